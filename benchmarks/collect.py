@@ -38,8 +38,13 @@ def main() -> int:
     folder: Path = options.folder
     found = [one for program in options.programs for one in figures(folder, program)]
     (folder / f"{TARGET}.json").write_text(json.dumps(found, indent=1) + "\n")
-    lines = ["# Benchmarks", "", "| figure | measured | unit | to reach | holds |",
-             "|---|--:|---|--:|---|", *map(line, found)]  # fmt: skip
+    lines = [
+        "# Benchmarks",
+        "",
+        "| figure | measured | unit | to reach | holds |",
+        "|---|--:|---|--:|---|",
+        *map(line, found),
+    ]
     silent = [one for one in options.programs if not (folder / f"{one}.md").exists()]
     lines += [f"| {one} | did not finish | | | **no** |" for one in silent]
     parts = [(folder / f"{one}.md").read_text() for one in options.programs if one not in silent]

@@ -86,9 +86,7 @@ def drawn(model: Model, truth: dict[str, float], draws: int) -> Draws:
         ends = [one.interval95 or (np.nan, np.nan) for one in estimates]
         found.append([[one.value, *end] for one, end in zip(estimates, ends, strict=True)])
     table = np.array(found)
-    return Draws(
-        names, theta, bound(problem, theta), table[..., 0], table[..., 1], table[..., 2]
-    )  # fmt: skip
+    return Draws(names, theta, bound(problem, theta), table[..., 0], table[..., 1], table[..., 2])
 
 
 def bound(problem: Problem, theta: NDArray[np.float64]) -> NDArray[np.float64]:

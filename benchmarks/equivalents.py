@@ -25,14 +25,28 @@ HISTORY = 512
 """Rows of history before and after the record's own, that the C code may touch."""
 
 TERMS = [
-    "y(k-1)", "y(k-2)", "u(k)", "u(k-1)", "y(k-1)**2", "y(k-1)*y(k-2)", "y(k-1)**3",
-    "y(k-1)**2*y(k-2)", "y(k-1)*y(k-2)**2", "y(k-2)**3", "y(k-1)*u(k)", "y(k-1)**2*u(k)",
+    "y(k-1)",
+    "y(k-2)",
+    "u(k)",
+    "u(k-1)",
+    "y(k-1)**2",
+    "y(k-1)*y(k-2)",
+    "y(k-1)**3",
+    "y(k-1)**2*y(k-2)",
+    "y(k-1)*y(k-2)**2",
+    "y(k-2)**3",
+    "y(k-1)*u(k)",
+    "y(k-1)**2*u(k)",
     "y(k-2)**2",
-]  # fmt: skip
+]
 NARX: Mapping[str, Any] = {
-    "name": "narx-13", "form": "polynomial", "output": "y", "inputs": {"u": "1"},
-    "terms": TERMS, "coefficients": {"lower": -2, "upper": 2},
-}  # fmt: skip
+    "name": "narx-13",
+    "form": "polynomial",
+    "output": "y",
+    "inputs": {"u": "1"},
+    "terms": TERMS,
+    "coefficients": {"lower": -2, "upper": 2},
+}
 
 
 @dataclass(frozen=True)
@@ -53,13 +67,25 @@ class Example:
 EXAMPLES = {
     "tube (RK4)": Example("tube", "tube", 0.01, [0.9, 0.2, 0.0], [1.1, 0.5, 0.3], 4),
     "silverbox (RK4, 2 steps a sample)": Example(
-        "silverbox", "silverbox", 1 / 610.35, [1e5, 20, 1e5, -1e4, 0, -1e3, 0],
-        [3e5, 80, 3e5, 1e4, 1e6, 1e3, 3e-3], 8, "band-limited", steps=2,
+        "silverbox",
+        "silverbox",
+        1 / 610.35,
+        [1e5, 20, 1e5, -1e4, 0, -1e3, 0],
+        [3e5, 80, 3e5, 1e4, 1e6, 1e3, 3e-3],
+        8,
+        "band-limited",
+        steps=2,
     ),
     "coulomb-eq16": Example("coulomb", "coulomb-eq16", 0.02, [0] * 4, [1, 0.9, 10, 2], 1),
     "actuator (8 steps a sample)": Example(
-        "actuator", "actuator", 0.01, [3e-4, 1e-2, 2e-2, 60, 3e5, -0.1],
-        [4e-4, 2e-2, 5e-2, 100, 6e5, 0.1], 8, input_scale=2e5, steps=8,
+        "actuator",
+        "actuator",
+        0.01,
+        [3e-4, 1e-2, 2e-2, 60, 3e5, -0.1],
+        [4e-4, 2e-2, 5e-2, 100, 6e5, 0.1],
+        8,
+        input_scale=2e5,
+        steps=8,
     ),
     "narx, 13 terms": Example(
         "narx", NARX, 1.0, [0.5, -0.5, *[-0.01] * 11], [0.9, 0.05, *[0.01] * 11], 1
@@ -67,7 +93,7 @@ EXAMPLES = {
     "mackey-glass (RK4)": Example(
         "mackey", "mackey-glass", 0.5, [0.1, 0.05, 2, 1], [0.3, 0.2, 12, 20], 4
     ),
-}  # fmt: skip
+}
 
 
 def problem_of(example: Example, samples: int) -> Problem:
@@ -119,11 +145,17 @@ class Compiled:
             return ctypes.c_void_p(values.ctypes.data)
 
         arguments = (
-            address(rows), ctypes.c_long(theta.shape[0]), address(evaluator.floats),
-            ctypes.c_long(zero), ctypes.c_long(points), address(evaluator.measured),
-            ctypes.c_long(samples), ctypes.c_double(example.sample_time), address(work),
+            address(rows),
+            ctypes.c_long(theta.shape[0]),
+            address(evaluator.floats),
+            ctypes.c_long(zero),
+            ctypes.c_long(points),
+            address(evaluator.measured),
+            ctypes.c_long(samples),
+            ctypes.c_double(example.sample_time),
+            address(work),
             address(fitness),
-        )  # fmt: skip
+        )
         function = getattr(self._library, example.function)
         kept = (rows, work)  # ctypes holds addresses only
 

@@ -58,9 +58,13 @@ def kind(process: int) -> str:
     except OSError:
         return "ended"
     for mark, name in (
-        ("ray::", "workers"), ("service.dispatch.process", "dispatcher"), ("serve", "web process"),
-        ("gcs_server", "Ray"), ("raylet", "Ray"), ("/ray/", "Ray"),
-    ):  # fmt: skip
+        ("ray::", "workers"),
+        ("service.dispatch.process", "dispatcher"),
+        ("serve", "web process"),
+        ("gcs_server", "Ray"),
+        ("raylet", "Ray"),
+        ("/ray/", "Ray"),
+    ):
         if mark in words:
             return name
     return "this program"

@@ -49,11 +49,16 @@ def duffing(form: str) -> Model:
     parameters = {name: {"lower": low, "upper": high} for name, (low, high) in BOUNDS.items()}
     return parse_model(
         {
-            "name": "duffing", "form": form, "inputs": {"q": "N"},
-            "states": dict.fromkeys(equations, "m"), "parameters": parameters,
-            "equations": equations, "outputs": {"y": "x"}, "initial": dict.fromkeys(equations, 0),
+            "name": "duffing",
+            "form": form,
+            "inputs": {"q": "N"},
+            "states": dict.fromkeys(equations, "m"),
+            "parameters": parameters,
+            "equations": equations,
+            "outputs": {"y": "x"},
+            "initial": dict.fromkeys(equations, 0),
         }
-    )  # fmt: skip
+    )
 
 
 def problem(model: Model, samples: int) -> Problem:
@@ -136,10 +141,13 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
         share = operations_a_step(built) * 48 * 300 * example.steps / ours / 1000 / peak
         rows += [
             Row(f"{name}: time ÷ C by hand", ours / c, "", 1.5),
-            Row(f"{name}: per individual, sample and stage", ours * 1000 / 48 / 300
-                / example.stages, "ns"),
+            Row(
+                f"{name}: per individual, sample and stage",
+                ours * 1000 / 48 / 300 / example.stages,
+                "ns",
+            ),
             Row(f"{name}: share of the peak of {peak:.0f} GFLOP/s", 100 * share, "%"),
-        ]  # fmt: skip
+        ]
     return rows, []
 
 
@@ -157,8 +165,14 @@ def growth(repeats: int) -> list[Row]:
         slope, start = np.polyfit(n, t, 1, w=1 / t)  # relative departures count
         off = float(np.max(np.abs((start + slope * n) / t - 1)))
         span = f"{counts[0]} to {counts[-1]} {what}s"
-        rows.append(Row(f"{span}: line {start:.1f} µs + {1e3 * slope:.1f} ns a {what}, worst off",
-                        100 * off, "%", 20.0))  # fmt: skip
+        rows.append(
+            Row(
+                f"{span}: line {start:.1f} µs + {1e3 * slope:.1f} ns a {what}, worst off",
+                100 * off,
+                "%",
+                20.0,
+            )
+        )
     return rows
 
 
@@ -168,11 +182,17 @@ def others(repeats: int) -> list[Row]:
     lagged, long = problem(model, 300), problem(duffing("difference"), 20_000)
     few, one_block = individuals(48), individuals(16)
     rows = [
-        Row("duffing-delay (RK4), 48 × 300", microseconds(lambda: lagged.evaluate_fitness(few), repeats),
-            "µs"),
-        Row("duffing-eq16, 16 × 20,000 samples",
-            microseconds(lambda: long.evaluate_fitness(one_block), max(repeats // 5, 2)) / 1000, "ms"),
-    ]  # fmt: skip
+        Row(
+            "duffing-delay (RK4), 48 × 300",
+            microseconds(lambda: lagged.evaluate_fitness(few), repeats),
+            "µs",
+        ),
+        Row(
+            "duffing-eq16, 16 × 20,000 samples",
+            microseconds(lambda: long.evaluate_fitness(one_block), max(repeats // 5, 2)) / 1000,
+            "ms",
+        ),
+    ]
     start = time.perf_counter()
     code = emit_kernel(model, KernelVariant())
     written = time.perf_counter()

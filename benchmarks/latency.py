@@ -93,13 +93,17 @@ def never_seen(count: int) -> list[Row]:
         with TemporaryDirectory() as folder:
             environment = {
                 "NUMBA_CACHE_DIR": str(find_cache_folder()),  # the search is no part of a model
-                **os.environ, "LAGID_CACHE_DIR": folder,
-            }  # fmt: skip
+                **os.environ,
+                "LAGID_CACHE_DIR": folder,
+            }
             for found in (cold, cached):
                 ran = subprocess.run(
-                    [sys.executable, "-c", NEVER_SEEN], env=environment, check=True,
-                    capture_output=True, text=True,
-                )  # fmt: skip
+                    [sys.executable, "-c", NEVER_SEEN],
+                    env=environment,
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                )
                 found.append(float(ran.stdout))
     return [
         Row("model never seen: equations to first fitness", statistics.median(cold), "s", 3.0),

@@ -44,7 +44,9 @@ COMPILED: Sequence[tuple[Any, str]] = (
 def body(dataset: str, replicates: int) -> dict[str, Any]:
     """The sweep as one job: σ × replicates × methods; a replicate has noise of its own."""
     return {
-        "name": "noise sweep", "model": "duffing-eq16", "datasets": [dataset],
+        "name": "noise sweep",
+        "model": "duffing-eq16",
+        "datasets": [dataset],
         "sweep": {
             "axes": [
                 {"path": "/noise/sigma", "values": SIGMAS},
@@ -53,7 +55,7 @@ def body(dataset: str, replicates: int) -> dict[str, Any]:
                 {"path": "/algorithm/method", "values": METHODS},
             ]
         },
-    }  # fmt: skip
+    }
 
 
 def compiled_seconds(count: int) -> float:
@@ -107,10 +109,14 @@ def main() -> None:
     wall = done - start
     rows = [
         Row(f"{runs} identifications: submission", submitted - start, "s"),
-        Row(f"{runs} identifications: submission to stored results", wall, "s",
-            60.0 if not options.quick else None),
+        Row(
+            f"{runs} identifications: submission to stored results",
+            wall,
+            "s",
+            60.0 if not options.quick else None,
+        ),
         Row("the same for 4,200 at this pace", wall * 4200 / runs, "s", 60.0),
-    ]  # fmt: skip
+    ]
     used = {name: seconds - before.get(name, 0.0) for name, seconds in sorted(spent.items())}
     used.pop("this program", None)
     rows += [

@@ -135,9 +135,15 @@ class Task:
 def _evolution(task: Task) -> None:
     n = task.lower.size
     differential_evolution(
-        task.fitness, [(0.0, 1.0)] * n, popsize=15, maxiter=BUDGET, tol=1e-6, atol=0,
-        rng=task.seed, polish=True,
-    )  # fmt: skip
+        task.fitness,
+        [(0.0, 1.0)] * n,
+        popsize=15,
+        maxiter=BUDGET,
+        tol=1e-6,
+        atol=0,
+        rng=task.seed,
+        polish=True,
+    )
 
 
 def _annealing(task: Task) -> None:

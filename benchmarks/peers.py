@@ -74,10 +74,14 @@ def rows_of(done: Study, peers: list[Peer]) -> list[Row]:
         Row(f"{name}: lagid, target hit", hits, f"of {count}", count, ">="),
         Row(f"{name}: lagid, median simulations to the target", done.to_target(), ""),
         Row(f"{name}: the same, islands side by side", done.side_by_side(), ""),
-        Row(f"{name}: lagid, CPU to the target, prorated", prorated, "ms",
-            best if np.isfinite(best) else None),
+        Row(
+            f"{name}: lagid, CPU to the target, prorated",
+            prorated,
+            "ms",
+            best if np.isfinite(best) else None,
+        ),
         Row(f"{name}: lagid, CPU to the target, direct", direct, "ms"),
-    ]  # fmt: skip
+    ]
     if name in FASTEST_PEER:
         told = FASTEST_PEER[name]
         rows.append(Row(f"{name}: fastest in bench/peers, on its machine, prorated", told, "ms"))

@@ -38,9 +38,15 @@ SLOW_PEERS = {"SciPy dual_annealing": 5, "SciPy differential_evolution": 10}
 """Searches at most of peers that take long, so that the whole ends within 40 minutes."""
 
 PROTOTYPE = {
-    "A/300/1": 241, "A/300/5": 236, "A/1500/1": 1219, "A/1500/5": 1798,
-    "B/300/1": 255, "B/300/5": 660, "B/1500/1": 3622, "B/1500/5": 4390,
-}  # fmt: skip
+    "A/300/1": 241,
+    "A/300/5": 236,
+    "A/1500/1": 1219,
+    "A/1500/5": 1798,
+    "B/300/1": 255,
+    "B/300/5": 660,
+    "B/1500/1": 3622,
+    "B/1500/5": 4390,
+}
 """Median evaluations to the target of the prototype that the design describes."""
 
 FASTEST_PEER = {"A0": 0.64, "A/300/1": 0.30, "B0": 0.76, "B/300/1": 2.5}

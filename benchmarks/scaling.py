@@ -98,8 +98,9 @@ def two_against_one(pairs: int, runs: Mapping[str, tuple[int, dict[str, Any]]]) 
     rows: list[Row] = []
     with service(1) as one, service(2) as two:
         for name, (count, changes) in runs.items():
-            both = [(one.sweep(count, **changes), two.sweep(count, **changes))
-                    for _ in range(pairs)]  # fmt: skip
+            both = [
+                (one.sweep(count, **changes), two.sweep(count, **changes)) for _ in range(pairs)
+            ]
             rows += _efficiency(name, [pair[0] for pair in both], [pair[1] for pair in both])
     return rows
 
@@ -118,16 +119,26 @@ def _efficiency(name: str, alone: Sequence[Swept], both: Sequence[Swept]) -> lis
     cores = os.cpu_count() or 1
     bar = 0.92 if cores > 2 else None  # else the dispatcher shares the second worker's core
     return [
-        Row(f"{name}: efficiency of 2 workers against 1, wall time on {cores} cores",
-            gain / 2, "", bar, ">="),
-        Row(f"{name}: the same by CPU time (a run's with 1 worker over that with 2)",
-            inflation, "", 0.92, ">="),
+        Row(
+            f"{name}: efficiency of 2 workers against 1, wall time on {cores} cores",
+            gain / 2,
+            "",
+            bar,
+            ">=",
+        ),
+        Row(
+            f"{name}: the same by CPU time (a run's with 1 worker over that with 2)",
+            inflation,
+            "",
+            0.92,
+            ">=",
+        ),
         Row(f"{name}: part of all CPU time that computes", work / (work + ours + rays), ""),
         Row(f"{name}: CPU of a worker for a run", work, "ms"),
         Row(f"{name}: CPU of the dispatcher for a run", ours, "ms"),
         Row(f"{name}: CPU of Ray's own processes for a run", rays, "ms"),
         Row(f"{name}: workers that one dispatcher feeds, by its CPU time", work / ours, ""),
-    ]  # fmt: skip
+    ]
 
 
 def cost_of_a_task(count: int) -> list[Row]:
@@ -175,8 +186,10 @@ def cost_of_a_task(count: int) -> list[Row]:
     ]
 
 
-SINGLES: Mapping[str, dict[str, Any]] = {"paper-size": {}, "long": {"algorithm": {
-    "generations": 20_000, "islands": 2, "stop": {"settled": None}}}}  # fmt: skip
+SINGLES: Mapping[str, dict[str, Any]] = {
+    "paper-size": {},
+    "long": {"algorithm": {"generations": 20_000, "islands": 2, "stop": {"settled": None}}},
+}
 
 
 def beside_a_sweep(runs: int, pairs: int) -> list[Row]:
@@ -215,8 +228,10 @@ def beside_a_sweep(runs: int, pairs: int) -> list[Row]:
             Row(f"{name} single, beside the sweep: longest delay", max(delays), "s", 2.0),
         ]
     delay = max(at_first) - statistics.median(alone["paper-size"])
-    return [*rows, Row("paper-size single just after the sweep began: longest delay",
-                       delay, "s", 2.0)]  # fmt: skip
+    return [
+        *rows,
+        Row("paper-size single just after the sweep began: longest delay", delay, "s", 2.0),
+    ]
 
 
 def _finished(one: Service, job: str) -> int:
@@ -243,10 +258,12 @@ def main() -> None:
     }
     skipped = []
     if (os.cpu_count() or 1) <= 2:
-        skipped.append(Skipped(
-            "bar of the efficiency by wall time",
-            "two workers and the dispatcher share two cores here",
-        ))  # fmt: skip
+        skipped.append(
+            Skipped(
+                "bar of the efficiency by wall time",
+                "two workers and the dispatcher share two cores here",
+            )
+        )
     rows = [
         *two_against_one(3 if few else 7, sweeps),
         *cost_of_a_task(300 if few else 2000),

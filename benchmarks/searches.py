@@ -93,9 +93,16 @@ def optimum(problem: Problem, starts: list[FloatArray]) -> float:
         place = np.clip((start - lower) / (upper - lower), 0.0, 1.0)
         for step in (1e-7, 1e-5):
             solved = least_squares(
-                residuals, place, bounds=(0.0, 1.0), diff_step=step, x_scale="jac",
-                ftol=1e-14, xtol=1e-14, gtol=1e-15, max_nfev=200,
-            )  # fmt: skip
+                residuals,
+                place,
+                bounds=(0.0, 1.0),
+                diff_step=step,
+                x_scale="jac",
+                ftol=1e-14,
+                xtol=1e-14,
+                gtol=1e-15,
+                max_nfev=200,
+            )
             theta = np.clip(lower + (upper - lower) * np.vstack([place, solved.x]), lower, upper)
             least = min(least, float(np.min(problem.evaluate_fitness(theta))))
     return least
@@ -139,9 +146,16 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
         island.generation == state.generation for island in state.islands
     )
     made = Search(
-        goal.distance(found.rms), found.evaluations, hit, in_order, took, share, seconds, after,
+        goal.distance(found.rms),
+        found.evaluations,
+        hit,
+        in_order,
+        took,
+        share,
+        seconds,
+        after,
         settled,
-    )  # fmt: skip
+    )
     return made, goal
 
 

@@ -23,14 +23,17 @@ STEP = 0.02
 """Sample time of the paper's examples (s)."""
 
 NARX = {
-    "name": "narx-two-lags", "form": "polynomial", "output": "y", "inputs": {"u": "1"},
+    "name": "narx-two-lags",
+    "form": "polynomial",
+    "output": "y",
+    "inputs": {"u": "1"},
     "parameters": {
         "dh": {"lower": 0, "upper": 20, "unit": "samples"},
         "dk": {"lower": 0, "upper": 40, "unit": "samples"},
     },
     "terms": ["y(k-1)", "y(k-1-dh)", "u(k-1-dk)", "y(k-1)*u(k-1-dk)", "u(k-1-dk)**2"],
     "coefficients": {"lower": -2, "upper": 2},
-}  # fmt: skip
+}
 """A polynomial model with two unknown lags."""
 
 
@@ -124,9 +127,16 @@ def paper(example: str, samples: int = 300, lag: float = 1.0, noise: float = 0.0
     truth = {"c": 0.2, "L": 0.5, "b": 5.0, last: 1.0 if example == "A" else 0.5}
     name = f"{example}/{samples}/{lag:g}" if noise else f"{example}0"
     return System(
-        name, model, samples, STEP, truth, _cosine, parameters={"L": {"upper": lag}}, noise=noise,
+        name,
+        model,
+        samples,
+        STEP,
+        truth,
+        _cosine,
+        parameters={"L": {"upper": lag}},
+        noise=noise,
         absolute=True,
-    )  # fmt: skip
+    )
 
 
 PAPER = (
@@ -138,43 +148,78 @@ PAPER = (
 
 OTHERS = (
     System(
-        "delayed van der Pol", "delayed-van-der-pol", 600, 0.05,
-        {"mu": 1.0, "w": 1.5, "g": 0.8, "L": 1.7, "v(0)": 0.0}, switching(2.0, 20, 1),
+        "delayed van der Pol",
+        "delayed-van-der-pol",
+        600,
+        0.05,
+        {"mu": 1.0, "w": 1.5, "g": 0.8, "L": 1.7, "v(0)": 0.0},
+        switching(2.0, 20, 1),
         start={"y": 0.5},
     ),
     System(
-        "Mackey-Glass", "mackey-glass", 150, 1.0, {"beta": 0.2, "gamma": 0.1, "n": 10.0, "L": 17.0},
+        "Mackey-Glass",
+        "mackey-glass",
+        150,
+        1.0,
+        {"beta": 0.2, "gamma": 0.1, "n": 10.0, "L": 17.0},
         start={"y": 1.2},
     ),
     System(
-        "delayed logistic", "delayed-logistic", 400, 0.05, {"r": 1.8, "K": 10.0, "L": 1.0},
+        "delayed logistic",
+        "delayed-logistic",
+        400,
+        0.05,
+        {"r": 1.8, "K": 10.0, "L": 1.0},
         start={"y": 2.0},
     ),
     System(
-        "FOPDT, lag to half the record", "fopdt", 400, 0.05,
-        {"K": 2.0, "T": 0.8, "L": 2.3, "y0": 1.0, "x(0)": 0.0}, switching(1.0, 30, 2),
+        "FOPDT, lag to half the record",
+        "fopdt",
+        400,
+        0.05,
+        {"K": 2.0, "T": 0.8, "L": 2.3, "y0": 1.0, "x(0)": 0.0},
+        switching(1.0, 30, 2),
         parameters={"L": {"upper": 10.0}},
     ),
     System(
-        "SOPDT, lag to half the record", "sopdt", 400, 0.05,
+        "SOPDT, lag to half the record",
+        "sopdt",
+        400,
+        0.05,
         {"K": 2.0, "T1": 0.8, "r": 0.5, "L": 2.3, "y0": 1.0, "w(0)": 0.0, "x(0)": 0.0},
-        switching(1.0, 30, 3), parameters={"L": {"upper": 10.0}},
+        switching(1.0, 30, 3),
+        parameters={"L": {"upper": 10.0}},
     ),
     System(
-        "actuator with stick-slip", "actuator", 800, 0.01,
+        "actuator with stick-slip",
+        "actuator",
+        800,
+        0.01,
         {
-            "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,
+            "J": 3.6e-4,
+            "F_c": 1.2317e-2,
+            "F_max": 3.3333e-2,
+            "k_a": 83.089,
+            "k_c": 456.99e3,
             "theta(0)": 0.0,
         },
         _supply,
     ),
     System(
-        "NARX, two unknown lags", NARX, 400, 1.0,
+        "NARX, two unknown lags",
+        NARX,
+        400,
+        1.0,
         {
-            "dh": 6.0, "dk": 13.0, "a[y(k-1)]": 0.7, "a[y(k-1-dh)]": -0.3, "a[u(k-1-dk)]": 0.5,
-            "a[y(k-1)*u(k-1-dk)]": 0.15, "a[u(k-1-dk)**2]": 0.2,
+            "dh": 6.0,
+            "dk": 13.0,
+            "a[y(k-1)]": 0.7,
+            "a[y(k-1-dh)]": -0.3,
+            "a[u(k-1-dk)]": 0.5,
+            "a[y(k-1)*u(k-1-dk)]": 0.15,
+            "a[u(k-1-dk)**2]": 0.2,
         },
         switching(1.0, 5, 4),
     ),
-)  # fmt: skip
+)
 """Systems for which nothing in the search was chosen."""

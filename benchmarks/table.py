@@ -50,8 +50,12 @@ def parser(description: str) -> argparse.ArgumentParser:
 
 def markdown(title: str, rows: list[Row], skipped: list[Skipped]) -> str:
     """The figures as a table, those with a bar first."""
-    lines = [f"## {title}", "", "| figure | measured | unit | to reach | holds |",
-             "|---|--:|---|--:|---|"]  # fmt: skip
+    lines = [
+        f"## {title}",
+        "",
+        "| figure | measured | unit | to reach | holds |",
+        "|---|--:|---|--:|---|",
+    ]
     for row in sorted(rows, key=lambda row: row.bar is None):
         bar = "" if row.bar is None else f"{row.relation} {row.bar:g}"
         verdict = "" if row.bar is None else ("yes" if row.holds else "**no**")

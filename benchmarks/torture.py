@@ -42,11 +42,10 @@ FAULTS: dict[str, Fault] = {
     "runs that kill their workers, one that takes all memory": cancelling.bad_runs,
     "cancel of a running job, resumed": cancelling.cancel_running,
     "cancel of a finishing job, resumed": cancelling.cancel_finishing,
-    "cancel of a queued and of an orphaned job, dispatcher killed":
-        cancelling.cancel_without_dispatcher,
+    "cancel of a queued and of an orphaned job, dispatcher killed": cancelling.cancel_without_dispatcher,
     "Ray not available at start": conditions.withhold_ray,
     "stopped in order with jobs queued, started": conditions.restart,
-}  # fmt: skip
+}
 POSTGRES_FAULTS: dict[str, Fault] = {"kill -9 of PostgreSQL, restarted": faults.kill_postgres}
 DISK_FAULTS: dict[str, Fault] = {"disk full of objects and checkpoints": conditions.fill_disks}
 
@@ -85,12 +84,13 @@ class Torture:
             data,
             database_url=None if postgres is None else postgres.get_uri(),
             environment={
-                "BREAK_CLOCK": str(self.clock), "BREAK_RAY": str(self.ray_away),
+                "BREAK_CLOCK": str(self.clock),
+                "BREAK_RAY": str(self.ray_away),
                 "BREAK_SEEDS": ",".join(map(str, DEADLY)),
                 "BREAK_MEMORY": ",".join(map(str, GREEDY)),
                 "LAGID_WORKER_MEMORY_MB": str(WORKER_MEGABYTES),
             },
-        )  # fmt: skip
+        )
         self.met: dict[str, list[Met]] = {kind: [] for kind in self.known()}
         self.at_risk: list[float] = []
         self.unrecovered = 0
@@ -164,15 +164,17 @@ class Torture:
             ("faults", sum(map(len, self.met.values())), None),
             ("faults without recovery", self.unrecovered, 0),
             *((kind, counts[kind], None) for kind in sorted(told)),
-            ("jobs ended", counts["jobs"], None), ("runs ended", counts["runs"], None),
-            ("runs lost", counts["lost"], 0), ("runs doubled", counts["doubled"], 0),
+            ("jobs ended", counts["jobs"], None),
+            ("runs ended", counts["runs"], None),
+            ("runs lost", counts["lost"], 0),
+            ("runs doubled", counts["doubled"], 0),
             ("jobs given up after too many faults", counts["given up"], None),
             ("runs given up after too many faults", counts["runs given up"], None),
             ("jobs stuck", stuck, 0),
             ("jobs whose summary differs by a bit", len(stream.different), 0),
             ("runs without signals (disk full)", counts["unplotted"], None),
             ("processes, segments, files left", left, 0),
-        ]  # fmt: skip
+        ]
         rows = [Row(f"{self.name}: {what}", number, "", bar) for what, number, bar in figures]
         risk = max(self.at_risk, default=0.0)
         rows.append(Row(f"{self.name}: work of a long run in no checkpoint, most", risk, "s", 5))
@@ -186,10 +188,11 @@ class Torture:
     def recoveries(self) -> str:
         """How long the work stood, by fault, and who had the processors meanwhile, as a table."""
         lines = [
-            f"### {self.name}: recovery", "",
+            f"### {self.name}: recovery",
+            "",
             "| fault | times | median s | worst s | in the worst, processor s | share of others |",
             "|---|--:|--:|--:|--:|--:|",
-        ]  # fmt: skip
+        ]
         for kind, met in self.met.items():
             if met:
                 worst = max(met, key=lambda one: one.seconds)

@@ -30,15 +30,38 @@ if TYPE_CHECKING:
     from sysid.uncertainty.estimates import Estimate
 
 __all__ = [
-    "Channel", "Estimate", "GeneticAlgorithm", "History", "Identification", "IslandChange", "Loss",
-    "Migration", "Noise", "Parameter", "Problem", "Record", "Recording", "SequenceSearch", "Stop",
-    "SysidError", "catalogue", "export_model", "identify", "load_model", "simulate",
-]  # fmt: skip
+    "Channel",
+    "Estimate",
+    "GeneticAlgorithm",
+    "History",
+    "Identification",
+    "IslandChange",
+    "Loss",
+    "Migration",
+    "Noise",
+    "Parameter",
+    "Problem",
+    "Record",
+    "Recording",
+    "SequenceSearch",
+    "Stop",
+    "SysidError",
+    "catalogue",
+    "export_model",
+    "identify",
+    "load_model",
+    "simulate",
+]
 
 _PUBLIC_NAMES = {
     "core.errors": ("SysidError",),
     "core.settings": (
-        "GeneticAlgorithm", "IslandChange", "Loss", "Migration", "SequenceSearch", "Stop",
+        "GeneticAlgorithm",
+        "IslandChange",
+        "Loss",
+        "Migration",
+        "SequenceSearch",
+        "Stop",
     ),
     "data.noise": ("Noise",),
     "data.records": ("Channel", "History", "Record", "Recording"),
@@ -50,7 +73,7 @@ _PUBLIC_NAMES = {
     "simulation.problem": ("Problem",),
     "simulation.simulate": ("simulate",),
     "uncertainty.estimates": ("Estimate",),
-}  # fmt: skip
+}
 _MODULE_BY_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 
 

@@ -69,9 +69,16 @@ class Case:
 TUBE = levels(3.0, 0.05e6, 0.5e6)
 SILVERBOX = {"b": 1.86e5, "d": 41.9, "k1": 1.84e5, "k2": -6.4e3, "k3": 7.3e5, "c": 1.0e3, "L": 2e-4}
 NARX = dict.fromkeys((one.name for one in load_model("narx").parameters), 0.0) | {
-    "a[y(k-1)]": 0.5, "a[y(k-1-dh)]": -0.2, "a[u(k-1)]": 0.6, "a[u(k-1-dk)]": 0.3,
-    "a[y(k-1)**2]": -0.1, "a[y(k-1)*u(k-1)]": 0.15, "a[u(k-1-dk)**2]": 0.2, "dh": 3.4, "dk": 7.6,
-}  # fmt: skip
+    "a[y(k-1)]": 0.5,
+    "a[y(k-1-dh)]": -0.2,
+    "a[u(k-1)]": 0.6,
+    "a[u(k-1-dk)]": 0.3,
+    "a[y(k-1)**2]": -0.1,
+    "a[y(k-1)*u(k-1)]": 0.15,
+    "a[u(k-1-dk)**2]": 0.2,
+    "dh": 3.4,
+    "dk": 7.6,
+}
 ACTUATOR = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3}
 REST = {"y(0)": 0.0, "v(0)": 0.0}
 CASES = {
@@ -81,38 +88,86 @@ CASES = {
     "duffing-eq16": Case({"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}, 0.02, 300, cosine(10, 5)),
     "coulomb-delay": Case({"c": 0.2, "L": 0.5, "b": 5.0, "mu": 0.5}, 0.02, 300, cosine(10, 5)),
     "coulomb-eq16": Case({"c": 0.2, "L": 0.5, "b": 5.0, "mu": 0.5}, 0.02, 300, cosine(10, 5)),
-    "tube": Case({"K": 1.0, "T": 0.34, "L": 0.119}, 0.01, 2000, TUBE, sigma=10.0,
-        initial={"y(0)": 2e5}),
+    "tube": Case(
+        {"K": 1.0, "T": 0.34, "L": 0.119}, 0.01, 2000, TUBE, sigma=10.0, initial={"y(0)": 2e5}
+    ),
     "tube-second-order": Case(
-        {"K": 1.0, "w": 20.0, "z": 0.7, "L": 0.05}, 0.01, 1500, TUBE, sigma=10.0,
+        {"K": 1.0, "w": 20.0, "z": 0.7, "L": 0.05},
+        0.01,
+        1500,
+        TUBE,
+        sigma=10.0,
         initial={"y(0)": 2e5},
     ),
-    "fopdt": Case({"K": 0.96, "T": 0.375, "L": 0.22, "y0": 4.84}, 0.08, 500,
-                  levels(0.6, -1.5, 1.5), "zero", 1e-4, initial={"x(0)": -0.5}),
-    "sopdt": Case({"K": 0.92, "T1": 0.26, "r": 0.48, "L": 0.16, "y0": 4.85}, 0.08, 500,
-                  levels(0.6, -1.5, 1.5), "zero", 1e-5, 5e-3,
-                  initial={"w(0)": -0.6, "x(0)": -0.1}),
+    "fopdt": Case(
+        {"K": 0.96, "T": 0.375, "L": 0.22, "y0": 4.84},
+        0.08,
+        500,
+        levels(0.6, -1.5, 1.5),
+        "zero",
+        1e-4,
+        initial={"x(0)": -0.5},
+    ),
+    "sopdt": Case(
+        {"K": 0.92, "T1": 0.26, "r": 0.48, "L": 0.16, "y0": 4.85},
+        0.08,
+        500,
+        levels(0.6, -1.5, 1.5),
+        "zero",
+        1e-5,
+        5e-3,
+        initial={"w(0)": -0.6, "x(0)": -0.1},
+    ),
     "exponential": Case({"L": 0.8}, 0.01, 200),
-    "silverbox": Case(SILVERBOX, 1 / 610.35, 1500, noise(0.05), "band-limited", 1e-6, 1e-2,
-                      initial=REST),
-    "silverbox-9": Case(SILVERBOX | {"d1": 20.0, "d2": 119.0, "k5": 4.0e5}, 1 / 610.35, 3000,
-                        noise(0.08), "band-limited", within=1e-2, initial=REST),
-    "emps": Case({"M": 95.1, "Fv": 203.5, "Fc": 20.4, "o": -3.2}, 1e-3, 3000,
-                 multisine(1.0, 2.0, 20.0), within=1e-2, initial={"y(0)": 0.0}),
+    "silverbox": Case(
+        SILVERBOX, 1 / 610.35, 1500, noise(0.05), "band-limited", 1e-6, 1e-2, initial=REST
+    ),
+    "silverbox-9": Case(
+        SILVERBOX | {"d1": 20.0, "d2": 119.0, "k5": 4.0e5},
+        1 / 610.35,
+        3000,
+        noise(0.08),
+        "band-limited",
+        within=1e-2,
+        initial=REST,
+    ),
+    "emps": Case(
+        {"M": 95.1, "Fv": 203.5, "Fc": 20.4, "o": -3.2},
+        1e-3,
+        3000,
+        multisine(1.0, 2.0, 20.0),
+        within=1e-2,
+        initial={"y(0)": 0.0},
+    ),
     "narx": Case(NARX, 0.1, 500, noise(0.5), initial={"y(0)": 0.0}),
     "actuator": Case(
-        ACTUATOR, 0.01, 800, sum_of(levels(0.1, -8e3, 8e3), multisine(2e3, 1.0, 20.0)),
-        sigma=1e-4, within=2e-2,
+        ACTUATOR,
+        0.01,
+        800,
+        sum_of(levels(0.1, -8e3, 8e3), multisine(2e3, 1.0, 20.0)),
+        sigma=1e-4,
+        within=2e-2,
         initial={"theta(0)": 0.0, "A_m": 5.0e-6, "B": 1.0e-3, "theta_s": 2.356194490192345},
     ),
-    "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10.0, "L": 17.0}, 1.0, 90,
-                         initial={"x(0)": 1.2}, within=1e-2),
-    "delayed-van-der-pol": Case({"mu": 1.0, "w": 2.0, "g": 0.8, "L": 0.7}, 0.02, 600,
-                                levels(0.5, -3, 3), sigma=1e-5,
-                                initial={"x(0)": 0.5, "v(0)": -1.0}),
-    "delayed-logistic": Case({"r": 1.6, "K": 5.0, "L": 1.1}, 0.05, 400,
-                             initial={"x(0)": 1.0}, sigma=1e-5),
-}  # fmt: skip
+    "mackey-glass": Case(
+        {"beta": 0.2, "gamma": 0.1, "n": 10.0, "L": 17.0},
+        1.0,
+        90,
+        initial={"x(0)": 1.2},
+        within=1e-2,
+    ),
+    "delayed-van-der-pol": Case(
+        {"mu": 1.0, "w": 2.0, "g": 0.8, "L": 0.7},
+        0.02,
+        600,
+        levels(0.5, -3, 3),
+        sigma=1e-5,
+        initial={"x(0)": 0.5, "v(0)": -1.0},
+    ),
+    "delayed-logistic": Case(
+        {"r": 1.6, "K": 5.0, "L": 1.1}, 0.05, 400, initial={"x(0)": 1.0}, sigma=1e-5
+    ),
+}
 
 
 def made(model: Model, case: Case) -> Record:

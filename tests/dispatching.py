@@ -45,8 +45,12 @@ class Place:
     def submit(self, **body: Any) -> str:
         """Queue a job on the dataset."""
         # A test that compares two runs wants both computed.
-        default = {"model": "fopdt", "datasets": [self.dataset], "reuse": False, "parameters":
-                   {"T": {"upper": 10.0}, "L": {"upper": 2.0}}}  # fmt: skip
+        default = {
+            "model": "fopdt",
+            "datasets": [self.dataset],
+            "reuse": False,
+            "parameters": {"T": {"upper": 10.0}, "L": {"upper": 2.0}},
+        }
         return submit_job(self.database, JobIn(**{**default, **body}), self.settings).id
 
     def job(self, job: str) -> Job:
@@ -78,8 +82,11 @@ class Place:
         child = subprocess.Popen(
             [sys.executable, "-m", "service.dispatch.process"],
             env={**os.environ, **to_environment(self.settings)},
-            stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
         try:
             yield child
             child.send_signal(signal.SIGTERM)
@@ -93,9 +100,14 @@ class Place:
         record = step_record()
         recording = Recording((*record.inputs, *record.outputs))
         stored = add_recording(
-            self.database, self.store, recording, name="steps", kind="upload", key="steps",
+            self.database,
+            self.store,
+            recording,
+            name="steps",
+            kind="upload",
+            key="steps",
             details={"warnings": []},
-        )  # fmt: skip
+        )
         return stored.dataset.id
 
 

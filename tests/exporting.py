@@ -74,8 +74,11 @@ def compiled(folder: Path, sources: Mapping[str, str]) -> ctypes.CDLL:
     library = folder / "exported.so"
     done = subprocess.run(
         [compiler(), *FLAGS, *map(str, paths), "-o", str(library), "-lm"],
-        capture_output=True, text=True, timeout=100, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return ctypes.CDLL(str(library))

@@ -28,11 +28,15 @@ def differential(equations: dict[str, str], output: str, **fields: Any) -> Model
 
 def _model(form: str, equations: dict[str, str], output: str, fields: dict[str, Any]) -> Model:
     document: dict[str, Any] = {
-        "name": "test", "form": form, "inputs": {"u": "V"},
-        "states": dict.fromkeys(equations, "m"), "parameters": PARAMETERS,
-        "equations": equations, "outputs": {"y": output},
+        "name": "test",
+        "form": form,
+        "inputs": {"u": "V"},
+        "states": dict.fromkeys(equations, "m"),
+        "parameters": PARAMETERS,
+        "equations": equations,
+        "outputs": {"y": output},
         "initial": dict.fromkeys(equations, 0.3),
-    }  # fmt: skip
+    }
     return parse_model(document | fields)
 
 
@@ -40,9 +44,11 @@ def duffing() -> Model:
     """The recursion of Eq. 16."""
     force = "c*(x(k-1 - L/h) - x(k-2 - L/h))/h + b*x(k-2) + a*x(k-2)**3 - u(k-2)"
     return difference(
-        {"x": f"2*x(k-1) - x(k-2) - h**2*({force})"}, "x",
-        parameters=PARAMETERS | {"a": {"lower": 0, "upper": 5}}, initial={"x": 0},
-    )  # fmt: skip
+        {"x": f"2*x(k-1) - x(k-2) - h**2*({force})"},
+        "x",
+        parameters=PARAMETERS | {"a": {"lower": 0, "upper": 5}},
+        initial={"x": 0},
+    )
 
 
 def lag_element(**fields: Any) -> Model:
@@ -53,9 +59,14 @@ def lag_element(**fields: Any) -> Model:
 
 
 def record(
-    samples: int = 30, period: float = 0.05, *, irregular: bool = False, hold: Hold = "first",
-    seed: int = 1, outputs: tuple[str, ...] = ("y",),
-) -> Record:  # fmt: skip
+    samples: int = 30,
+    period: float = 0.05,
+    *,
+    irregular: bool = False,
+    hold: Hold = "first",
+    seed: int = 1,
+    outputs: tuple[str, ...] = ("y",),
+) -> Record:
     """A random-walk input and smooth outputs."""
     rng = np.random.default_rng(seed)
     times = period * np.arange(samples)

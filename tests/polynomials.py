@@ -10,23 +10,32 @@ from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
 
 PERIOD = 0.1
-TRUTH = {
-    "y(k-1)": 0.6, "y(k-2)": -0.3, "u(k-1)": 0.8, "y(k-1)*u(k-2)": 0.3, "u(k-1)**2": -0.2,
-}  # fmt: skip
+TRUTH = {"y(k-1)": 0.6, "y(k-2)": -0.3, "u(k-1)": 0.8, "y(k-1)*u(k-2)": 0.3, "u(k-1)**2": -0.2}
 """Terms and coefficients of a stable polynomial."""
 
-LAGGED = {"y(k-1)": 0.5, "y(k-1-dh)": -0.2, "u(k-1)": 0.6, "u(k-1-dk)": 0.5,
-          "y(k-1)*u(k-1-dk)": 0.2}  # fmt: skip
+LAGGED = {
+    "y(k-1)": 0.5,
+    "y(k-1-dh)": -0.2,
+    "u(k-1)": 0.6,
+    "u(k-1-dk)": 0.5,
+    "y(k-1)*u(k-1-dk)": 0.2,
+}
 """The same with two unknown lags."""
 
 
 def document(terms: object, **changes: Any) -> dict[str, Any]:
     """A polynomial of second degree in y(k-1), y(k-2), u(k-1), u(k-2)."""
     return {
-        "name": "polynomial", "form": "polynomial", "output": "y", "inputs": {"u": "V"},
-        "degree": 2, "lags": {"y": [1, 2], "u": [1, 2]},
-        "coefficients": {"lower": -2, "upper": 2}, "terms": terms, **changes,
-    }  # fmt: skip
+        "name": "polynomial",
+        "form": "polynomial",
+        "output": "y",
+        "inputs": {"u": "V"},
+        "degree": 2,
+        "lags": {"y": [1, 2], "u": [1, 2]},
+        "coefficients": {"lower": -2, "upper": 2},
+        "terms": terms,
+        **changes,
+    }
 
 
 def lagged(terms: object, **changes: Any) -> dict[str, Any]:
@@ -44,9 +53,14 @@ def frols(keep: int, **fields: Any) -> dict[str, Any]:
 
 
 def record_of(
-    truth: Mapping[str, float], *, samples: int = 400, seed: int = 1, noise: float = 0.0,
-    lags: Mapping[str, float] | None = None, hold: Hold = "first",
-) -> Record:  # fmt: skip
+    truth: Mapping[str, float],
+    *,
+    samples: int = 400,
+    seed: int = 1,
+    noise: float = 0.0,
+    lags: Mapping[str, float] | None = None,
+    hold: Hold = "first",
+) -> Record:
     """The free run of a polynomial with these coefficients, from a random input."""
     written = [term for term in truth if term != "1"]
     model = parse_model((lagged if lags else document)(written, constant="1" in truth))

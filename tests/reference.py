@@ -17,15 +17,34 @@ from sysid.simulation.experiments import GridExperiment
 from sysid.simulation.problem import Problem
 
 _FUNCTIONS = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
-    "abs": np.abs, "sign": np.sign, "min": np.minimum, "max": np.maximum, "tanh": np.tanh,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
+    "log": np.log,
+    "sqrt": np.sqrt,
+    "abs": np.abs,
+    "sign": np.sign,
+    "min": np.minimum,
+    "max": np.maximum,
+    "tanh": np.tanh,
     "atan": np.arctan,
-}  # fmt: skip
+}
 _OPERATORS = {
-    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "**": np.power,
-    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal,
-    "==": np.equal, "!=": np.not_equal, "and": np.logical_and, "or": np.logical_or,
-}  # fmt: skip
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "/": np.divide,
+    "**": np.power,
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+    "==": np.equal,
+    "!=": np.not_equal,
+    "and": np.logical_and,
+    "or": np.logical_or,
+}
 
 
 def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> FloatArray:
@@ -56,9 +75,13 @@ class Twin:
     """One individual in one experiment."""
 
     def __init__(
-        self, model: Model, experiment: GridExperiment, number: int, values: Mapping[str, float],
+        self,
+        model: Model,
+        experiment: GridExperiment,
+        number: int,
+        values: Mapping[str, float],
         one_step: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.model, self.experiment, self.values = model, experiment, values
         self.one_step = one_step
         self.difference = model.form != "differential"
@@ -85,10 +108,12 @@ class Twin:
         for m in range(grid.last_step + 1):
             if m % grid.substeps == 0:
                 now = self._now()
-                found.append([
-                    self._value(output.expression, m, 0.0, now, -1)
-                    for output in self.model.outputs
-                ])  # fmt: skip
+                found.append(
+                    [
+                        self._value(output.expression, m, 0.0, now, -1)
+                        for output in self.model.outputs
+                    ]
+                )
                 if self.one_step:
                     self._replace(m // grid.substeps)
             if m < grid.last_step:

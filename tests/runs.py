@@ -11,7 +11,7 @@ from sysid.data.records import Channel, Record
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
-from workers.protocol import (  # fmt: skip
+from workers.protocol import (
     Executor,
     InvalidRun,
     ProblemSpec,
@@ -122,6 +122,10 @@ def bits(found: Identification) -> tuple[object, ...]:
     """Everything of a result that must not depend on where it was computed."""
     return (
         tuple((one.name, one.value, one.stderr) for one in found.estimates),
-        found.rms, found.evaluations, found.generations, found.history, found.migrations,
+        found.rms,
+        found.evaluations,
+        found.generations,
+        found.history,
+        found.migrations,
         tuple(values.tobytes() for outputs in found.simulated for values in outputs),
-    )  # fmt: skip
+    )

@@ -9,7 +9,7 @@ from typing import Any
 from sysid.identification.run import begin_run
 from sysid.islands.state import RunState
 from tests.runs import RECORDS, ListedRuns, Notebook, spec
-from workers.protocol import (  # fmt: skip
+from workers.protocol import (
     AdvanceRun,
     ItemResult,
     QueuedRun,

@@ -62,8 +62,15 @@ def runs_of(database: Database, job_id: str) -> list[Run]:
 
 def new_dataset(**values) -> NewDataset:
     given = {
-        "name": "step", "kind": "upload", "sha256": "a" * 64, "source_key": "s1",
-        "size_bytes": 10, "n_samples": 5, "duration": 1.0, "sample_time": 0.25,
-        "channels": [{"name": "u", "unit": "V"}], **values,
-    }  # fmt: skip
+        "name": "step",
+        "kind": "upload",
+        "sha256": "a" * 64,
+        "source_key": "s1",
+        "size_bytes": 10,
+        "n_samples": 5,
+        "duration": 1.0,
+        "sample_time": 0.25,
+        "channels": [{"name": "u", "unit": "V"}],
+        **values,
+    }
     return NewDataset(**given)

@@ -55,9 +55,12 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
     child = subprocess.Popen(
         [sys.executable, "-m", "tests.two_nodes", str(folder), str(temporary)],
         env={**os.environ, **_auth(token), "RAY_USAGE_STATS_ENABLED": "0"},
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=log,
+        text=True,
         start_new_session=True,
-    )  # fmt: skip
+    )
     assert child.stdin is not None
     assert child.stdout is not None
     try:

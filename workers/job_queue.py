@@ -24,7 +24,7 @@ from workers.protocol import (
     RunObserver,
     RunProgress,
     WorkItem,
-)  # fmt: skip
+)
 
 MAX_SHARED_RECORDS = 16
 """Sets of records that a job keeps with the crew."""

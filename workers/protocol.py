@@ -155,9 +155,11 @@ class RunConclusion:
 
 
 def _rebuild_conclusion(
-    rest: Identification, histories: list[list[Any]], migrants: list[Any],
+    rest: Identification,
+    histories: list[list[Any]],
+    migrants: list[Any],
     rms_noise_free: float | None,
-) -> RunConclusion:  # fmt: skip
+) -> RunConclusion:
     history = tuple(tuple(map(Improvement._make, island)) for island in histories)
     found = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
     return RunConclusion(found, rms_noise_free)

@@ -23,7 +23,7 @@ from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.island import Island
 from sysid.simulation.problem import Problem, compute_reference_rms
-from workers.protocol import (  # fmt: skip
+from workers.protocol import (
     AdvanceRun,
     EvolveIsland,
     IslandProgress,

@@ -92,16 +92,17 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     total = sum(run.evaluations for run in runs)
     estimates, reasons = [run.estimates for run in runs], [reason(run.error) for run in runs]
     figures = {
-        "summary": summary, "evaluations of the job": job.evaluations, "of its runs": total,
+        "summary": summary,
+        "evaluations of the job": job.evaluations,
+        "of its runs": total,
         "histories": [paths.get(run.id) for run in runs],
-        "estimates": estimates, "reasons": reasons,
-    }  # fmt: skip
+        "estimates": estimates,
+        "reasons": reasons,
+    }
     given_up = job.state is JobState.FAILED and job.lost_leases >= job.max_attempts
     states = tuple(run.state.value for run in runs)
     killed = tuple((run.error or "").startswith(KILLED) for run in runs)
-    unplotted = sum(
-        run.state is JobState.SUCCEEDED and run.signals_sha256 is None for run in runs
-    )  # fmt: skip
+    unplotted = sum(run.state is JobState.SUCCEEDED and run.signals_sha256 is None for run in runs)
     text = json.dumps(figures, sort_keys=True)
     return Finding(states, doubled, given_up, text, killed, unplotted)
 

@@ -48,9 +48,11 @@ def _is_refused(bench: Bench) -> bool:
     rows = [f"{0.02 * i:.2f},{new + i},{new - i}" for i in range(5_000)]
     text = "\n".join(["t,q [N],y [m]", *rows, ""])
     answer = httpx.post(
-        f"{bench.stand.url}/v1/datasets", content=text, headers={"Content-Type": "text/csv"},
+        f"{bench.stand.url}/v1/datasets",
+        content=text,
+        headers={"Content-Type": "text/csv"},
         timeout=60.0,
-    )  # fmt: skip
+    )
     if answer.status_code == httpx.codes.INTERNAL_SERVER_ERROR:
         raise AssertionError(f"the web answered 500 while its disk was full: {answer.text}")
     return answer.status_code == httpx.codes.SERVICE_UNAVAILABLE

@@ -115,8 +115,9 @@ def pause_dispatcher(bench: Bench) -> float:
             held = f"-{first}-"
             until(
                 lambda: not any(held in owner for owner in owners(bench.stand)),
-                "the paused dispatcher's jobs were given to another", LIMIT_SECONDS,
-            )  # fmt: skip
+                "the paused dispatcher's jobs were given to another",
+                LIMIT_SECONDS,
+            )
             took = goes_on(bench, begun)
             time.sleep(max(0.0, PAUSED_SECONDS - (time.monotonic() - begun)))
         finally:
@@ -152,8 +153,9 @@ def renewal(bench: Bench, fault: Callable[[], None]) -> float:
     fault()
     until(
         lambda: bool(owners(bench.stand) - before) and bench.stand.answers() == 200,
-        "another dispatcher has the jobs", LIMIT_SECONDS,
-    )  # fmt: skip
+        "another dispatcher has the jobs",
+        LIMIT_SECONDS,
+    )
     return goes_on(bench, begun)
 
 

@@ -54,12 +54,17 @@ class Stand:
         self.family = Family(mark := secrets.token_hex(8))
         address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
         self.environment = {
-            **os.environ, MARK: mark, "LAGID_DATA_DIR": str(folder), "LAGID_CPUS": str(cpus),
-            "LAGID_PORT": str(self.port), "OPENBLAS_NUM_THREADS": "1",
+            **os.environ,
+            MARK: mark,
+            "LAGID_DATA_DIR": str(folder),
+            "LAGID_CPUS": str(cpus),
+            "LAGID_PORT": str(self.port),
+            "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(self.temporary),
             "PYTHONPATH": os.pathsep.join([str(SHIM), str(Path.cwd())]),
-            **address, **(environment or {}),
-        }  # fmt: skip
+            **address,
+            **(environment or {}),
+        }
         self.url = f"http://127.0.0.1:{self.port}"
         self.database = Database(database_url or make_sqlite_url(folder / "lagid.db"))
         self.client = Client(self.url)
@@ -99,9 +104,13 @@ class Stand:
         """A second dispatcher for the length of the block, which ends in order."""
         with (self.folder / "second.log").open("ab") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "service.dispatch.process"], env=self.environment,
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-            )  # fmt: skip
+                [sys.executable, "-m", "service.dispatch.process"],
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
         try:
             yield child
         finally:
@@ -149,9 +158,13 @@ class Stand:
     def _spawn(self) -> None:
         with (self.folder / "serve.log").open("ab") as log:
             self.web = subprocess.Popen(
-                [sys.executable, "-m", "service.cli.main", "serve"], env=self.environment,
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-            )  # fmt: skip
+                [sys.executable, "-m", "service.cli.main", "serve"],
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
 
     def _end_web(self) -> None:
         if self.web is not None and self.web.poll() is None:

@@ -32,9 +32,10 @@ def bodies(dataset: str) -> dict[str, dict[str, Any]]:
     kill their workers or take all memory; one to be cancelled, which ends with making floors.
     """
     common = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False}
-    unstable = {"path": "/parameters/b", "values": [
-        {"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8},
-    ]}  # fmt: skip
+    unstable = {
+        "path": "/parameters/b",
+        "values": [{"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8}],
+    }
     endless = {"generations": 40_000, "islands": 4, "stop": {"settled": None}}
     bad = [*range(1, 6), *DEADLY, *range(6, 11), *GREEDY, *range(11, 16)]
     sigmas = {"path": "/noise/sigma", "values": [0.01, 0.02]}

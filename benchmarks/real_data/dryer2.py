@@ -28,8 +28,10 @@ def measure(client: Client, folder: Path) -> list[Row]:
         "datasets": [half("dryer2 a", [0, 500])],
         "validation": {"datasets": [half("dryer2 b", [500, 1000])]},
     }
-    alone = {**common, "validation": {"datasets": [half("dryer2 b alone", [500, 1000],
-                                                        history=False)]}}  # fmt: skip
+    alone = {
+        **common,
+        "validation": {"datasets": [half("dryer2 b alone", [500, 1000], history=False)]},
+    }
     rows = []
     for model, bar in BARS.items():
         run = identify(client, {**common, "name": f"dryer2 {model}", "model": model})

@@ -74,9 +74,13 @@ def pooled(
     """The outlet of the even (0) or odd (1) repeats over the inlet curve of all (data's README)."""
     chosen = {"length_m": length, "p_nom_bar": pressure, "phase": "fill"}
     pooling = {
-        "input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1,
+        "input": "p_in_bar",
+        "outputs": ["p_out_bar"],
+        "bin": 0.003,
+        "start": 0,
+        "stop": 1,
         "outputs_from": {"repeat": {"modulus": 2, "remainder": remainder}},
-    }  # fmt: skip
+    }
     name = f"{length:g} m, {pressure:g} bar, fill, {'odd' if remainder else 'even'} repeats"
     return client.derive(raw, [{"select": chosen}, {"pool": pooling}], name=name)
 

@@ -49,9 +49,12 @@ def measure(client: Client, folder: Path, *, quick: bool = False) -> list[Row]:
 def carried_out(client: Client, batch: Batch, **fields: Any) -> Carried:
     """Submit a batch to the recipe and wait for it."""
     body = {
-        "model": "tube", "label": "length_m", "predict": [PREDICTED_M],
-        "batch": [{"x": x, "datasets": list(datasets)} for x, datasets in batch], **fields,
-    }  # fmt: skip
+        "model": "tube",
+        "label": "length_m",
+        "predict": [PREDICTED_M],
+        "batch": [{"x": x, "datasets": list(datasets)} for x, datasets in batch],
+        **fields,
+    }
     job = client.reidentify(body)
     ended = client.wait(job["id"], progress=lambda _: PEAK.sample())
     if ended["state"] != "succeeded":
@@ -62,11 +65,12 @@ def carried_out(client: Client, batch: Batch, **fields: Any) -> Carried:
 
 def _reference_tubes(client: Client, folder: Path) -> list[Row]:
     stored = {
-        (length, pattern): client.add_dataset(
-            folder / f"tube_{length:03d}m_pattern{pattern}.csv"
-        )["id"]
-        for length in REFERENCE for pattern in (1, 2)
-    }  # fmt: skip
+        (length, pattern): client.add_dataset(folder / f"tube_{length:03d}m_pattern{pattern}.csv")[
+            "id"
+        ]
+        for length in REFERENCE
+        for pattern in (1, 2)
+    }
     rows: list[Row] = []
     cold_all, warm_all, first = 0, 0, None
     for pattern in (1, 2):
@@ -85,9 +89,9 @@ def _reference_tubes(client: Client, folder: Path) -> list[Row]:
             cold_all, warm_all = cold_all + cold.evaluations, warm_all + anew.evaluations
         first = next(run["id"] for x, run in warm.runs if x == 40)
     jointly = [(float(length), [stored[length, 1], stored[length, 2]]) for length in REFERENCE]
-    print_trend("tube reference, both patterns together", carried_out(
-        client, jointly, channels=CHANNELS
-    ))  # fmt: skip
+    print_trend(
+        "tube reference, both patterns together", carried_out(client, jointly, channels=CHANNELS)
+    )
     print(f"\nthe same runs: cold starts {cold_all} simulations, warm starts {warm_all}")
     return [*rows, Row("cold over warm simulations", cold_all / warm_all, "1", 2.0, ">=")]
 
@@ -129,9 +133,13 @@ def _measured_tubes(client: Client, folder: Path) -> list[Row]:
             shortest = min(shortest, made["duration"])
             batch.append((length, [made["id"]]))
     found = carried_out(
-        client, batch, channels={"u": "p_in_bar", "y": "p_out_bar"}, look_at=["T", "L"],
-        loss={"kind": "soft-l1", "scale": 0.1}, parameters={"L": {"upper": shortest / 2}},
-    )  # fmt: skip
+        client,
+        batch,
+        channels={"u": "p_in_bar", "y": "p_out_bar"},
+        look_at=["T", "L"],
+        loss={"kind": "soft-l1", "scale": 0.1},
+        parameters={"L": {"upper": shortest / 2}},
+    )
     print_trend("pneuact, fill, 3 to 8 m", found)
     law = next(law for law in _quantity(found, "L")["laws"] if law["law"] == "line")
     slope = law["coefficients"][1]
@@ -149,8 +157,9 @@ def _quantity(found: Carried, name: str) -> dict[str, Any]:
 def print_trend(title: str, found: Carried) -> None:
     """Print the table of a batch, its laws and predictions."""
     quantities = found.trend["quantities"]
-    names = [f"{one['name']}{'' if one['unit'] == '1' else ', ' + one['unit']}"
-             for one in quantities]  # fmt: skip
+    names = [
+        f"{one['name']}{'' if one['unit'] == '1' else ', ' + one['unit']}" for one in quantities
+    ]
     print(f"\n### {title}: {found.evaluations} simulations\n")
     print(f"| length, m | runs | {' | '.join(names)} | measured span |")
     print(f"|--:|--:|{'--:|' * len(names)}--:|")
@@ -165,11 +174,15 @@ def print_trend(title: str, found: Carried) -> None:
                 f"{c['name']} = {c['value']:.4g} ± {c['stderr']:.2g}" for c in law["coefficients"]
             )
             chosen = ", chosen" if law["is_chosen"] else ""
-            print(f"- {one['name']} = {law['formula']}: {known}; AIC {law['aic']:.2f}, "
-                  f"Birge ratio {law['birge']:.2f}{chosen}")  # fmt: skip
+            print(
+                f"- {one['name']} = {law['formula']}: {known}; AIC {law['aic']:.2f}, "
+                f"Birge ratio {law['birge']:.2f}{chosen}"
+            )
         for at in one["predictions"]:
-            print(f"- {one['name']} at {at['x']:g} m: {at['value']:.4g}, 95 % interval "
-                  f"{at['lower']:.4g} to {at['upper']:.4g}")  # fmt: skip
+            print(
+                f"- {one['name']} at {at['x']:g} m: {at['value']:.4g}, 95 % interval "
+                f"{at['lower']:.4g} to {at['upper']:.4g}"
+            )
 
 
 def _shown(one: Mapping[str, Any], x: float) -> str:

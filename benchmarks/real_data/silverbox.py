@@ -27,8 +27,9 @@ def measure(client: Client, folder: Path) -> list[Row]:
 
     def part(name: str, rows: list[int], *, history: bool) -> str:
         steps: list[dict[str, Any]] = [
-            {"trim": {"rows": rows, "history": history}}, {"hold": {"u": "band-limited"}},
-        ]  # fmt: skip
+            {"trim": {"rows": rows, "history": history}},
+            {"hold": {"u": "band-limited"}},
+        ]
         name = f"silverbox {name}{'' if history else ' alone'}"
         return str(client.derive(raw["id"], steps, name=name)["id"])
 

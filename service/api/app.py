@@ -18,7 +18,7 @@ from service.api import (
     recipes,
     references,
     runs,
-)  # fmt: skip
+)
 from service.api.dependencies import Parts
 from service.api.middleware import BodyLimit
 from service.core.settings import Settings
@@ -52,9 +52,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
-        health.router, datasets.router, models.router, jobs.router, recipes.recipe_router,
-        references.reference_router, events.router, runs.comparison_router, runs.router, pages.router,
-    ):  # fmt: skip
+        health.router,
+        datasets.router,
+        models.router,
+        jobs.router,
+        recipes.recipe_router,
+        references.reference_router,
+        events.router,
+        runs.comparison_router,
+        runs.router,
+        pages.router,
+    ):
         app.include_router(router)
     return app
 

@@ -55,11 +55,16 @@ async def add_dataset(
     """Store a recording, CSV or MCAP. The same bytes again give the same dataset (200)."""
     async with receive_upload(request, parts.settings) as upload:
         stored = await run_in_threadpool(
-            datasets.add_upload, parts.database, parts.store, upload.path, upload.file_format,
-            sha256=upload.sha256, name=name or upload.name,
+            datasets.add_upload,
+            parts.database,
+            parts.store,
+            upload.path,
+            upload.file_format,
+            sha256=upload.sha256,
+            name=name or upload.name,
             segments=[one.strip() for one in (segments or "").split(",") if one.strip()],
             sample_time=sample_time,
-        )  # fmt: skip
+        )
     return _dataset_response(stored, response, name)
 
 

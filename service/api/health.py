@@ -55,8 +55,11 @@ def read_metrics(session: ReadSession) -> str:
     lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
     for state, n in JobRepository(session).count_states().items():
         lines.append(f'lagid_jobs{{state="{state.value}"}} {n}')
-    lines += ["# HELP lagid_dispatchers Dispatchers that are alive.",
-              "# TYPE lagid_dispatchers gauge", f"lagid_dispatchers {alive_now}"]  # fmt: skip
+    lines += [
+        "# HELP lagid_dispatchers Dispatchers that are alive.",
+        "# TYPE lagid_dispatchers gauge",
+        f"lagid_dispatchers {alive_now}",
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -55,9 +55,12 @@ def reidentify_page(session: ReadSession) -> Response:
 
 @router.get("/jobs/{job_id}", **HIDDEN)
 def job_page(
-    job_id: str, request: Request, session: ReadSession, cursor: Cursor = None,
+    job_id: str,
+    request: Request,
+    session: ReadSession,
+    cursor: Cursor = None,
     cell: CellFilter = None,
-) -> Response:  # fmt: skip
+) -> Response:
     """One job with its runs, or the grid of its cells and the runs of the chosen one."""
     url = str(request.base_url)
     return HtmlPage(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
@@ -145,8 +148,9 @@ def trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Resp
     return _figure_response(results.load_trend_figure(session, job_id, choice), "trend", choice)
 
 
-@router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"],
-            response_class=JSONResponse)  # fmt: skip
+@router.get(
+    "/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"], response_class=JSONResponse
+)
 def dataset_figure(
     dataset_id: str, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:

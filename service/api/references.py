@@ -13,7 +13,7 @@ reference_router = APIRouter(prefix="/v1/references", tags=["references"])
 @reference_router.get("")
 def list_references(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50
-) -> Page[ReferenceOut]:  # fmt: skip
+) -> Page[ReferenceOut]:
     """References in use, by name."""
     return references.list_references(session, cursor, limit)
 

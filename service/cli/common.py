@@ -45,8 +45,18 @@ SampleTime = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for machines.")]
 
-__all__ = ["DEFAULT_URL", "AsJson", "Key", "SampleTime", "Segments", "Url", "connect_client", "fail",
-           "out", "print_json"]  # fmt: skip
+__all__ = [
+    "DEFAULT_URL",
+    "AsJson",
+    "Key",
+    "SampleTime",
+    "Segments",
+    "Url",
+    "connect_client",
+    "fail",
+    "out",
+    "print_json",
+]
 
 
 @contextmanager
@@ -125,8 +135,9 @@ def print_table(
         table.add_column(
             format_cell(heading.removeprefix(">")),
             justify="right" if heading.startswith(">") else "left",
-            overflow="fold", no_wrap=number == 0,
-        )  # fmt: skip
+            overflow="fold",
+            no_wrap=number == 0,
+        )
     for row in rows:
         table.add_row(*(format_cell(value) for value in row))
     if table.row_count:
@@ -136,9 +147,13 @@ def print_table(
 
 
 def print_listing(
-    found: list[dict[str, Any]], as_json: bool, headings: Sequence[str],
-    row: Callable[[dict[str, Any]], Sequence[object]], *, empty: str,
-) -> None:  # fmt: skip
+    found: list[dict[str, Any]],
+    as_json: bool,
+    headings: Sequence[str],
+    row: Callable[[dict[str, Any]], Sequence[object]],
+    *,
+    empty: str,
+) -> None:
     """Print what a server lists: as JSON, or one `row` each under headings."""
     if as_json:
         print_json(found)
@@ -315,10 +330,12 @@ def report_faults(places: FieldOrigins) -> Iterator[None]:
         entries = error.document.get("errors") or ()
         if error.status != INVALID_STATUS or not entries:
             raise
-        fail(places.describe_faults(
-            FieldError(str(one.get("pointer") or ""), str(one.get("detail")), one.get("column"))
-            for one in entries
-        ))  # fmt: skip
+        fail(
+            places.describe_faults(
+                FieldError(str(one.get("pointer") or ""), str(one.get("detail")), one.get("column"))
+                for one in entries
+            )
+        )
 
 
 def _iterate_parents(pointer: str) -> Iterator[str]:

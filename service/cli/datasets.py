@@ -40,10 +40,16 @@ def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = Fal
         found,
         as_json,
         ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
-        lambda one: (one["id"], one["name"], one["kind"], one["samples"], one["duration"],
-                     _format_channels(one)),
+        lambda one: (
+            one["id"],
+            one["name"],
+            one["kind"],
+            one["samples"],
+            one["duration"],
+            _format_channels(one),
+        ),
         empty="no datasets; add one: lagid dataset add recording.csv",
-    )  # fmt: skip
+    )
 
 
 @app.command("add")

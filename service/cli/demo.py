@@ -95,9 +95,12 @@ def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
         cells = [_format_estimate(runs[method], name) for method in METHODS]
         unit = next(p["unit"] for p in runs["improved"]["parameters"] if p["name"] == name)
         table.add_row(
-            f"{name} \\[{unit}]", f"{true:g}", f"{PAPER_SIMPLE[name]:.6f}",
-            f"{PAPER_PROPOSED[name]:.6f}", *cells,
-        )  # fmt: skip
+            f"{name} \\[{unit}]",
+            f"{true:g}",
+            f"{PAPER_SIMPLE[name]:.6f}",
+            f"{PAPER_PROPOSED[name]:.6f}",
+            *cells,
+        )
     table.add_section()
     table.add_row("RMS \\[m]", f"{NOISE_SD:g}", "", "", *(f"{runs[m]['rms']:.6f}" for m in METHODS))
     table.add_row("simulations", "", "", "", *(str(runs[m]["evaluations"]) for m in METHODS))

@@ -51,10 +51,14 @@ SERVER_SETTINGS = {
     "model": "use --model",
     "validation.datasets": "use --validation FILE",
 }
-FIELD_ORIGINS = FieldOrigins({
-    "/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}",
-    "/loss/noise_model": "--noise-model",
-})  # fmt: skip
+FIELD_ORIGINS = FieldOrigins(
+    {
+        "/model": "--model …",
+        "/datasets": "DATA",
+        "/channels": "--channels {}",
+        "/loss/noise_model": "--noise-model",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +194,10 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
     if validation is None or not (data.is_file() and validation.is_file()):
         return
     if read_file(data) == read_file(validation):
-        fail_usage(f"--validation {validation}: this is the recording that is fitted; name another, "
-              "or use --set validation.fraction=0.3")  # fmt: skip
+        fail_usage(
+            f"--validation {validation}: this is the recording that is fitted; name another, "
+            "or use --set validation.fraction=0.3"
+        )
 
 
 def read_recording(path: Path, reading: CsvOptions) -> "Recording":
@@ -293,8 +299,12 @@ def _run_identification(
 
     document = body.to_normal_form()
     algorithm = to_algorithm(document["algorithm"])
-    columns = (BarColumn(bar_width=40), TextColumn("{task.percentage:>3.0f} %"),
-               TextColumn("RMS {task.fields[rms]}"), TimeElapsedColumn())  # fmt: skip
+    columns = (
+        BarColumn(bar_width=40),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("RMS {task.fields[rms]}"),
+        TimeElapsedColumn(),
+    )
     console = Console(stderr=True, highlight=False)
     quiet = quiet or not console.is_terminal  # in a file an ended bar is an empty line
     with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
@@ -304,13 +314,20 @@ def _run_identification(
             progress.update(bar, completed=state.generation, rms=f"{state.rms:.6g}")
 
         return identified(
-            model, records, algorithm, seed=body.seed, parameters=document["parameters"],
-            prediction=body.prediction, loss=to_loss(document["loss"]), weights=body.weights,
-            skip=body.skip, validation=kept or None,
+            model,
+            records,
+            algorithm,
+            seed=body.seed,
+            parameters=document["parameters"],
+            prediction=body.prediction,
+            loss=to_loss(document["loss"]),
+            weights=body.weights,
+            skip=body.skip,
+            validation=kept or None,
             validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
             progress=show,
-        )  # fmt: skip
+        )
 
 
 def _load_model(name: str) -> "Model":
@@ -328,6 +345,8 @@ def _extract_records(
     for signal, channel in channels.by_signal.items():
         if channel not in recording.names:
             given = f"--channels {signal}" if signal in body.channels else "--channels"
-            fail(f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
-                 f"{suggest_name(channel, recording.names)}")  # fmt: skip
+            fail(
+                f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
+                f"{suggest_name(channel, recording.names)}"
+            )
     return list(channels.cut_records(recording, path.stem))

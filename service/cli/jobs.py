@@ -95,11 +95,19 @@ def list_jobs(
         found,
         as_json,
         ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
-        lambda one: (one["id"], one["name"], one["state"], one["model"], _format_progress(one),
-                     *_single_run_rms(one), format_moment(one["created_at"])),
-        empty=f"no jobs are {' or '.join(state)}" if state
+        lambda one: (
+            one["id"],
+            one["name"],
+            one["state"],
+            one["model"],
+            _format_progress(one),
+            *_single_run_rms(one),
+            format_moment(one["created_at"]),
+        ),
+        empty=f"no jobs are {' or '.join(state)}"
+        if state
         else "no jobs; submit one: lagid submit job.yaml",
-    )  # fmt: skip
+    )
 
 
 def list_runs(
@@ -164,8 +172,10 @@ def read_job(file: Path) -> dict[str, Any]:
         body["model"] = read_document(file.parent / model)
     for one in body.get("datasets") or []:
         if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
-            fail(f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
-                 f"add it first: lagid dataset add {one}")  # fmt: skip
+            fail(
+                f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
+                f"add it first: lagid dataset add {one}"
+            )
     return body
 
 
@@ -189,8 +199,15 @@ def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
                 *(found.get(name) for name in units),
             ]
         )
-    headings = ("run", "state", *paths, f">{append_unit('RMS', rms_unit)}", ">fit %",
-                ">validation %", *(f">{append_unit(*one)}" for one in units.items()))  # fmt: skip
+    headings = (
+        "run",
+        "state",
+        *paths,
+        f">{append_unit('RMS', rms_unit)}",
+        ">fit %",
+        ">validation %",
+        *(f">{append_unit(*one)}" for one in units.items()),
+    )
     print_table(headings, rows, empty="no runs")
 
 

@@ -50,11 +50,17 @@ def list_models(
         found,
         as_json,
         ("name", ">version", "form", "inputs", "outputs", "parameters", "title"),
-        lambda one: (one["name"], one["version"] or "built in", one["form"],
-                     ", ".join(one["inputs"]), ", ".join(one["outputs"]),
-                     ", ".join(one["parameters"]), one["title"]),
+        lambda one: (
+            one["name"],
+            one["version"] or "built in",
+            one["form"],
+            ", ".join(one["inputs"]),
+            ", ".join(one["outputs"]),
+            ", ".join(one["parameters"]),
+            one["title"],
+        ),
         empty="no models",
-    )  # fmt: skip
+    )
 
 
 @app.command("show")

@@ -27,11 +27,12 @@ def reproduce_paper(
     ] = None,
     url: Annotated[
         str | None,
-        typer.Option(help="A server that does the work; else one is started for it.",
-                     show_default=False),
+        typer.Option(
+            help="A server that does the work; else one is started for it.", show_default=False
+        ),
     ] = None,
     key: Key = None,
-) -> None:  # fmt: skip
+) -> None:
     """Reproduce the paper's tables and figures with real jobs; print tables, write a report."""
     from service.paper.bench import StudyBench
     from service.paper.document import to_markdown

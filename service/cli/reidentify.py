@@ -107,11 +107,13 @@ def reidentify(
     batch = [_parse_experiments(text) for text in experiments]
     chosen = _choose_label_value([x for x, _ in batch], label, accept, accept_run)
     body: dict[str, Any] = {
-        "model": read_model(model), "label": label, "look_at": split_names(parameters),
+        "model": read_model(model),
+        "label": label,
+        "look_at": split_names(parameters),
         "predict": [parse_number("--predict", one) for one in split_names(predict)],
         "channels": parse_channels(channels),
         **_drop_missing(reference=reference, warm_start=warm_start, name=name),
-    }  # fmt: skip
+    }
     for change in changes or []:
         apply_setting(body, change)
     with connect_client(url, key) as client:
@@ -130,11 +132,19 @@ def reidentify(
 def _field_origins(experiments: list[str]) -> FieldOrigins:
     """Where the fields of the body stand on the command line; entries of the batch as typed."""
     batch = {f"/batch/{number}": text for number, text in enumerate(experiments)}
-    return FieldOrigins({
-        "/model": "--model …", "/label": "--label", "/look_at": "--parameters",
-        "/predict": "--predict", "/reference": "--reference", "/warm_start": "--warm-start",
-        "/name": "--name", "/channels": "--channels {}", **batch,
-    })  # fmt: skip
+    return FieldOrigins(
+        {
+            "/model": "--model …",
+            "/label": "--label",
+            "/look_at": "--parameters",
+            "/predict": "--predict",
+            "/reference": "--reference",
+            "/warm_start": "--warm-start",
+            "/name": "--name",
+            "/channels": "--channels {}",
+            **batch,
+        }
+    )
 
 
 def _print_outcome(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
@@ -247,8 +257,10 @@ def show_reference(
     out.print(f"{found['name']}: {_format_estimates(found['estimates'])}", markup=False)
     if found["labels"]:
         out.print(format_labels(found["labels"]), markup=False)
-    rows = [(one["run"], format_moment(one["at"]), one["by"], one["note"])
-            for one in (found, *found["history"])]  # fmt: skip
+    rows = [
+        (one["run"], format_moment(one["at"]), one["by"], one["note"])
+        for one in (found, *found["history"])
+    ]
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
 

@@ -52,10 +52,11 @@ class _RunsGroup(TyperGroup):
 
 
 app = typer.Typer(
-    cls=_RunsGroup, add_completion=False,
+    cls=_RunsGroup,
+    add_completion=False,
     help="List the runs of a job with their estimates: lagid runs [JOB]; show one: "
     "lagid runs RUN; or ask about it.",
-)  # fmt: skip
+)
 app.command(LIST_COMMAND)(listing)
 
 
@@ -69,8 +70,17 @@ def show_residuals(
     if as_json:
         print_json(found)
         return
-    headings = ("test", "experiment", "output", "input", ">samples", ">inside 95 %",
-                ">inside 99 %", ">p", "verdict")  # fmt: skip
+    headings = (
+        "test",
+        "experiment",
+        "output",
+        "input",
+        ">samples",
+        ">inside 95 %",
+        ">inside 99 %",
+        ">p",
+        "verdict",
+    )
     print_table(headings, map(_test_row, found["tests"]), empty="no tests")
     verdict = {True: "passed", False: "failed", None: "not tested"}[found["passed"]]
     out.print(f"residuals on {found['data']} data: {verdict}", markup=False)
@@ -97,9 +107,12 @@ def simulate_run(
         return
     for one in found["outputs"]:
         values = [value for value in one["values"] if value is not None]
-        out.print(f"{one['name']} [{one['unit']}]: {one['samples']} samples, from {min(values):.6g}"
-                  f" to {max(values):.6g}, at the end {values[-1]:.6g}",
-                  markup=False, soft_wrap=True)  # fmt: skip
+        out.print(
+            f"{one['name']} [{one['unit']}]: {one['samples']} samples, from {min(values):.6g}"
+            f" to {max(values):.6g}, at the end {values[-1]:.6g}",
+            markup=False,
+            soft_wrap=True,
+        )
     _print_step(found["metrics"])
     _print_controller(found["controller"], found["tuning"], found["margins"])
     for note in found["notes"]:
@@ -126,10 +139,14 @@ def profile_run(
         print_json(found)
         return
     rows = [
-        [one["name"], one["unit"], f"{one['estimate']:.6g}",
-         *("open" if end is None else f"{end:.6g}" for end in one["interval95"])]
+        [
+            one["name"],
+            one["unit"],
+            f"{one['estimate']:.6g}",
+            *("open" if end is None else f"{end:.6g}" for end in one["interval95"]),
+        ]
         for one in found["profiles"]
-    ]  # fmt: skip
+    ]
     print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
 
 
@@ -146,11 +163,24 @@ def compare_runs(
     if as_json:
         print_json(found)
         return
-    headings = ("run", "model", ">parameters", ">samples", f">RMS [{found['unit']}]", ">fit %",
-                ">validation %", ">AIC", ">BIC", "residuals",
-                *(f">{one['name']}" for one in found["parameters"]))  # fmt: skip
-    print_table(headings, [_comparison_row(one, found["parameters"]) for one in found["runs"]],
-                empty="no runs")  # fmt: skip
+    headings = (
+        "run",
+        "model",
+        ">parameters",
+        ">samples",
+        f">RMS [{found['unit']}]",
+        ">fit %",
+        ">validation %",
+        ">AIC",
+        ">BIC",
+        "residuals",
+        *(f">{one['name']}" for one in found["parameters"]),
+    )
+    print_table(
+        headings,
+        [_comparison_row(one, found["parameters"]) for one in found["runs"]],
+        empty="no runs",
+    )
     for note in found["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
 
@@ -193,11 +223,14 @@ def _print_controller(
         parts.append(f"T_d = {used['derivative_time']:.6g} s, N = {used['derivative_filter']:.4g}")
     rule = "" if tuning is None else f" by {tuning['rule'].upper()} ({tuning['reference']})"
     out.print(f"controller{rule}: {', '.join(parts)}", markup=False, soft_wrap=True)
-    limited = "" if used["lower"] is used["upper"] is None else (
-        f", {used['saturated_percent']:.3g} % of the time at a limit"
-    )  # fmt: skip
-    out.print(f"command: {used['command_min']:.6g} to {used['command_max']:.6g}{limited}",
-              markup=False)  # fmt: skip
+    limited = (
+        ""
+        if used["lower"] is used["upper"] is None
+        else (f", {used['saturated_percent']:.3g} % of the time at a limit")
+    )
+    out.print(
+        f"command: {used['command_min']:.6g} to {used['command_max']:.6g}{limited}", markup=False
+    )
     if margins is not None and margins["is_stable"]:
         shown = [
             f"{name} {margins[key]:.3g}{unit}"
@@ -210,10 +243,16 @@ def _print_controller(
 def _test_row(one: dict[str, Any]) -> tuple[object, ...]:
     reason = f": {one['reason']}" if one["reason"] else ""
     return (
-        one["test"], one["experiment"] + 1, one["output"], one["input"], one["samples"],
-        _format_percent(one["inside95"]), _format_percent(one["inside99"]), format_p_value(one["p"]),
+        one["test"],
+        one["experiment"] + 1,
+        one["output"],
+        one["input"],
+        one["samples"],
+        _format_percent(one["inside95"]),
+        _format_percent(one["inside99"]),
+        format_p_value(one["p"]),
         f"{one['outcome']}{reason}",
-    )  # fmt: skip
+    )
 
 
 def _comparison_row(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:

@@ -66,8 +66,10 @@ def serve(
 
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
-            out.print(f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); "
-                      "Ctrl-C ends it", soft_wrap=True)  # fmt: skip
+            out.print(
+                f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); Ctrl-C ends it",
+                soft_wrap=True,
+            )
             _run_server(create_app(settings), listener, supervisor)
 
 

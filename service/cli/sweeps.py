@@ -50,13 +50,24 @@ LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX = (
 )  # places of 5, 50 and 95 % among the quantiles of a summary
 
 NamedValues = list[str] | None
-FIELD_ORIGINS = FieldOrigins({
-    "/model": "--model …", "/sigma": "--sigma", "/relative": "--relative",
-    "/replicates": "--replicates", "/methods": "--methods", "/seed": "--seed", "/name": "--name",
-    "/datasets": "--data", "/channels": "--channels {}", "/truth": "--true",
-    "/truth/parameters": "--true {}", "/truth/inputs": "--input {}", "/truth/samples": "--samples",
-    "/truth/sample_time": "--sample-time",
-})  # fmt: skip
+FIELD_ORIGINS = FieldOrigins(
+    {
+        "/model": "--model …",
+        "/sigma": "--sigma",
+        "/relative": "--relative",
+        "/replicates": "--replicates",
+        "/methods": "--methods",
+        "/seed": "--seed",
+        "/name": "--name",
+        "/datasets": "--data",
+        "/channels": "--channels {}",
+        "/truth": "--true",
+        "/truth/parameters": "--true {}",
+        "/truth/inputs": "--input {}",
+        "/truth/samples": "--samples",
+        "/truth/sample_time": "--sample-time",
+    }
+)
 
 Data = Annotated[
     str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
@@ -115,11 +126,16 @@ def sweep_noise(
     """
     truth = _build_truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
-        "model": read_model(model), "sigma": [one for text in sigma for one in parse_sigma_grid(text)],
-        "relative": relative, "replicates": replicates, "methods": split_names(methods),
-        "seed": seed, "channels": parse_channels(channels),
-        **_choose_source(data, truth), **({} if name is None else {"name": name}),
-    }  # fmt: skip
+        "model": read_model(model),
+        "sigma": [one for text in sigma for one in parse_sigma_grid(text)],
+        "relative": relative,
+        "replicates": replicates,
+        "methods": split_names(methods),
+        "seed": seed,
+        "channels": parse_channels(channels),
+        **_choose_source(data, truth),
+        **({} if name is None else {"name": name}),
+    }
     for change in changes or []:
         apply_setting(body, change)
     with connect_client(url, key) as client:
@@ -147,8 +163,10 @@ def parse_sigma_grid(text: str) -> list[float]:
                 fail_usage(f"--sigma {text}: {count} values; at most {MAX_SIGMA_VALUES}")
             found += [float(start + step * number) for number in range(count)]
         else:
-            fail_usage(f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
-                  "positive step, such as 0:1:0.05")  # fmt: skip
+            fail_usage(
+                f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
+                "positive step, such as 0:1:0.05"
+            )
     if not found:
         fail_usage(f"--sigma {text!r}: need numbers, such as 0:1:0.05 or 0,0.1,0.3")
     return found
@@ -164,10 +182,13 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
     others = [key for key in summary["by"] if key not in (SIGMA_PATH, RELATIVE_KEY)]
     relative = [f">{RELATIVE_KEY} σ"] if RELATIVE_KEY in summary["by"] else []
     cells = [
-        [*(_format_short(one["key"][RELATIVE_KEY], 4) for _ in relative), _format_short(one["sigma"], 4),
-         *(str(one["key"][key]) for key in others)]
+        [
+            *(_format_short(one["key"][RELATIVE_KEY], 4) for _ in relative),
+            _format_short(one["sigma"], 4),
+            *(str(one["key"][key]) for key in others),
+        ]
         for one in groups
-    ]  # fmt: skip
+    ]
     unit = summary["rms_unit"]
     one_output = None if unit == "σ" else unit
     keys = [
@@ -175,17 +196,27 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
         f">{append_unit('σ', one_output)}",
         *(key.rsplit("/", 1)[-1] for key in others),
     ]
-    found = [(
-        [*keys, ">runs", ">success", ">evaluations",
-         f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]", ">floor"],
-        [[*cell, *_group_cells(one)] for cell, one in zip(cells, groups, strict=True)],
-    )]  # fmt: skip
+    found = [
+        (
+            [
+                *keys,
+                ">runs",
+                ">success",
+                ">evaluations",
+                f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]",
+                ">floor",
+            ],
+            [[*cell, *_group_cells(one)] for cell, one in zip(cells, groups, strict=True)],
+        )
+    ]
     names = list(units)
     for first in range(0, len(names), PARAMETERS_PER_TABLE):
         some, headings = names[first : first + PARAMETERS_PER_TABLE], list(keys)
         for name in some:
-            headings += [f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error "
-                         "[5 %, 95 %]", ">floor"]  # fmt: skip
+            headings += [
+                f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error [5 %, 95 %]",
+                ">floor",
+            ]
         rows = [[*cell, *_error_cells(one, some)] for cell, one in zip(cells, groups, strict=True)]
         found.append((headings, rows))
     return found
@@ -197,15 +228,19 @@ def _group_cells(group: dict[str, Any]) -> list[str]:
         f"{ended}" if ended == group["runs"] else f"{ended}/{group['runs']}",
         f"{100 * group['success_rate']:.0f} %" if ended else "–",
         "–" if group["evaluations"] is None else f"{group['evaluations']:.0f}",
-        _format_band(group["rms_noise_free"]), _format_short(group["rms_floor"]),
-    ]  # fmt: skip
+        _format_band(group["rms_noise_free"]),
+        _format_short(group["rms_floor"]),
+    ]
 
 
 def _error_cells(group: dict[str, Any], names: list[str]) -> list[str]:
     known = {one["name"]: one for one in group["parameters"]}
     found = [known.get(name, {"error": None, "floor": None}) for name in names]
-    return [text for one in found
-            for text in (_format_band(one["error"], signed=True), _format_short(one["floor"]))]  # fmt: skip
+    return [
+        text
+        for one in found
+        for text in (_format_band(one["error"], signed=True), _format_short(one["floor"]))
+    ]
 
 
 def _print_sweep(
@@ -226,8 +261,9 @@ def _print_sweep(
             out.print()
         for note in [*summary["notes"], *([RELATIVE_NOTE] if is_relative else [])]:
             print_line(f"note: {note}")
-        out.print(f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused",
-                  markup=False)  # fmt: skip
+        out.print(
+            f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused", markup=False
+        )
     check_succeeded(job)
 
 
@@ -243,8 +279,9 @@ def _build_truth(
             one: {"kind": "expression", "expression": text}
             for one, text in parse_pairs("--input", inputs or ()).items()
         },
-        "samples": samples, "sample_time": sample_time,
-    }  # fmt: skip
+        "samples": samples,
+        "sample_time": sample_time,
+    }
 
 
 def _choose_source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:

@@ -52,10 +52,18 @@ def print_run(run: dict[str, Any], as_json: bool) -> None:
         print_line(format_labels(place))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
-        [[one["name"], format_estimate(one), one["unit"], _format_interval(one["interval95"]), describe_status(one)]
-         for one in run["parameters"]],
+        [
+            [
+                one["name"],
+                format_estimate(one),
+                one["unit"],
+                _format_interval(one["interval95"]),
+                describe_status(one),
+            ]
+            for one in run["parameters"]
+        ],
         empty="no estimates" if run["finished_at"] else "no estimates yet",
-    )  # fmt: skip
+    )
     if run["rms"] is not None:
         print_line(_format_fit(run))
     if run["error"]:
@@ -132,9 +140,13 @@ def _print_groups(client: "Client", job: dict[str, Any]) -> None:
         [summary["quantiles"].index(q) for q in (LOW_QUANTILE, MEDIAN, HIGH_QUANTILE)],
     )
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
-    headings = [*(key.removeprefix("/").replace("/", ".") for key in summary["by"]), ">runs",
-                ">success", f"{append_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
-                *(append_unit(*one) for one in units.items())]  # fmt: skip
+    headings = [
+        *(key.removeprefix("/").replace("/", ".") for key in summary["by"]),
+        ">runs",
+        ">success",
+        f"{append_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
+        *(append_unit(*one) for one in units.items()),
+    ]
     print_table(
         headings, [_group_row(one, units, places) for one in groups[:MAX_PRINTED]], empty="no runs"
     )
@@ -145,9 +157,12 @@ def _print_groups(client: "Client", job: dict[str, Any]) -> None:
 def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
     values = {one["name"]: one["value"] for one in group["parameters"]}
     return [
-        *group["key"].values(), group["runs"], f"{100 * group['success_rate']:.0f} %",
-        _format_band(group["rms"], places), *(_format_band(values.get(name), places) for name in units),
-    ]  # fmt: skip
+        *group["key"].values(),
+        group["runs"],
+        f"{100 * group['success_rate']:.0f} %",
+        _format_band(group["rms"], places),
+        *(_format_band(values.get(name), places) for name in units),
+    ]
 
 
 def _format_band(quantiles: Sequence[float] | None, places: Sequence[int]) -> str | None:
@@ -170,8 +185,13 @@ def _print_warning_kinds(warnings: list[str]) -> None:
 def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
     """Print what `GET /v1/jobs/{id}/trend` tells, with notes that name the user's `places`."""
     tables = build_tables(trend, PLAIN)
-    headings = [f">{trend['x']}", *(f">{one}" for one in tables.headings), ">measured span",
-                ">evaluations", "flags"]  # fmt: skip
+    headings = [
+        f">{trend['x']}",
+        *(f">{one}" for one in tables.headings),
+        ">measured span",
+        ">evaluations",
+        "flags",
+    ]
     rows = [
         (row.x_text, *row.cells, row.span_text, row.evaluations, "; ".join(row.flags))
         for row in tables.rows

@@ -65,9 +65,11 @@ class RunsProgress:
     """
 
     def __init__(
-        self, newest: Callable[[], Document | None], unit: str | None = None,
+        self,
+        newest: Callable[[], Document | None],
+        unit: str | None = None,
         clock: Clock = time.monotonic,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._newest, self.unit, self.clock = newest, unit, clock
         self._begun: tuple[float, int] | None = None
         self._looked, self._seen, self._text = 0.0, 0, ""

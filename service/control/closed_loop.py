@@ -51,9 +51,13 @@ class LoopResponse:
 
 
 def simulate_closed_loop(
-    model: Model, values: Mapping[str, float], times: FloatArray, reference: Channel,
-    inputs: Sequence[Channel], control: ControlIn,
-) -> LoopResponse:  # fmt: skip
+    model: Model,
+    values: Mapping[str, float],
+    times: FloatArray,
+    reference: Channel,
+    inputs: Sequence[Channel],
+    control: ControlIn,
+) -> LoopResponse:
     """The model in the loop.
 
     Parameters
@@ -151,8 +155,10 @@ def _build_controller(
 
     transport = None if control.transport is None else Transport(**control.transport.model_dump())
     gain, integral_time, derivative_time = (
-        control.gain, control.integral_time, control.derivative_time
-    )  # fmt: skip
+        control.gain,
+        control.integral_time,
+        control.derivative_time,
+    )
     told = None
     if control.tuning is not None:
         gain, integral_time, derivative_time, told = _tune_controller(
@@ -160,12 +166,21 @@ def _build_controller(
         )
     assert gain is not None
     return PidControl(
-        control.input, control.output, gain, control.limit, transport,
-        integral_time=integral_time, derivative_time=derivative_time,
-        derivative_filter=control.derivative_filter, derivative_on=control.derivative_on,
-        setpoint_weight=control.setpoint_weight, lower=control.lower, upper=control.upper,
-        anti_windup=control.anti_windup, tracking_time=control.tracking_time,
-    ), told  # fmt: skip
+        control.input,
+        control.output,
+        gain,
+        control.limit,
+        transport,
+        integral_time=integral_time,
+        derivative_time=derivative_time,
+        derivative_filter=control.derivative_filter,
+        derivative_on=control.derivative_on,
+        setpoint_weight=control.setpoint_weight,
+        lower=control.lower,
+        upper=control.upper,
+        anti_windup=control.anti_windup,
+        tracking_time=control.tracking_time,
+    ), told
 
 
 def _tune_controller(
@@ -177,9 +192,14 @@ def _tune_controller(
     from sysid.control.tuning import tune_controller
 
     found = tune_controller(
-        identified, control.input, control.output, rule=tuning.rule, controller=tuning.controller,
-        closed_loop_time_constant=tuning.closed_loop_time_constant, transport=transport,
-    )  # fmt: skip
+        identified,
+        control.input,
+        control.output,
+        rule=tuning.rule,
+        controller=tuning.controller,
+        closed_loop_time_constant=tuning.closed_loop_time_constant,
+        transport=transport,
+    )
     process = found.process
     told = TuningOut.from_source(
         found,
@@ -221,9 +241,14 @@ def _to_controller_out(used: "PidControl", command: FloatArray) -> ControllerOut
 
 
 def _check_loop_finite(
-    outputs: Sequence[Channel], times: FloatArray, gain: float, step: float,
-    margins: MarginsOut | None, *, is_tuned: bool,
-) -> None:  # fmt: skip
+    outputs: Sequence[Channel],
+    times: FloatArray,
+    gain: float,
+    step: float,
+    margins: MarginsOut | None,
+    *,
+    is_tuned: bool,
+) -> None:
     """Refuse a loop that diverges: its gain is to blame, or steps (s) too long for a stable one."""
     try:
         check_finite_outputs(outputs, times)

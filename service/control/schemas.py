@@ -66,9 +66,14 @@ class ControlIn(Body):
 
 
 _EXAMPLE_CONTROL = {
-    "input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "lower": 0, "upper": 0.7,
+    "input": "u",
+    "output": "y",
+    "gain": 0.5,
+    "integral_time": 1.0,
+    "lower": 0,
+    "upper": 0.7,
     "reference": {"kind": "step", "amplitude": 1},
-}  # fmt: skip
+}
 
 
 class RunSimulateIn(Body):

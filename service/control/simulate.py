@@ -205,9 +205,14 @@ def _sample_channel(channel: Channel, times: FloatArray) -> Channel:
 
 
 def _store_simulation(
-    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, asked: _SimulationRequest,
-    found: _SimulationResult, reference: Channel | None,
-) -> DatasetOut:  # fmt: skip
+    database: Database,
+    store: ObjectStore,
+    run_id: str,
+    body: RunSimulateIn,
+    asked: _SimulationRequest,
+    found: _SimulationResult,
+    reference: Channel | None,
+) -> DatasetOut:
     """The simulation as a dataset that knows its run; the same request gives the same one."""
     request = body.model_dump(mode="json", exclude={"name", "store"})
     key = hash_source({"run": run_id, "simulation": request, "values": asked.values})
@@ -219,13 +224,23 @@ def _store_simulation(
     taken = {channel.name for channel in channels}
     if reference is not None and reference.name not in taken:
         channels.append(reference)
-    details = {"run": run_id, "simulation": request, "true_parameters": asked.values,
-               "warnings": found.notes}  # fmt: skip
+    details = {
+        "run": run_id,
+        "simulation": request,
+        "true_parameters": asked.values,
+        "warnings": found.notes,
+    }
     stored = add_recording(
-        database, store, Recording(tuple(channels)),
-        name=body.name or f"{asked.model.name}, simulated with {run_id}", kind="simulate",
-        key=key, details=details, parents=[run_id, *asked.parents], relation="simulated",
-    )  # fmt: skip
+        database,
+        store,
+        Recording(tuple(channels)),
+        name=body.name or f"{asked.model.name}, simulated with {run_id}",
+        kind="simulate",
+        key=key,
+        details=details,
+        parents=[run_id, *asked.parents],
+        relation="simulated",
+    )
     return to_out(stored.dataset)
 
 

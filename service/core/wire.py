@@ -27,9 +27,10 @@ def check_depth(value: Any) -> Any:
         depth += 1
         if depth > MAX_DEPTH:
             raise PydanticCustomError(
-                "nesting", "need lists and objects at most {most} levels within one another",
+                "nesting",
+                "need lists and objects at most {most} levels within one another",
                 {"most": MAX_DEPTH},
-            )  # fmt: skip
+            )
     return value
 
 

@@ -94,8 +94,12 @@ def add_upload(
     InvalidUpload
         If the file cannot be used, with the place.
     """
-    read_as = {"sha256": sha256, "format": form, "segments": list(segments),
-               "sample_time": sample_time}  # fmt: skip
+    read_as = {
+        "sha256": sha256,
+        "format": form,
+        "segments": list(segments),
+        "sample_time": sample_time,
+    }
     key = hash_source(read_as)
     with database.read_session() as session:
         known = DatasetRepository(session).find_by_source(key)
@@ -105,9 +109,14 @@ def add_upload(
     read = read_untrusted(path, form, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
-        database, store, read.recording, name=name or "recording", kind="upload", key=key,
+        database,
+        store,
+        read.recording,
+        name=name or "recording",
+        kind="upload",
+        key=key,
         details=details,
-    )  # fmt: skip
+    )
 
 
 def derive_dataset(
@@ -136,11 +145,15 @@ def derive_dataset(
     recording = derived(load_recording(store, parent.sha256), body.steps)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
-        database, store, recording, name=body.name or f"{parent.name} ({steps})", kind="derive",
+        database,
+        store,
+        recording,
+        name=body.name or f"{parent.name} ({steps})",
+        kind="derive",
         key=_hash_derivation(parent, body),
         details={"steps": body.steps, "warnings": [], "known_before": _measure_history(recording)},
         parents=[parent.id],
-    )  # fmt: skip
+    )
 
 
 def add_recording(
@@ -166,13 +179,23 @@ def add_recording(
 
 
 def describe_recording(
-    recording: Recording, *, name: str, kind: DatasetKind, key: str, details: Mapping[str, Any],
+    recording: Recording,
+    *,
+    name: str,
+    kind: DatasetKind,
+    key: str,
+    details: Mapping[str, Any],
     content: StoredObject,
-) -> NewDataset:  # fmt: skip
+) -> NewDataset:
     """What the row of a recording says."""
     return NewDataset(
-        name=name, kind=kind, sha256=content.sha256, source_key=key, size_bytes=content.size,
-        n_samples=recording.samples, duration=recording.duration,
+        name=name,
+        kind=kind,
+        sha256=content.sha256,
+        source_key=key,
+        size_bytes=content.size,
+        n_samples=recording.samples,
+        duration=recording.duration,
         sample_time=_find_common_period(recording) if recording.sampling.is_regular else None,
         channels=[_describe_channel(channel) for channel in recording.channels],
         details={
@@ -183,7 +206,7 @@ def describe_recording(
                 for s in recording.segments
             ],
         },
-    )  # fmt: skip
+    )
 
 
 def to_out(row: Dataset) -> DatasetOut:
@@ -283,14 +306,17 @@ def _store_file(
 def _describe_channel(channel: Channel) -> dict[str, Any]:
     sampling, history = channel.sampling, channel.history
     return {
-        "name": channel.name, "unit": channel.unit, "hold": channel.hold,
-        "samples": channel.times.size, "start": float(channel.times[0]),
+        "name": channel.name,
+        "unit": channel.unit,
+        "hold": channel.hold,
+        "samples": channel.times.size,
+        "start": float(channel.times[0]),
         "stop": float(channel.times[-1]),
         "sample_time": sampling.period if sampling.is_regular else None,
         "missing": int(np.count_nonzero(~np.isfinite(channel.values))),
         "history_samples": 0 if history is None else history.times.size,
         "history_start": None if history is None else float(history.times[0]),
-    }  # fmt: skip
+    }
 
 
 def _find_common_period(recording: Recording) -> float | None:

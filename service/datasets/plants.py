@@ -47,9 +47,16 @@ def simulate_plant(database: Database, store: ObjectStore, body: SimulateIn) -> 
         "warnings": [],
     }
     return add_recording(
-        database, store, _add_noise(recording, body), name=body.name or f"{body.plant}, simulated",
-        kind="simulate", key=key, details=details, parents=parents, relation="simulated",
-    )  # fmt: skip
+        database,
+        store,
+        _add_noise(recording, body),
+        name=body.name or f"{body.plant}, simulated",
+        kind="simulate",
+        key=key,
+        details=details,
+        parents=parents,
+        relation="simulated",
+    )
 
 
 def _build_supply(
@@ -58,8 +65,9 @@ def _build_supply(
     """The supply pressure of the actuator, and the datasets it was taken from."""
     faults = [
         FieldError(f"/inputs/{name}", "the actuator has one input, P_a")
-        for name in body.inputs if name != "P_a"
-    ]  # fmt: skip
+        for name in body.inputs
+        if name != "P_a"
+    ]
     if "P_a" not in body.inputs:
         faults.append(
             FieldError("/inputs/P_a", f"give input 'P_a' in Pa, such as {_SUPPLY_EXAMPLE}")

@@ -196,9 +196,10 @@ class SeriesInput(Body):
         times, values = len(self.times), len(self.values)
         if times != values:
             raise PydanticCustomError(
-                "lengths", "there are {times} times and {values} values; need as many",
+                "lengths",
+                "there are {times} times and {values} values; need as many",
                 {"times": times, "values": values},
-            )  # fmt: skip
+            )
         return self
 
 

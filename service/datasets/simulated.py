@@ -39,17 +39,30 @@ class SimulatedDataset:
         """The dataset as it will be, to be looked at before it is stored."""
         nothing = StoredObject(sha256="", size=0)
         return build_dataset_row(
-            describe_recording(self.recording, name=self.name, kind="simulate", key=self.key,
-                      details=self.details, content=nothing),
+            describe_recording(
+                self.recording,
+                name=self.name,
+                kind="simulate",
+                key=self.key,
+                details=self.details,
+                content=nothing,
+            ),
             dataset_id,
-        )  # fmt: skip
+        )
 
     def store_dataset(self, database: Database, store: ObjectStore) -> StoredDataset:
         """Store it as a dataset."""
         return add_recording(
-            database, store, self.recording, name=self.name, kind="simulate", key=self.key,
-            details=self.details, parents=self.parents, relation="simulated",
-        )  # fmt: skip
+            database,
+            store,
+            self.recording,
+            name=self.name,
+            kind="simulate",
+            key=self.key,
+            details=self.details,
+            parents=self.parents,
+            relation="simulated",
+        )
 
 
 @simulation_limit.acquire()
@@ -106,9 +119,12 @@ def simulate_or_find(
         "warnings": [],
     }
     return SimulatedDataset(
-        _simulate_recording(model, inputs, body, times), body.name or f"{model.name}, simulated", key,
-        details, tuple(signals.parents),
-    )  # fmt: skip
+        _simulate_recording(model, inputs, body, times),
+        body.name or f"{model.name}, simulated",
+        key,
+        details,
+        tuple(signals.parents),
+    )
 
 
 def _resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
@@ -188,10 +204,12 @@ def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> list[Fi
     # A start that the model does not fix, or another than its own, is given as `x(0)`.
     known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
     faults = [
-        FieldError(f"/parameters/{name}", f"the model has no parameter {name!r}"
-                   f"{suggest_name(name, known)}")
-        for name in values if name not in known
-    ]  # fmt: skip
+        FieldError(
+            f"/parameters/{name}", f"the model has no parameter {name!r}{suggest_name(name, known)}"
+        )
+        for name in values
+        if name not in known
+    ]
     missing = [p for p in model.parameters if p.is_free and p.name not in values]
     return faults + [
         FieldError(f"/parameters/{p.name}", f"give the true value of {p.name!r} [{p.unit}]")
@@ -203,10 +221,14 @@ def _find_input_faults(model: Model, inputs: Mapping[str, InputIn]) -> list[Fiel
     known = [one.name for one in model.inputs]
     faults = [
         FieldError(f"/inputs/{name}", f"the model has no input {name!r}{suggest_name(name, known)}")
-        for name in inputs if name not in known
-    ]  # fmt: skip
+        for name in inputs
+        if name not in known
+    ]
     return faults + [
-        FieldError(f"/inputs/{name}", f"give input {name!r}, such as "
-                   '{"kind": "cosine", "amplitude": 1, "frequency": 0.5}')
-        for name in known if name not in inputs
-    ]  # fmt: skip
+        FieldError(
+            f"/inputs/{name}",
+            f'give input {name!r}, such as {{"kind": "cosine", "amplitude": 1, "frequency": 0.5}}',
+        )
+        for name in known
+        if name not in inputs
+    ]

@@ -94,9 +94,10 @@ class _BoundsMaker:
     def iterate_steps(self) -> Iterator[Document | None]:
         """Nothing after each problem, and then the document."""
         axes = [
-            axis["path"] for axis in self._job.spec["sweep"]["axes"]
+            axis["path"]
+            for axis in self._job.spec["sweep"]["axes"]
             if not axis["path"].startswith(IRRELEVANT_FIELDS)
-        ]  # fmt: skip
+        ]
         found = retry_transient(partial(self._group_runs, axes))
         cells = [dict(zip(axes, one.key, strict=True)) for one in found[:MOST_PROBLEMS]]
         problems = []
@@ -113,8 +114,12 @@ class _BoundsMaker:
 
     def _describe_problem(self, cell: Mapping[str, Any]) -> Document:
         entry: Document = {
-            "cell": dict(cell), "reference": None, "stderr": {}, "rms": None, "note": "",
-        }  # fmt: skip
+            "cell": dict(cell),
+            "reference": None,
+            "stderr": {},
+            "rms": None,
+            "note": "",
+        }
         try:
             entry["reference"] = retry_transient(partial(self._read_reference, cell))
             if entry["reference"] is None:

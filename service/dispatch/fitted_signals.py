@@ -171,6 +171,5 @@ def _list_fitted_outputs(
     for number, (record, outputs) in enumerate(zip(records, simulated, strict=True), 1):
         for channel, values in zip(record.outputs, outputs, strict=True):
             yield FittedOutput(
-                role, number, channel.name, channel.unit, channel.times, channel.values,
-                values,
-            )  # fmt: skip
+                role, number, channel.name, channel.unit, channel.times, channel.values, values
+            )

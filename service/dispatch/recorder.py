@@ -152,9 +152,11 @@ class RunRecorder:
             evaluations = live.state.evaluations
         evaluations = failure.evaluations or evaluations
         self._evaluations += evaluations
-        self._pending.outcomes.append(RunOutcome(
-            run_id=run, state=JobState.FAILED, error=failure.reason, evaluations=evaluations
-        ))  # fmt: skip
+        self._pending.outcomes.append(
+            RunOutcome(
+                run_id=run, state=JobState.FAILED, error=failure.reason, evaluations=evaluations
+            )
+        )
         if failure.reason not in self._reasons and len(self._reasons) < MOST_REASONS:
             self._reasons.append(failure.reason)
             self._pending.messages.append(f"{run} failed: {failure.reason}")

@@ -39,9 +39,15 @@ def to_history_points(
         for number, one in enumerate(improvements[first:], start=first):
             if math.isfinite(one.rms):
                 yield HistoryPoint(
-                    run, island, number, one.generation, one.evaluations, one.rms, one.phase,
+                    run,
+                    island,
+                    number,
+                    one.generation,
+                    one.evaluations,
+                    one.rms,
+                    one.phase,
                     one.parameters,
-                )  # fmt: skip
+                )
 
 
 def to_migrant_points(

@@ -224,10 +224,12 @@ class WarmStarts:
     def _read_last_success(self, before: range) -> tuple[int, Mapping[str, float]] | None:
         """Number and estimates of the last of these runs that succeeded."""
         query = select(Run.number, Run.estimates).where(
-            Run.job_id == self._job.id, Run.state == JobState.SUCCEEDED,
-            Run.number >= before.start, Run.number < before.stop,
+            Run.job_id == self._job.id,
+            Run.state == JobState.SUCCEEDED,
+            Run.number >= before.start,
+            Run.number < before.stop,
             (Run.number - before.start) % before.step == 0,
-        )  # fmt: skip
+        )
         with self._database.read_session() as session:
             found = session.execute(query.order_by(Run.number.desc()).limit(1)).one_or_none()
         return None if found is None else (found[0], _to_values(found[1]))

@@ -179,16 +179,33 @@ def _band_traces(
         to_json_numbers(values[i] for i in order) for values in (band.low, band.middle, band.high)
     )
     shared = {"type": "scatter", "x": x, "legendgroup": group, **at}
-    edge = {**shared, "mode": "lines", "line": {"width": 0}, "showlegend": False,
-            "hoverinfo": "skip"}  # fmt: skip
+    edge = {
+        **shared,
+        "mode": "lines",
+        "line": {"width": 0},
+        "showlegend": False,
+        "hoverinfo": "skip",
+    }
     return [
         {**edge, "name": f"{label}, 5 %", "y": low},
-        {**edge, "name": f"{label}, 95 %", "y": high, "fill": "tonexty",
-         "fillcolor": theme.fade(line["color"], 0.15)},
-        {**shared, "mode": "lines+markers", "name": label, "y": middle, "line": line,
-         "marker": {"size": 5, "color": line["color"]}, "showlegend": first,
-         "hovertemplate": f"{group}<br>σ %{{x:.4g}}: %{{y:.4g}}<extra></extra>"},
-    ]  # fmt: skip
+        {
+            **edge,
+            "name": f"{label}, 95 %",
+            "y": high,
+            "fill": "tonexty",
+            "fillcolor": theme.fade(line["color"], 0.15),
+        },
+        {
+            **shared,
+            "mode": "lines+markers",
+            "name": label,
+            "y": middle,
+            "line": line,
+            "marker": {"size": 5, "color": line["color"]},
+            "showlegend": first,
+            "hovertemplate": f"{group}<br>σ %{{x:.4g}}: %{{y:.4g}}<extra></extra>",
+        },
+    ]
 
 
 def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
@@ -200,11 +217,19 @@ def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dic
     name = "Cramér–Rao floor (of parameters: 5 and 95 %)"
     lines = []
     for sign in signs:
-        lines.append({
-            "type": "scatter", "mode": "lines", "name": name, "legendgroup": name,
-            "showlegend": name not in told, "x": to_json_numbers(x),
-            "y": to_json_numbers(sign * panel.floor[one] for one in x), "line": dict(_FLOOR_STYLE), **at,
-            "hovertemplate": "floor, σ %{x:.4g}: %{y:.4g}<extra></extra>",
-        })  # fmt: skip
+        lines.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": name,
+                "legendgroup": name,
+                "showlegend": name not in told,
+                "x": to_json_numbers(x),
+                "y": to_json_numbers(sign * panel.floor[one] for one in x),
+                "line": dict(_FLOOR_STYLE),
+                **at,
+                "hovertemplate": "floor, σ %{x:.4g}: %{y:.4g}<extra></extra>",
+            }
+        )
         told.add(name)
     return lines

@@ -125,11 +125,18 @@ def plot_correlation(run: RunFigureData) -> Figure:
     rows = [to_json_numbers(row) for row in (run.correlation or {}).get("matrix", ())]
     few = len(names) <= 12
     matrix = {
-        "type": "heatmap", "x": names, "y": names, "z": rows, "zmin": -1, "zmax": 1,
-        "colorscale": theme.DIVERGING, "xgap": 2, "ygap": 2,
+        "type": "heatmap",
+        "x": names,
+        "y": names,
+        "z": rows,
+        "zmin": -1,
+        "zmax": 1,
+        "colorscale": theme.DIVERGING,
+        "xgap": 2,
+        "ygap": 2,
         "hovertemplate": "%{y} and %{x}: %{z:.3f}<extra></extra>",
         "colorbar": {"thickness": 10, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
-    }  # fmt: skip
+    }
     if few:
         matrix["texttemplate"] = "%{z:.2f}"
     return {
@@ -138,11 +145,15 @@ def plot_correlation(run: RunFigureData) -> Figure:
             correlation_height(len(names)),
             xaxis={"showgrid": False, "type": "category", "showline": False, "ticks": ""},
             yaxis={
-                "showgrid": False, "type": "category", "autorange": "reversed",
-                "showline": False, "ticks": "", "automargin": True,
+                "showgrid": False,
+                "type": "category",
+                "autorange": "reversed",
+                "showline": False,
+                "ticks": "",
+                "automargin": True,
             },
         ),
-    }  # fmt: skip
+    }
 
 
 def plot_waterfall(run: RunFigureData) -> Figure:
@@ -155,23 +166,32 @@ def plot_waterfall(run: RunFigureData) -> Figure:
         series.append(("after refinement", theme.BLUE, "circle", 1))
     data = [
         {
-            "type": "scatter", "mode": "lines+markers", "name": name, "x": rank,
-            "y": to_json_numbers(np.nan if (v := run.islands[i][part]) is None else v for i in order),
-            "text": islands, "line": {"color": colour, "width": 1, "dash": "dot"},
+            "type": "scatter",
+            "mode": "lines+markers",
+            "name": name,
+            "x": rank,
+            "y": to_json_numbers(
+                np.nan if (v := run.islands[i][part]) is None else v for i in order
+            ),
+            "text": islands,
+            "line": {"color": colour, "width": 1, "dash": "dot"},
             "marker": {"color": colour, "symbol": symbol, "size": 9},
             "hovertemplate": "%{text}: %{y:.5g} " + run.unit + "<extra></extra>",
         }
         for name, colour, symbol, part in series
-    ]  # fmt: skip
+    ]
     return {
         "data": data if order else [],
         "layout": base_layout(
             WATERFALL_HEIGHT,
-            xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
-                   "range": [0.5, len(order) + 0.5]},
+            xaxis={
+                "title": {"text": "islands, best first"},
+                "dtick": max(1, len(order) // 12),
+                "range": [0.5, len(order) + 0.5],
+            },
             yaxis=_fitness_axis(run, data),
         ),
-    }  # fmt: skip
+    }
 
 
 def to_csv(figure: Figure) -> str:
@@ -216,11 +236,14 @@ def _island_line(
 ) -> dict[str, Any]:
     x, kept = _step_points(points, abscissa, end)
     return {
-        "type": "scatter", "mode": "lines", "name": f"island {number + 1}",
-        "x": x, "y": to_json_numbers(p.rms for p in kept),
+        "type": "scatter",
+        "mode": "lines",
+        "name": f"island {number + 1}",
+        "x": x,
+        "y": to_json_numbers(p.rms for p in kept),
         "line": {**theme.series_style(number), "shape": "hv"},
         "hovertemplate": f"island {number + 1}<br>%{{x}} {abscissa}: %{{y:.5g}}<extra></extra>",
-    }  # fmt: skip
+    }
 
 
 def _phase_markers(run: RunFigureData, abscissa: Abscissa) -> list[dict[str, Any]]:
@@ -235,16 +258,22 @@ def _phase_markers(run: RunFigureData, abscissa: Abscissa) -> list[dict[str, Any
         if not found:
             continue
         found = [found[i] for i in stride_indices(len(found))]
-        markers.append({
-            "type": "scatter", "mode": "markers", "name": name,
-            "x": [_abscissa_value(p, abscissa) for _, p in found], "y": to_json_numbers(p.rms for _, p in found),
-            "marker": {
-                "symbol": symbol, "size": 10 if phase == "refinement" else 6,
-                "color": [theme.series_style(i)["color"] for i, _ in found],
-            },
-            "text": [f"island {i + 1}" for i, _ in found],
-            "hovertemplate": f"{name}, %{{text}}<br>%{{x}}: %{{y:.5g}}<extra></extra>",
-        })  # fmt: skip
+        markers.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": name,
+                "x": [_abscissa_value(p, abscissa) for _, p in found],
+                "y": to_json_numbers(p.rms for _, p in found),
+                "marker": {
+                    "symbol": symbol,
+                    "size": 10 if phase == "refinement" else 6,
+                    "color": [theme.series_style(i)["color"] for i, _ in found],
+                },
+                "text": [f"island {i + 1}" for i, _ in found],
+                "hovertemplate": f"{name}, %{{text}}<br>%{{x}}: %{{y:.5g}}<extra></extra>",
+            }
+        )
     return markers
 
 
@@ -266,9 +295,15 @@ def _fitness_axis(run: RunFigureData, data: Sequence[dict[str, Any]]) -> dict[st
 
 def _vertical_line(x: float) -> dict[str, Any]:
     return {
-        "type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "layer": "below",
+        "type": "line",
+        "x0": x,
+        "x1": x,
+        "y0": 0,
+        "y1": 1,
+        "yref": "paper",
+        "layer": "below",
         "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"},
-    }  # fmt: skip
+    }
 
 
 def _final_fitness(island: tuple[float, float | None]) -> float:
@@ -295,13 +330,19 @@ def _add_parameter_plot(
         if points:
             x, kept = _step_points(points, "generations", end)
             y: Floats = np.array([p.parameters[number] for p in kept], dtype=np.float64)
-            figure["data"].append({
-                "type": "scatter", "mode": "lines",
-                "name": f"{parameter.name}, island {island + 1}",
-                "x": x, "y": to_json_numbers(y), "xaxis": at["xaxis"], "yaxis": at["yaxis"],
-                "line": {**theme.series_style(island), "shape": "hv"},
-                "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
-            })  # fmt: skip
+            figure["data"].append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": f"{parameter.name}, island {island + 1}",
+                    "x": x,
+                    "y": to_json_numbers(y),
+                    "xaxis": at["xaxis"],
+                    "yaxis": at["yaxis"],
+                    "line": {**theme.series_style(island), "shape": "hv"},
+                    "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
+                }
+            )
     figure["layout"]["shapes"] += [
         _bound_line(bound, at) for bound in (parameter.lower, parameter.upper)
     ]
@@ -318,10 +359,16 @@ def _bounds_axis(parameter: FreeParameter) -> dict[str, Any]:
 
 def _bound_line(y: float, at: dict[str, str]) -> dict[str, Any]:
     return {
-        "type": "line", "xref": f"{at['xaxis']} domain", "x0": 0, "x1": 1, "yref": at["yaxis"],
-        "y0": y, "y1": y, "layer": "below",
+        "type": "line",
+        "xref": f"{at['xaxis']} domain",
+        "x0": 0,
+        "x1": 1,
+        "yref": at["yaxis"],
+        "y0": y,
+        "y1": y,
+        "layer": "below",
         "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dash"},
-    }  # fmt: skip
+    }
 
 
 def _parameter_caption(parameter: FreeParameter) -> str:

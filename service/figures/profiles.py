@@ -44,11 +44,16 @@ def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int
 
 def _profile_trace(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
     return {
-        "type": "scatter", "mode": "lines+markers", "name": one.name,
-        "x": one.values, "y": one.ratio, **at,
-        "line": {"color": theme.BLUE, "width": 1.5}, "marker": {"color": theme.BLUE, "size": 4},
+        "type": "scatter",
+        "mode": "lines+markers",
+        "name": one.name,
+        "x": one.values,
+        "y": one.ratio,
+        **at,
+        "line": {"color": theme.BLUE, "width": 1.5},
+        "marker": {"color": theme.BLUE, "size": 4},
         "hovertemplate": f"{one.name} = %{{x:.6g}}: %{{y:.3g}}<extra></extra>",
-    }  # fmt: skip
+    }
 
 
 def _threshold_shapes(
@@ -57,15 +62,27 @@ def _threshold_shapes(
     """The threshold, and an upright at each end of the interval that is not open."""
     style = {"color": theme.GREY, "width": 1, "dash": "dot"}
     level = {
-        "type": "line", "x0": 0, "x1": 1, "xref": f"{at['xaxis']} domain", "y0": threshold,
-        "y1": threshold, "yref": at["yaxis"], "line": style,
-    }  # fmt: skip
+        "type": "line",
+        "x0": 0,
+        "x1": 1,
+        "xref": f"{at['xaxis']} domain",
+        "y0": threshold,
+        "y1": threshold,
+        "yref": at["yaxis"],
+        "line": style,
+    }
     ends = [
         {
-            "type": "line", "x0": end, "x1": end, "xref": at["xaxis"], "y0": 0, "y1": threshold,
-            "yref": at["yaxis"], "line": style,
+            "type": "line",
+            "x0": end,
+            "x1": end,
+            "xref": at["xaxis"],
+            "y0": 0,
+            "y1": threshold,
+            "yref": at["yaxis"],
+            "line": style,
         }
         for end in one.interval95
         if end is not None
-    ]  # fmt: skip
+    ]
     return [level, *ends]

@@ -83,10 +83,7 @@ def _band_traces(
     """The 95 % band as an area, the 99 % band as dashed lines about it."""
     # Half a lag further at each end, so that the first and the last bar stand on the band.
     x = to_json_numbers(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
-    shared = {
-        "type": "scatter", "mode": "lines", "x": x, **at,
-        "hoverinfo": "skip",
-    }  # fmt: skip
+    shared = {"type": "scatter", "mode": "lines", "x": x, **at, "hoverinfo": "skip"}
     drawn = []
     for name, band, look in (
         ("95 % band", bands[0], {"line": {"width": 0}}),
@@ -95,11 +92,24 @@ def _band_traces(
         ends = np.concatenate([band[:1], band, band[-1:]])
         area = {"fill": "tonexty", "fillcolor": _BAND95} if look["line"]["width"] == 0 else {}
         drawn += [
-            {**shared, **look, "name": name, "y": to_json_numbers(-ends), "legendgroup": name,
-             "showlegend": first and not area},
-            {**shared, **look, **area, "name": name, "y": to_json_numbers(ends), "legendgroup": name,
-             "showlegend": first and bool(area)},
-        ]  # fmt: skip
+            {
+                **shared,
+                **look,
+                "name": name,
+                "y": to_json_numbers(-ends),
+                "legendgroup": name,
+                "showlegend": first and not area,
+            },
+            {
+                **shared,
+                **look,
+                **area,
+                "name": name,
+                "y": to_json_numbers(ends),
+                "legendgroup": name,
+                "showlegend": first and bool(area),
+            },
+        ]
     return drawn
 
 
@@ -108,8 +118,12 @@ def _correlation_bars(
 ) -> dict[str, Any]:
     outside = np.abs(values) > band99
     return {
-        "type": "bar", "name": one.title.partition("<br>")[0], "x": to_json_numbers(lags),
-        "y": to_json_numbers(values), **at, "showlegend": False,
+        "type": "bar",
+        "name": one.title.partition("<br>")[0],
+        "x": to_json_numbers(lags),
+        "y": to_json_numbers(values),
+        **at,
+        "showlegend": False,
         "marker": {"color": [theme.VERMILLION if out else theme.BLUE for out in outside]},
         "hovertemplate": "lag %{x}: %{y:.3f}<extra></extra>",
-    }  # fmt: skip
+    }

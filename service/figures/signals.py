@@ -97,8 +97,10 @@ def stack_plots(heights: Sequence[int]) -> Figure:
     for number, height in enumerate(heights, 1):
         domain = [max((top - height) / total, 0.0), top / total]
         shared[f"yaxis{number if number > 1 else ''}"] = {
-            "domain": domain, "anchor": "x", "nticks": 3 if height < _OUTPUT_PX else 7,
-        }  # fmt: skip
+            "domain": domain,
+            "anchor": "x",
+            "nticks": 3 if height < _OUTPUT_PX else 7,
+        }
         top -= height + _GAP_PX
     return {"data": [], "layout": shared}
 
@@ -106,8 +108,10 @@ def stack_plots(heights: Sequence[int]) -> Figure:
 def name_axis(figure: Figure, number: int, text: str) -> None:
     """Write the name of the numbered axis (from 1) of a stack."""
     figure["layout"][f"yaxis{number if number > 1 else ''}"]["title"] = {
-        "text": text, "standoff": 6, "font": {"size": 11},
-    }  # fmt: skip
+        "text": text,
+        "standoff": 6,
+        "font": {"size": 11},
+    }
 
 
 def axis_id(name: str) -> str:
@@ -125,17 +129,23 @@ def _output_traces(
     shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
     return [
         {
-            **shared, "name": "measured", "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
+            **shared,
+            "name": "measured",
+            "x": to_json_numbers(times[kept]),
+            "y": to_json_numbers(values[kept]),
             **_measured_style(times, kept.size),
             "hovertemplate": "%{y:.6g}<extra>measured</extra>",
         },
         {
-            **shared, "name": "identified", "mode": "lines",
-            "x": to_json_numbers(times[also]), "y": to_json_numbers(identified[also]),
+            **shared,
+            "name": "identified",
+            "mode": "lines",
+            "x": to_json_numbers(times[also]),
+            "y": to_json_numbers(identified[also]),
             "line": {"color": theme.BLUE, "width": 1.6},
             "hovertemplate": "%{y:.6g}<extra>identified</extra>",
         },
-    ]  # fmt: skip
+    ]
 
 
 def _measured_style(times: Floats, drawn: int) -> dict[str, Any]:
@@ -153,11 +163,16 @@ def _residual_trace(
     values = output.measured.values[span] - output.identified[span]
     kept = thin_indices(values, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines", "name": "residual", "yaxis": axis_id(axis),
-        "showlegend": in_legend, "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
+        "type": "scatter",
+        "mode": "lines",
+        "name": "residual",
+        "yaxis": axis_id(axis),
+        "showlegend": in_legend,
+        "x": to_json_numbers(times[kept]),
+        "y": to_json_numbers(values[kept]),
         "line": {"color": theme.VERMILLION, "width": 1},
         "hovertemplate": "%{y:.4g}<extra>residual</extra>",
-    }  # fmt: skip
+    }
 
 
 def signal_line(
@@ -167,11 +182,16 @@ def signal_line(
     times, values = signal.times[span], signal.values[span]
     kept = thin_indices(values, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": axis_id(axis),
-        "showlegend": legend, "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
+        "type": "scatter",
+        "mode": "lines",
+        "name": signal.name,
+        "yaxis": axis_id(axis),
+        "showlegend": legend,
+        "x": to_json_numbers(times[kept]),
+        "y": to_json_numbers(values[kept]),
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
-    }  # fmt: skip
+    }
 
 
 def _record_duration(experiment: ExperimentTraces) -> float:
@@ -210,12 +230,30 @@ def _validation_shading(experiment: ExperimentTraces) -> dict[str, Any]:
     times = experiment.outputs[0].measured.times
     first = float(max(since, times[0]))
     return {
-        "shapes": [{
-            "type": "rect", "x0": first, "x1": float(times[-1]), "y0": 0, "y1": 1,
-            "yref": "paper", "fillcolor": theme.SHADE, "line": {"width": 0}, "layer": "below",
-        }],
-        "annotations": [{
-            "text": "validation", "x": first, "y": 1, "yref": "paper", "xanchor": "left",
-            "yanchor": "top", "xshift": 4, "showarrow": False, "font": {"size": 11},
-        }],
-    }  # fmt: skip
+        "shapes": [
+            {
+                "type": "rect",
+                "x0": first,
+                "x1": float(times[-1]),
+                "y0": 0,
+                "y1": 1,
+                "yref": "paper",
+                "fillcolor": theme.SHADE,
+                "line": {"width": 0},
+                "layer": "below",
+            }
+        ],
+        "annotations": [
+            {
+                "text": "validation",
+                "x": first,
+                "y": 1,
+                "yref": "paper",
+                "xanchor": "left",
+                "yanchor": "top",
+                "xshift": 4,
+                "showarrow": False,
+                "font": {"size": 11},
+            }
+        ],
+    }

@@ -60,7 +60,7 @@ def apply_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulat
     changes: dict[str, Any] = {
         "outputs": [told(one) for one in found.outputs],
         "inputs": [told(one) for one in found.inputs],
-    }  # fmt: skip
+    }
     if found.metrics is not None:
         unit = units.get(found.metrics.output, found.metrics.unit)
         changes["metrics"] = found.metrics.model_copy(update={"unit": unit})
@@ -93,8 +93,16 @@ def _limit_lines(controller: ControllerOut | None, number: int) -> Iterator[dict
 
 def _horizontal_line(axis: str, height: float) -> dict[str, Any]:
     """A dotted line at a height, all over the width."""
-    return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": axis, "y0": height,
-            "y1": height, **_LINE_STYLE}  # fmt: skip
+    return {
+        "type": "line",
+        "xref": "paper",
+        "x0": 0,
+        "x1": 1,
+        "yref": axis,
+        "y0": height,
+        "y1": height,
+        **_LINE_STYLE,
+    }
 
 
 def _settling_shapes(
@@ -107,5 +115,15 @@ def _settling_shapes(
     edges = (metrics.final_value - metrics.band, metrics.final_value + metrics.band)
     band = [_horizontal_line(axis, y) for y in edges]
     settled = since + metrics.settling_time
-    return [*band, {"type": "line", "x0": settled, "x1": settled, "yref": f"{axis} domain",
-                    "y0": 0, "y1": 1, **_LINE_STYLE}]  # fmt: skip
+    return [
+        *band,
+        {
+            "type": "line",
+            "x0": settled,
+            "x1": settled,
+            "yref": f"{axis} domain",
+            "y0": 0,
+            "y1": 1,
+            **_LINE_STYLE,
+        },
+    ]

@@ -53,8 +53,11 @@ def _star_path(x: float, y: float, r: float) -> str:
 
 
 _MARKER_PATHS: Mapping[str, _MarkerPath] = {
-    "diamond": _diamond_path, "triangle-up": _triangle_path, "x-thin": _cross_path, "star": _star_path,
-}  # fmt: skip
+    "diamond": _diamond_path,
+    "triangle-up": _triangle_path,
+    "x-thin": _cross_path,
+    "star": _star_path,
+}
 _LINE_MARKERS = ("x-thin", "star")
 
 PlotlyTrace = Mapping[str, Any]
@@ -120,10 +123,15 @@ def build_axes(
         is_log = layout.get("type") == "log"
         low, high = _axis_range(figure, name, layout, is_log)
         found[name] = SvgAxis(
-            name=name, title=str((layout.get("title") or {}).get("text", "")), is_log=is_log,
-            low=low, high=high, start=edges[0] + first * (edges[1] - edges[0]),
-            stop=edges[0] + last * (edges[1] - edges[0]), n_ticks=layout.get("nticks", 7),
-        )  # fmt: skip
+            name=name,
+            title=str((layout.get("title") or {}).get("text", "")),
+            is_log=is_log,
+            low=low,
+            high=high,
+            start=edges[0] + first * (edges[1] - edges[0]),
+            stop=edges[0] + last * (edges[1] - edges[0]),
+            n_ticks=layout.get("nticks", 7),
+        )
     return found
 
 
@@ -227,9 +235,12 @@ _LETTER_PX, _LEGEND_ROW_PX, _LEGEND_KEY_PX = 6.7, 18, 30
 _DASH_ARRAYS = {"dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
 _TAG_PATTERN = re.compile(r"(</?b>|</?sup>|<br>)")
 _TAG_SPANS = {
-    "<b>": '<tspan font-weight="600">', "<sup>": '<tspan baseline-shift="super" font-size="9">',
-    "</b>": "</tspan>", "</sup>": "</tspan>", "<br>": " ",
-}  # fmt: skip
+    "<b>": '<tspan font-weight="600">',
+    "<sup>": '<tspan baseline-shift="super" font-size="9">',
+    "</b>": "</tspan>",
+    "</sup>": "</tspan>",
+    "<br>": " ",
+}
 
 
 def is_drawable(figure: Figure) -> bool:
@@ -254,10 +265,16 @@ def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
     box = (margin["l"], width - margin["r"], margin["t"] + more, height + more - margin["b"])
     axes = build_axes(figure, box)
     parts = [
-        *_draw_grid(figure, axes), *_draw_shapes(figure, axes, box),
-        *(part for n, _ in enumerate(figure["data"]) for part in _draw_trace(figure["data"], n, axes)),
-        *_draw_labels(figure, axes, box), *_draw_legend(legend),
-    ]  # fmt: skip
+        *_draw_grid(figure, axes),
+        *_draw_shapes(figure, axes, box),
+        *(
+            part
+            for n, _ in enumerate(figure["data"])
+            for part in _draw_trace(figure["data"], n, axes)
+        ),
+        *_draw_labels(figure, axes, box),
+        *_draw_legend(legend),
+    ]
     return Markup(
         f'<svg class="drawn" viewBox="0 0 {width} {height + more}" role="img" '
         f'aria-label="{escape(title)}">{"".join(parts)}</svg>'
@@ -276,8 +293,7 @@ def _draw_grid(figure: Figure, axes: Mapping[str, SvgAxis]) -> Iterator[str]:
         for axis in (x, y):
             for place, label in axis.tick_positions():
                 yield _draw_tick(axis, x, y, place, label if axis is y or is_below else "")
-        yield (f'<path class="frame" d="M{x.start:.1f} {y.stop:.1f}V{y.start:.1f}'
-               f'H{x.stop:.1f}"/>')  # fmt: skip
+        yield (f'<path class="frame" d="M{x.start:.1f} {y.stop:.1f}V{y.start:.1f}H{x.stop:.1f}"/>')
 
 
 def _draw_tick(axis: SvgAxis, x: SvgAxis, y: SvgAxis, place: float, label: str) -> str:
@@ -318,8 +334,10 @@ def _draw_labels(
             x_at = axes["x"].to_pixel(one["x"]) or left
         y_at = bottom - one["y"] * (bottom - top)
         drop = 12 if one.get("yanchor") == "top" else -one.get("yshift", 0)
-        yield (f'<text x="{x_at + one.get("xshift", 0):.1f}" y="{y_at + drop:.1f}">'
-               f"{to_markup(one['text'])}</text>")  # fmt: skip
+        yield (
+            f'<text x="{x_at + one.get("xshift", 0):.1f}" y="{y_at + drop:.1f}">'
+            f"{to_markup(one['text'])}</text>"
+        )
 
 
 def _draw_title(text: str, at: str) -> str:
@@ -364,8 +382,10 @@ def _draw_trace(
         yield _draw_band(data[number - 1], trace, x, y)
     mode = trace.get("mode", "lines")
     if "lines" in mode and trace.get("line", {}).get("width", 1):
-        yield (f'<path d="{_path_data(_thin_line(trace, x, y), trace)}" fill="none" '
-               f"{_stroke_attributes(trace.get('line', {}))}/>")  # fmt: skip
+        yield (
+            f'<path d="{_path_data(_thin_line(trace, x, y), trace)}" fill="none" '
+            f"{_stroke_attributes(trace.get('line', {}))}/>"
+        )
     if "markers" in mode:
         yield from _draw_error_bars(trace, x, y)
         yield from _draw_markers(trace, x, y)
@@ -423,8 +443,10 @@ def _draw_error_bars(trace: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> Iterator[str
         if at is None or not ends or None in ends:
             continue
         low, high = ends
-        yield (f'<path d="M{at:.1f} {low:.1f}V{high:.1f}M{at - 4:.1f} {low:.1f}h8'
-               f'M{at - 4:.1f} {high:.1f}h8" fill="none" stroke="{bars["color"]}"/>')  # fmt: skip
+        yield (
+            f'<path d="M{at:.1f} {low:.1f}V{high:.1f}M{at - 4:.1f} {low:.1f}h8'
+            f'M{at - 4:.1f} {high:.1f}h8" fill="none" stroke="{bars["color"]}"/>'
+        )
 
 
 def _draw_markers(trace: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> Iterator[str]:
@@ -443,8 +465,9 @@ def _marker_property(value: Any, place: int) -> str:
 
 def _stroke_attributes(line: Mapping[str, Any]) -> str:
     dash = _DASH_ARRAYS.get(line.get("dash", ""))
-    return (f'stroke="{line.get("color", "currentColor")}" stroke-width="{line.get("width", 1)}"'
-            + (f' stroke-dasharray="{dash}"' if dash else ""))  # fmt: skip
+    return f'stroke="{line.get("color", "currentColor")}" stroke-width="{line.get("width", 1)}"' + (
+        f' stroke-dasharray="{dash}"' if dash else ""
+    )
 
 
 def _lay_out_legend(figure: Figure, width: int) -> Iterator[tuple[float, int, PlotlyTrace]]:
@@ -470,8 +493,13 @@ def _draw_legend(legend: Sequence[tuple[float, int, PlotlyTrace]]) -> Iterator[s
             yield f'<path d="M{left:.1f} {y}h{_LEGEND_KEY_PX - 6}" {_stroke_attributes(trace.get("line", {}))}/>'
         if "markers" in mode:
             marker = trace.get("marker", {})
-            yield draw_marker(_marker_property(marker.get("symbol", "circle"), 0), left + _LEGEND_KEY_PX / 2 - 3, y, 4,
-                         _marker_property(marker.get("color", "currentColor"), 0))  # fmt: skip
+            yield draw_marker(
+                _marker_property(marker.get("symbol", "circle"), 0),
+                left + _LEGEND_KEY_PX / 2 - 3,
+                y,
+                4,
+                _marker_property(marker.get("color", "currentColor"), 0),
+            )
         yield f'<text x="{left + _LEGEND_KEY_PX:.1f}" y="{y + 4}">{escape(_trace_label(trace))}</text>'
 
 

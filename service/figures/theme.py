@@ -44,10 +44,17 @@ def plotly_template(theme: Theme) -> dict[str, Any]:
     """Plotly template: quiet axes on a transparent ground."""
     ink = _INK_COLOURS[theme]
     axis = {
-        "gridcolor": ink["grid"], "linecolor": ink["line"], "tickcolor": ink["line"],
-        "zerolinecolor": ink["line"], "zerolinewidth": 1, "showline": True, "ticks": "outside",
-        "ticklen": 4, "automargin": False, "title": {"standoff": 8},
-    }  # fmt: skip
+        "gridcolor": ink["grid"],
+        "linecolor": ink["line"],
+        "tickcolor": ink["line"],
+        "zerolinecolor": ink["line"],
+        "zerolinewidth": 1,
+        "showline": True,
+        "ticks": "outside",
+        "ticklen": 4,
+        "automargin": False,
+        "title": {"standoff": 8},
+    }
     return {
         # Plotly takes a transparent cell for a white one and would write on it in black.
         "data": {"heatmap": [{"textfont": {"color": ink["text"]}}]},

@@ -82,9 +82,13 @@ def _law_formula(law: LawOut) -> str:
 def _quantity_traces(one: QuantityOut) -> list[dict[str, Any]]:
     known = [point for point in one.points if point.value is not None]
     return [
-        *_law_traces(one.band), *_other_law_traces(one), *_reference_traces(known), *_prediction_traces(one.predictions),
-        *_flag_traces(known), _estimate_trace(known),
-    ]  # fmt: skip
+        *_law_traces(one.band),
+        *_other_law_traces(one),
+        *_reference_traces(known),
+        *_prediction_traces(one.predictions),
+        *_flag_traces(known),
+        _estimate_trace(known),
+    ]
 
 
 def _scatter_trace(
@@ -105,9 +109,15 @@ def _law_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     return [
         _scatter_trace(_LAW_LABEL, "lines", x, low, **edge),
         _scatter_trace(_LAW_LABEL, "lines", x, high, **edge, fill="tonexty", fillcolor=_BAND),
-        _scatter_trace(_LAW_LABEL, "lines", x, middle, line={"color": theme.BLUE, "width": 1.8},
-                 hovertemplate="law at %{x:.4g}: %{y:.4g}<extra></extra>"),
-    ]  # fmt: skip
+        _scatter_trace(
+            _LAW_LABEL,
+            "lines",
+            x,
+            middle,
+            line={"color": theme.BLUE, "width": 1.8},
+            hovertemplate="law at %{x:.4g}: %{y:.4g}<extra></extra>",
+        ),
+    ]
 
 
 def _other_law_traces(one: QuantityOut) -> list[dict[str, Any]]:
@@ -119,10 +129,15 @@ def _other_law_traces(one: QuantityOut) -> list[dict[str, Any]]:
     x = [place.x for place in one.band]
     y = [a + b * at if law.law == "line" else _power_law(a, b, at) for at in x]
     return [
-        _scatter_trace(_OTHER_LABEL, "lines", to_json_numbers(x), to_json_numbers(y),
-                 line={"color": theme.GREY, "dash": "dot", "width": 1.4},
-                 hovertemplate=f"{law.formula} at %{{x:.4g}}: %{{y:.4g}}<extra></extra>")
-    ]  # fmt: skip
+        _scatter_trace(
+            _OTHER_LABEL,
+            "lines",
+            to_json_numbers(x),
+            to_json_numbers(y),
+            line={"color": theme.GREY, "dash": "dot", "width": 1.4},
+            hovertemplate=f"{law.formula} at %{{x:.4g}}: %{{y:.4g}}<extra></extra>",
+        )
+    ]
 
 
 def _power_law(a: float, b: float, x: float) -> float:
@@ -132,16 +147,26 @@ def _power_law(a: float, b: float, x: float) -> float:
 def _estimate_trace(known: list[PointOut]) -> dict[str, Any]:
     colour = theme.VERMILLION
     return _scatter_trace(
-        _ESTIMATES_LABEL, "markers", to_json_numbers(point.x for point in known),
+        _ESTIMATES_LABEL,
+        "markers",
+        to_json_numbers(point.x for point in known),
         _to_json_numbers([point.value for point in known]),
-        error_y={"type": "data", "array": _to_json_numbers([p.stderr or 0.0 for p in known]),
-                 "color": colour, "thickness": 1.4, "width": 4},
-        marker={"color": colour, "size": 7,
-                "symbol": ["circle" if p.is_used else "circle-open" for p in known]},
+        error_y={
+            "type": "data",
+            "array": _to_json_numbers([p.stderr or 0.0 for p in known]),
+            "color": colour,
+            "thickness": 1.4,
+            "width": 4,
+        },
+        marker={
+            "color": colour,
+            "size": 7,
+            "symbol": ["circle" if p.is_used else "circle-open" for p in known],
+        },
         customdata=[[f"{p.stderr:.3g}" if p.stderr else "–", len(p.runs), p.status] for p in known],
         hovertemplate="%{x:.4g}: %{y:.5g} ± %{customdata[0]}<br>%{customdata[1]} runs, "
-                      "%{customdata[2]}<extra></extra>",
-    )  # fmt: skip
+        "%{customdata[2]}<extra></extra>",
+    )
 
 
 def _prediction_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
@@ -150,14 +175,22 @@ def _prediction_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
         return []
     return [
         _scatter_trace(
-            _PREDICTED_LABEL, "markers", to_json_numbers(one.x for one in known),
+            _PREDICTED_LABEL,
+            "markers",
+            to_json_numbers(one.x for one in known),
             _to_json_numbers([one.value for one in known]),
-            error_y={"type": "data", "symmetric": True, "color": theme.GREEN, "thickness": 1.4,
-                     "width": 6, "array": _to_json_numbers([_half_width(one) for one in known])},
+            error_y={
+                "type": "data",
+                "symmetric": True,
+                "color": theme.GREEN,
+                "thickness": 1.4,
+                "width": 6,
+                "array": _to_json_numbers([_half_width(one) for one in known]),
+            },
             marker={"color": theme.GREEN, "size": 9, "symbol": "diamond-open"},
             hovertemplate="predicted at %{x:.4g}: %{y:.4g} ± %{error_y.array:.2g}<extra></extra>",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _half_width(one: LawPointOut) -> float:
@@ -169,11 +202,20 @@ def _flag_traces(known: list[PointOut]) -> list[dict[str, Any]]:
     if not flagged:
         return []
     return [
-        _scatter_trace(_FLAGGED_LABEL, "markers", to_json_numbers(p.x for p in flagged),
-                 _to_json_numbers([p.value for p in flagged]), hoverinfo="skip",
-                 marker={"color": theme.PURPLE, "size": 18, "symbol": "circle-open",
-                         "line": {"width": 2}})
-    ]  # fmt: skip
+        _scatter_trace(
+            _FLAGGED_LABEL,
+            "markers",
+            to_json_numbers(p.x for p in flagged),
+            _to_json_numbers([p.value for p in flagged]),
+            hoverinfo="skip",
+            marker={
+                "color": theme.PURPLE,
+                "size": 18,
+                "symbol": "circle-open",
+                "line": {"width": 2},
+            },
+        )
+    ]
 
 
 def _reference_traces(known: list[PointOut]) -> list[dict[str, Any]]:
@@ -181,11 +223,20 @@ def _reference_traces(known: list[PointOut]) -> list[dict[str, Any]]:
     if not pairs:
         return []
     return [
-        _scatter_trace(_EXPECTED_LABEL, "markers", to_json_numbers(x for x, _ in pairs), to_json_numbers(y for _, y in pairs),
-                 marker={"color": theme.GREY, "size": 10, "symbol": "x-thin",
-                         "line": {"width": 2, "color": theme.GREY}},
-                 hovertemplate="the reference expects %{y:.5g} at %{x:.4g}<extra></extra>")
-    ]  # fmt: skip
+        _scatter_trace(
+            _EXPECTED_LABEL,
+            "markers",
+            to_json_numbers(x for x, _ in pairs),
+            to_json_numbers(y for _, y in pairs),
+            marker={
+                "color": theme.GREY,
+                "size": 10,
+                "symbol": "x-thin",
+                "line": {"width": 2, "color": theme.GREY},
+            },
+            hovertemplate="the reference expects %{y:.5g} at %{x:.4g}<extra></extra>",
+        )
+    ]
 
 
 def _to_json_numbers(values: list[float | None]) -> list[float | None]:

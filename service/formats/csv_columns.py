@@ -118,18 +118,21 @@ def _parse_field(column: CsvColumn, text: str, convert: Callable[[str], float], 
     except ValueError:
         raise InvalidUpload(
             f"found {_shorten_text(text)}, which is not a number{_suggest_cause(text, column, convert)}",
-            row=row, column=column.name,
-        ) from None  # fmt: skip
+            row=row,
+            column=column.name,
+        ) from None
     if isinf(value):
         raise InvalidUpload(
             f"found {_shorten_text(text)}; values must be finite (an empty field is a missing value)",
-            row=row, column=column.name,
-        )  # fmt: skip
+            row=row,
+            column=column.name,
+        )
     if isnan(value) and column.role == "time":
         raise InvalidUpload(
             f"the time is missing (found {_shorten_text(text)}); every row needs a time in seconds",
-            row=row, column=column.name,
-        )  # fmt: skip
+            row=row,
+            column=column.name,
+        )
     return value
 
 

@@ -143,13 +143,15 @@ def _check_time_column(
     if sample_time is not None:
         raise InvalidUpload(
             "the file has this time column and sample_time is given too; leave one out",
-            row=1, column=name,
-        )  # fmt: skip
+            row=1,
+            column=name,
+        )
     if find_unit_seconds(unit) is None:
         raise InvalidUpload(
             f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
-            row=1, column=name,
-        )  # fmt: skip
+            row=1,
+            column=name,
+        )
 
 
 def find_unit_seconds(unit: str) -> float | None:

@@ -228,8 +228,9 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: CsvTable, name
     raise InvalidUpload(
         f"the time {what}: {before!r} s is followed by {after!r} s; times must grow from row to "
         "row (name the label columns of repeated measurements with segments)",
-        row=int(table.rows[wrong[0] + 1]), column=name,
-    )  # fmt: skip
+        row=int(table.rows[wrong[0] + 1]),
+        column=name,
+    )
 
 
 def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]) -> None:

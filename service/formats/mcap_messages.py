@@ -128,9 +128,13 @@ def make_record_dtype(fields: tuple[NumericField, ...]) -> np.dtype[np.void]:
     ``tag0, value0, tag1, …`` follow the record's own fields; a tag is 1 to 5 bytes.
     """
     parts: list[tuple[str, str]] = [
-        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-        ("log_time", "<u8"), ("publish_time", "<u8"),
-    ]  # fmt: skip
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
     for i, field in enumerate(fields):
         length = len(encode_tag(field))
         parts += [(f"tag{i}", "u1" if length == 1 else f"S{length}"), (f"value{i}", field.wire)]

@@ -23,9 +23,15 @@ from service.formats.mcap_writer import FOOTER_BODY, MCAP_MAGIC
 RECORD_HEAD: Final = struct.Struct("<BQ")
 _OPCODE_NAMES: Final = {int(one): one.name.lower().replace("_", " ") for one in Opcode}
 _SUMMARY_OPCODES: Final = {
-    Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
-    Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER,
-}  # fmt: skip
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.STATISTICS,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+    Opcode.FOOTER,
+}
 
 
 class RawRecord(NamedTuple):

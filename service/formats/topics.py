@@ -264,9 +264,11 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
             for name, entry in json.loads(metadata["history"]).items()
         }
         manifest = Manifest(
-            channels, {path: TopicClock.from_dict(entry) for path, entry in clocks.items()}, segments,
+            channels,
+            {path: TopicClock.from_dict(entry) for path, entry in clocks.items()},
+            segments,
             history,
-        )  # fmt: skip
+        )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
     names = {one.name for one in channels}

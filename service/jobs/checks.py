@@ -158,9 +158,10 @@ class JobChecker:
             first, name = places.setdefault(dataset.sha256, (pointer, reference))
             if first != pointer:
                 yield FieldError(
-                    pointer, f"{reference!r} is the same recording as {name!r} at {first}; "
+                    pointer,
+                    f"{reference!r} is the same recording as {name!r} at {first}; "
                     "name another, or leave it out",
-                )  # fmt: skip
+                )
 
     def _find_unit_faults(self, body: JobBody, model: Model) -> Iterator[FieldError]:
         return find_unit_faults(model, body["channels"], self._list_datasets(body))

@@ -67,9 +67,10 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
         latest = ReferenceRepository(session).get_latest(named)
     except RowNotFound:
         raise InvalidRequest.from_fault(
-            pointer, f"there is no reference {named!r}{_suggest_name(session, named)}; accept a run "
+            pointer,
+            f"there is no reference {named!r}{_suggest_name(session, named)}; accept a run "
             "under this name first",
-        ) from None  # fmt: skip
+        ) from None
     return _get_succeeded_run(session, latest.run_id, pointer)
 
 

@@ -34,11 +34,13 @@ def build_stored_cells(
     """The rows of a job's runs, from number `start` on."""
     for number, cell in enumerate(iterate_cells(groups, start), start):
         yield StoredCell(
-            number=number, cell=dict(cell.values), labels=dict(cell.labels),
+            number=number,
+            cell=dict(cell.values),
+            labels=dict(cell.labels),
             method=_find_field_value(spec, cell, "algorithm", "method"),
             seed=_find_field_value(spec, cell, "seed"),
             sigma=_find_field_value(spec, cell, "noise", "sigma"),
-        )  # fmt: skip
+        )
 
 
 def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -> list[Document]:
@@ -51,9 +53,12 @@ def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -
     """
     axes = [dict(axis) for axis in spec["sweep"]["axes"]]
     for steps in groups:
-        named = {number: axis.path for number, axis, _ in steps.columns
-                 if axis.values is not None
-                 and (_is_reference_field(axis.path) or any(map(_is_object, axis.values)))}  # fmt: skip
+        named = {
+            number: axis.path
+            for number, axis, _ in steps.columns
+            if axis.values is not None
+            and (_is_reference_field(axis.path) or any(map(_is_object, axis.values)))
+        }
         if not named:
             continue
         found = [_resolve_values(checker, spec, step.cell) for step in steps]

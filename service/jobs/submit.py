@@ -86,9 +86,12 @@ def check_job(
     spec = checker.resolve_body(document)
     spec["sweep"] = {"axes": resolve_axes(checker, spec, groups)}
     new = NewJob(
-        name=body.name or _choose_name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
+        name=body.name or _choose_name(checker, spec),
+        spec=spec,
+        n_runs=n_runs,
+        priority=body.priority,
         max_attempts=settings.max_attempts,
-    )  # fmt: skip
+    )
     first = islice(build_stored_cells(spec, read_axis_groups(spec)), CELLS_AT_SUBMISSION)
     return CheckedJob(new, digest, tuple(first))
 

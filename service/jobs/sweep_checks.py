@@ -100,9 +100,9 @@ def find_job_faults(
         groups = group_axes(body.sweep.axes)
         n_runs = count_runs(body, groups)
         if n_runs > most_runs:
-            found.append(FieldError(
-                "/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job"
-            ))  # fmt: skip
+            found.append(
+                FieldError("/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job")
+            )
         else:
             steps = build_axis_groups(body.sweep.axes, groups)
             wrong = list(_find_value_faults(checker, document, steps, frozenset(known)))

@@ -50,8 +50,10 @@ def _to_operation(
         summary=item.get("description") or item.get("summary", ""),
         parameters=tuple(
             ApiField(
-                one["name"], f"{_describe_schema(one.get('schema', {}))}, {one['in']}",
-                one.get("required", False), _format_default(one.get("schema", {})),
+                one["name"],
+                f"{_describe_schema(one.get('schema', {}))}, {one['in']}",
+                one.get("required", False),
+                _format_default(one.get("schema", {})),
                 one.get("description", ""),
             )
             for one in item.get("parameters", ())
@@ -60,7 +62,7 @@ def _to_operation(
         body=_describe_schema(schema) if schema else "",
         fields=tuple(_iterate_fields(document, schema)),
         answers=tuple((code, one["description"]) for code, one in item["responses"].items()),
-    )  # fmt: skip
+    )
 
 
 def _iterate_fields(document: Mapping[str, Any], schema: Mapping[str, Any]) -> Iterator[ApiField]:

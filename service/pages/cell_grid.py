@@ -67,17 +67,20 @@ def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> Gr
         for one, share in zip(found, shares, strict=True)
     }
     rows = [
-        ([format_value(value) for value in row],
-         [cells.get(to_json((*row, *column))) for column in columns])
+        (
+            [format_value(value) for value in row],
+            [cells.get(to_json((*row, *column))) for column in columns],
+        )
         for row in _distinct_keys([one.key[:split] for one in found])
-    ]  # fmt: skip
+    ]
     return GridView(
         quantity="RMS error against the record without noise" if SIGMA_PATH in keys else "RMS",
         row_names=[_axis_label(path) for path in keys[:split]],
         column_name=_axis_label(keys[-1]) if split < len(keys) else "",
         columns=[format_value(column[0]) if column else "all" for column in columns],
-        rows=rows, is_cut=is_cut,
-    )  # fmt: skip
+        rows=rows,
+        is_cut=is_cut,
+    )
 
 
 def cell_query(cell: Mapping[str, Any]) -> str:

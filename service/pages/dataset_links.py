@@ -22,10 +22,15 @@ def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
     """Datasets of a job, each with its role, label, name and parents."""
     lineage = LineageRepository(session)
     return [
-        {"role": role, "label": label, "id": one, "name": _dataset_name(session, one),
-         "parents": [e.parent for e in lineage.list_ancestors(one) if e.child == one]}
+        {
+            "role": role,
+            "label": label,
+            "id": one,
+            "name": _dataset_name(session, one),
+            "parents": [e.parent for e in lineage.list_ancestors(one) if e.child == one],
+        }
         for role, label, one in islice(_iterate_datasets(job.spec), MAX_LISTED_DATASETS)
-    ]  # fmt: skip
+    ]
 
 
 def count_unlisted_datasets(job: Job) -> int:

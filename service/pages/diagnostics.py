@@ -72,18 +72,22 @@ def to_diagnostics(result: Document) -> Diagnostics:
     several = len({one["experiment"] for one in onsets}) > 1
     verdicts = {True: "passed", False: "failed", None: "not tested"}
     return Diagnostics(
-        verdict=verdicts[tested["passed"]] if tests else "", data=tested.get("data", ""),
+        verdict=verdicts[tested["passed"]] if tests else "",
+        data=tested.get("data", ""),
         tests=[_to_test_view(one) for one in tests],
         n_figures=sum(one["experiment"] == 0 and one["outcome"] != "not tested" for one in tests),
         onsets=[_to_onset_view(one, several) for one in onsets],
         groups=[_format_group(one) for one in groups],
         criteria=result.get("criteria", {}),
         selection=[
-            SelectedTermView(one["term"], format_number(one["err"]),
-                         format_number(max(1.0 - one["cumulated"], 0.0)))
+            SelectedTermView(
+                one["term"],
+                format_number(one["err"]),
+                format_number(max(1.0 - one["cumulated"], 0.0)),
+            )
             for one in result.get("selection", ())
         ],
-    )  # fmt: skip
+    )
 
 
 def to_correlation_trace(one: CorrelationFunction) -> CorrelationTrace:
@@ -110,10 +114,15 @@ def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int 
 def _to_test_view(one: Document) -> ResidualTestView:
     what = "white" if one["test"] == "whiteness" else f"independent of {one['input']}"
     return ResidualTestView(
-        experiment=one["experiment"] + 1, output=one["output"], hypothesis=what,
-        inside95=_format_percent(one.get("inside95")), inside99=_format_percent(one.get("inside99")),
-        p=format_p_value(one.get("p")), outcome=one["outcome"], reason=one.get("reason") or "",
-    )  # fmt: skip
+        experiment=one["experiment"] + 1,
+        output=one["output"],
+        hypothesis=what,
+        inside95=_format_percent(one.get("inside95")),
+        inside99=_format_percent(one.get("inside99")),
+        p=format_p_value(one.get("p")),
+        outcome=one["outcome"],
+        reason=one.get("reason") or "",
+    )
 
 
 def _format_percent(part: float | None) -> str:

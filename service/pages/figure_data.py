@@ -60,16 +60,21 @@ def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
     runs = RunRepository(session)
     history = _group_by_island(runs.read_history(run.id))
     return RunFigureData(
-        id=run.id, unit=stored.rms_unit(session), fitness_label=fitness_label(body),
+        id=run.id,
+        unit=stored.rms_unit(session),
+        fitness_label=fitness_label(body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
-        evaluations=run.evaluations, history=history,
+        evaluations=run.evaluations,
+        history=history,
         parameters=_match_history_width(list_free_parameters(session, stored), history),
         epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
         migrations=sorted({one.epoch for one in runs.read_migrations(run.id)}),
-        islands=[(_replace_none(one.get("champion_rms"), inf), one.get("refined_rms"))
-                 for one in stored.result.get("islands", ())],
+        islands=[
+            (_replace_none(one.get("champion_rms"), inf), one.get("refined_rms"))
+            for one in stored.result.get("islands", ())
+        ],
         correlation=_to_correlation(stored.result.get("correlation")),
-    )  # fmt: skip
+    )
 
 
 def _to_correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
@@ -88,10 +93,12 @@ def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
     for island, points in groupby(rows, key=lambda row: row.island):
         while len(found) < island:  # an island that has not told anything yet
             found.append([])
-        found.append([
-            IslandImprovement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
-            for p in points
-        ])  # fmt: skip
+        found.append(
+            [
+                IslandImprovement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
+                for p in points
+            ]
+        )
     return found
 
 
@@ -110,17 +117,23 @@ def _match_history_width(
 def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreeParameter:
     values = [point.parameters[column] for point in points]
     lower, upper = min(values), max(values)
-    return FreeParameter(f"parameter {column + 1}", "1", lower, upper if upper > lower
-                           else lower + 1.0)  # fmt: skip
+    return FreeParameter(
+        f"parameter {column + 1}", "1", lower, upper if upper > lower else lower + 1.0
+    )
 
 
 def _to_estimated_parameter(
     one: Mapping[str, Any], scales: Mapping[str, ParameterScale]
 ) -> FreeParameter:
     return FreeParameter(
-        one["name"], one.get("unit", "1"), one["lower"], one["upper"],
-        scales.get(one["name"], "linear"), value=one["value"], stderr=one.get("stderr"),
-    )  # fmt: skip
+        one["name"],
+        one.get("unit", "1"),
+        one["lower"],
+        one["upper"],
+        scales.get(one["name"], "linear"),
+        value=one["value"],
+        stderr=one.get("stderr"),
+    )
 
 
 def _to_free_parameter(parameter: Parameter) -> FreeParameter:
@@ -186,15 +199,20 @@ def _join_validation(
         return experiment
     outputs = tuple(
         OutputTraces(
-            SignalTrace(first.measured.name, first.measured.unit, _concatenate(first.measured.times, rest.times),
-                  _concatenate(first.measured.values, rest.measured)),
+            SignalTrace(
+                first.measured.name,
+                first.measured.unit,
+                _concatenate(first.measured.times, rest.times),
+                _concatenate(first.measured.values, rest.measured),
+            ),
             _concatenate(first.identified, rest.simulated),
         )
         for first, rest in zip(experiment.outputs, later, strict=True)
-    )  # fmt: skip
+    )
     since = min(float(one.times[0]) for one in later)
-    return ExperimentTraces(experiment.name.replace("estimation", "record"), outputs,
-                      experiment.inputs, since)  # fmt: skip
+    return ExperimentTraces(
+        experiment.name.replace("estimation", "record"), outputs, experiment.inputs, since
+    )
 
 
 def _concatenate(first: Floats, rest: Floats) -> Floats:

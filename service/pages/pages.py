@@ -60,9 +60,11 @@ def reference_page(document: Mapping[str, Any]) -> str:
     """The REST interface, from its OpenAPI document."""
     about = document["info"]["description"]
     return render_template(
-        "reference.html", about=about, version=document["info"]["version"],
+        "reference.html",
+        about=about,
+        version=document["info"]["version"],
         operations=list_operations(document),
-    )  # fmt: skip
+    )
 
 
 def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> str:
@@ -73,18 +75,27 @@ def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> s
     jobs = [to_job_view(job, find_rms_unit(session, job.spec), now) for job in page.items]
     chosen = {"state": state.value} if state else {}
     return render_template(
-        "jobs.html", jobs=jobs, state=state.value if state else "",
-        states=[one.value for one in JobState], any_open=any(job.is_open for job in jobs),
-        cursor=cursor, filter_query=_encode_query(chosen),
+        "jobs.html",
+        jobs=jobs,
+        state=state.value if state else "",
+        states=[one.value for one in JobState],
+        any_open=any(job.is_open for job in jobs),
+        cursor=cursor,
+        filter_query=_encode_query(chosen),
         next=_encode_query({**chosen, "cursor": page.next}) if page.next else "",
-        choices=list_choices(), defaults=DEFAULTS,
-    )  # fmt: skip
+        choices=list_choices(),
+        defaults=DEFAULTS,
+    )
 
 
 def job_page(
-    session: Session, job_id: str, base_url: str, run_id: str | None = None,
-    cursor: str | None = None, cell: Sequence[str] = (),
-) -> str:  # fmt: skip
+    session: Session,
+    job_id: str,
+    base_url: str,
+    run_id: str | None = None,
+    cursor: str | None = None,
+    cell: Sequence[str] = (),
+) -> str:
     """A job with its runs, one of them in full: the one asked for, else the best or the first.
 
     Of a large sweep the page has the grid of its cells, and lists the runs of the chosen `cell`,
@@ -102,18 +113,22 @@ def job_page(
     stored = StoredRun.from_rows(job, chosen) if chosen else None
     view = to_job_view(job, find_rms_unit(session, job.spec), datetime.now(UTC))
     return render_template(
-        "job.html", job=view,
+        "job.html",
+        job=view,
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in page.items],
         run=load_full_run(session, stored) if stored else None,
         next_runs=_encode_query({"cell": cell, "cursor": page.next}) if page.next else "",
-        grid=grid, is_listed=is_listed,
+        grid=grid,
+        is_listed=is_listed,
         cell_title=format_cell(chosen_cell, {}),
-        noise_height=_noise_height(session, job, stored), trend=_load_trend_view(session, job),
+        noise_height=_noise_height(session, job, stored),
+        trend=_load_trend_view(session, job),
         comparable=_comparison_query(page.items),
-        datasets=dataset_links(session, job), more_datasets=count_unlisted_datasets(job),
+        datasets=dataset_links(session, job),
+        more_datasets=count_unlisted_datasets(job),
         commands=_request_commands(view, base_url),
         events=[to_event_view(one) for one in _latest_events(session, job)],
-    )  # fmt: skip
+    )
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:
@@ -150,18 +165,26 @@ def dataset_page(session: Session, dataset_id: str) -> str:
     """A dataset: its signals, channels, and lineage."""
     dataset = DatasetRepository(session).get(dataset_id)
     lineage = LineageRepository(session)
-    edges = [("from", edge.parent, edge.relation) for edge in lineage.list_ancestors(dataset.id)
-             if edge.child == dataset.id]  # fmt: skip
-    edges += [("for", edge.child, edge.relation) for edge in lineage.list_descendants(dataset.id)
-              if edge.parent == dataset.id]  # fmt: skip
+    edges = [
+        ("from", edge.parent, edge.relation)
+        for edge in lineage.list_ancestors(dataset.id)
+        if edge.child == dataset.id
+    ]
+    edges += [
+        ("for", edge.child, edge.relation)
+        for edge in lineage.list_descendants(dataset.id)
+        if edge.parent == dataset.id
+    ]
     return render_template(
-        "dataset.html", dataset=dataset, height=figures_signals.signals_height(dataset.n_channels),
+        "dataset.html",
+        dataset=dataset,
+        height=figures_signals.signals_height(dataset.n_channels),
         has_history=any(one["history_samples"] for one in dataset.channels),
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _object_href(name)}
             for direction, name, relation in edges
         ],
-    )  # fmt: skip
+    )
 
 
 def model_text(session: Session, name: str) -> str:
@@ -283,9 +306,11 @@ def noise_sweep_page(session: Session) -> str:
 def reidentify_page(session: Session) -> str:
     """The form of a batch re-identification."""
     return render_template(
-        "reidentify.html", models=_list_models(session), datasets=_list_datasets(session),
+        "reidentify.html",
+        models=_list_models(session),
+        datasets=_list_datasets(session),
         references=ReferenceRepository(session).list_names(),
-    )  # fmt: skip
+    )
 
 
 def _list_models(session: Session) -> Sequence[ModelOut]:

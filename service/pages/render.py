@@ -22,9 +22,7 @@ from service.core.text import TEMPLATE_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
 STATIC_FOLDER = Path(__file__).parent / "static"
-MEDIA_TYPES = {
-    ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml",
-}  # fmt: skip
+MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +70,11 @@ def template_environment() -> Environment:
     """The templates. Every text of a user is escaped, and a name that is not given is an error."""
     made = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     made.filters.update(TEMPLATE_FILTERS)
     made.globals["default_algorithm"] = GeneticAlgorithm()
     made.globals.update(

@@ -59,9 +59,13 @@ class _ReportSection:
 
 
 def render_large_report(
-    session: Session, store: ObjectStore, job: Job, trend: TrendOut | None, made: datetime,
+    session: Session,
+    store: ObjectStore,
+    job: Job,
+    trend: TrendOut | None,
+    made: datetime,
     base_url: str,
-) -> str:  # fmt: skip
+) -> str:
     """The report of a job of more runs than a page lists.
 
     Parameters
@@ -83,18 +87,26 @@ def render_large_report(
         for name, found in (("best", best), ("worst", worst), ("failed", failed))
     }
     return render_template(
-        "report_large.html", job=view, made=made, **summaries,
-        order="fit" if view.is_batch else "RMS", grid=_truncate_grid(grid),
+        "report_large.html",
+        job=view,
+        made=made,
+        **summaries,
+        order="fit" if view.is_batch else "RMS",
+        grid=_truncate_grid(grid),
         hidden_rows=max(len(grid.rows) - MAX_GRID_ROWS, 0) if grid else 0,
         trend=None if trend is None else to_trend_view(trend),
         drawings=_overview_drawings(session, job, trend),
         sections=[
             _build_section(session, store, StoredRun.from_rows(job, run), why)
-            for why, runs in shown for run in runs
+            for why, runs in shown
+            for run in runs
         ],
-        datasets=dataset_links(session, job), more_datasets=count_unlisted_datasets(job),
-        address=f"{base_url.rstrip('/')}/v1/jobs/{job.id}", policy=STATIC_POLICY, style=load_stylesheet(),
-    )  # fmt: skip
+        datasets=dataset_links(session, job),
+        more_datasets=count_unlisted_datasets(job),
+        address=f"{base_url.rstrip('/')}/v1/jobs/{job.id}",
+        policy=STATIC_POLICY,
+        style=load_stylesheet(),
+    )
 
 
 def _best_and_worst_runs(
@@ -118,9 +130,13 @@ def _truncate_grid(grid: GridView | None) -> GridView | None:
     if grid is None:
         return None
     return GridView(
-        grid.quantity, grid.row_names, grid.column_name, grid.columns, grid.rows[:MAX_GRID_ROWS],
+        grid.quantity,
+        grid.row_names,
+        grid.column_name,
+        grid.columns,
+        grid.rows[:MAX_GRID_ROWS],
         grid.is_cut,
-    )  # fmt: skip
+    )
 
 
 def _overview_drawings(
@@ -172,18 +188,25 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
     chosen = RunRepository(session).list_page(job.id, limit=MAX_FULL_RUNS, order=order).items
     full = [StoredRun.from_rows(job, run) for run in chosen]
     return render_template(
-        "report.html", job=view, made=made,
+        "report.html",
+        job=view,
+        made=made,
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in runs],
-        overview=_overview_figures(session, job), trend=None if batch is None else to_trend_view(batch),
+        overview=_overview_figures(session, job),
+        trend=None if batch is None else to_trend_view(batch),
         trend_figure=None if batch is None else to_script_json(strip_template(plot_trend(batch))),
         sections=[
-            (load_full_run(session, stored), _run_figures(session, store, stored)) for stored in full
+            (load_full_run(session, stored), _run_figures(session, store, stored))
+            for stored in full
         ],
-        datasets=dataset_links(session, job), more_datasets=count_unlisted_datasets(job),
-        policy=security_policy(), style=load_stylesheet(),
-        plotly_code=plotly_script(), draw=draw_script(),
+        datasets=dataset_links(session, job),
+        more_datasets=count_unlisted_datasets(job),
+        policy=security_policy(),
+        style=load_stylesheet(),
+        plotly_code=plotly_script(),
+        draw=draw_script(),
         templates=templates_json(),
-    )  # fmt: skip
+    )
 
 
 @cache

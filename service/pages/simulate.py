@@ -137,15 +137,26 @@ def simulate_page(
         faults = [to_form_fault(one) for one in _to_field_errors(error)]
         status = error.status if isinstance(error, Unavailable) else 422
     page = render_template(
-        "simulate.html", known=known, kind=kind, kinds=NOISE_KINDS, tunings=TUNINGS, choices=CHOICES,
-        values={**known.defaults, **(_shift_step_time(known.defaults) if kind == "loop" else {}),
-                **(IMPLIED_VALUES if has_request(query) else {}), **query,
-                **_controller_values(context.get("result"))},
+        "simulate.html",
+        known=known,
+        kind=kind,
+        kinds=NOISE_KINDS,
+        tunings=TUNINGS,
+        choices=CHOICES,
+        values={
+            **known.defaults,
+            **(_shift_step_time(known.defaults) if kind == "loop" else {}),
+            **(IMPLIED_VALUES if has_request(query) else {}),
+            **query,
+            **_controller_values(context.get("result")),
+        },
         faults={f.pointer[1:]: f.detail for f in faults},
-        lines=[_format_fault(one) for one in faults], query=_encode_query(query),
-        times=multiply_units, bracket=bracket_unit,
+        lines=[_format_fault(one) for one in faults],
+        query=_encode_query(query),
+        times=multiply_units,
+        bracket=bracket_unit,
         **{"result": None, "free": None, "figure": None, **context},
-    )  # fmt: skip
+    )
     return SimulationAnswer(page, is_csv=False, status=status)
 
 
@@ -158,10 +169,16 @@ def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) 
             datasets += _find_dataset(session, wanted)
     fitted = next((one for one in datasets if one.id == fitted_to), None)
     return _FormContext(
-        run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name,
-        model=stored.model, datasets=datasets, has_estimates=bool(stored.estimates),
-        units=_signal_units(stored, fitted), defaults=_default_values(stored, fitted) | _default_step(stored),
-    )  # fmt: skip
+        run=run.id,
+        title=f"run {run.number + 1}",
+        job=job.id,
+        job_name=job.name,
+        model=stored.model,
+        datasets=datasets,
+        has_estimates=bool(stored.estimates),
+        units=_signal_units(stored, fitted),
+        defaults=_default_values(stored, fitted) | _default_step(stored),
+    )
 
 
 def _find_dataset(session: Session, dataset: str) -> list[Dataset]:
@@ -188,11 +205,17 @@ def _default_values(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]
     period = period or model.solver.step or 0.01
     duration = min(fitted.duration if fitted else 10.0, MAX_DEFAULT_SAMPLES * period)
     return {
-        "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
-        "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",
-        "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
+        "input": model.inputs[0].name if model.inputs else "",
+        "output": model.outputs[0].name,
+        "gain": "1",
+        "amplitude": "1",
+        "time": "0",
+        "offset": "0",
+        "skip": "0",
+        "duration": f"{duration:.6g}",
+        "sample_time": f"{period:.6g}",
         **{f"channel.{name}": one for name, one in stored.channels.by_signal.items()},
-    }  # fmt: skip
+    }
 
 
 def _mean_period(irregular: Dataset) -> float | None:
@@ -239,15 +262,21 @@ def _simulate_query(
         body = _validate_body(FreeRunIn, wanted.body)
         free = free_runs.simulate_free_run(database, store, known.run, body)
         name = next((d.name for d in known.datasets if d.id == free.dataset), free.dataset)
-        return plot_response(_to_experiment_traces(free)), {"free": free, "dataset_name": name,
-                                             "records": MAX_LISTED_RECORDS}  # fmt: skip
+        return plot_response(_to_experiment_traces(free)), {
+            "free": free,
+            "dataset_name": name,
+            "records": MAX_LISTED_RECORDS,
+        }
     body = _validate_body(RunSimulateIn, wanted.body)
     told = run_simulations.simulate_run(database, store, known.run, body, MAX_POINTS)
     found = apply_units(told, known.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
     entered = known.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
-    return plot_simulation(found, since), {"result": found, "verdict": _step_verdict(found),
-                                      "command_unit": entered}  # fmt: skip
+    return plot_simulation(found, since), {
+        "result": found,
+        "verdict": _step_verdict(found),
+        "command_unit": entered,
+    }
 
 
 def _validate_body(kind: type[Any], body: Mapping[str, Any]) -> Any:
@@ -262,8 +291,11 @@ def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
     if found is None or found.tuning is None or found.controller is None:
         return {}
     used = found.controller
-    chosen = {"gain": used.gain, "integral_time": used.integral_time,
-              "derivative_time": used.derivative_time or None}  # fmt: skip
+    chosen = {
+        "gain": used.gain,
+        "integral_time": used.integral_time,
+        "derivative_time": used.derivative_time or None,
+    }
     return {name: "" if value is None else f"{value:.6g}" for name, value in chosen.items()}
 
 
@@ -297,8 +329,11 @@ def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
 
 
 def _figure_context(figure: Figure) -> dict[str, Any]:
-    return {"figure": to_script_json(strip_template(figure)), "height": figure["layout"]["height"],
-            "templates": templates_json()}  # fmt: skip
+    return {
+        "figure": to_script_json(strip_template(figure)),
+        "height": figure["layout"]["height"],
+        "templates": templates_json(),
+    }
 
 
 def _request_context(run: str, wanted: SimulationQuery, base_url: str) -> dict[str, str]:

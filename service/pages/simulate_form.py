@@ -21,18 +21,33 @@ NOISE_KINDS: Mapping[SimulationKind, str] = {
     "signal": "Free run on a signal",
 }
 FIELD_LABELS = {
-    "kind": "kind", "input": "controlled input", "output": "controlled output", "gain": "gain",
-    "integral_time": "integral time", "derivative_time": "derivative time",
-    "derivative_filter": "derivative filter N", "derivative_on": "derivative on",
-    "setpoint_weight": "setpoint weight", "tuning": "tuning",
-    "closed_loop_time_constant": "closed-loop time constant", "lower": "lower limit",
-    "upper": "upper limit", "anti_windup": "anti-windup", "tracking_time": "tracking time",
-    "limit": "limit of the command", "amplitude": "height of the step", "time": "time of the step",
-    "offset": "reference before the step", "transport_gain": "transport gain",
-    "time_constant": "transport time constant", "transport_delay": "transport time lag",
-    "duration": "duration", "sample_time": "sampling period", "dataset": "recording",
+    "kind": "kind",
+    "input": "controlled input",
+    "output": "controlled output",
+    "gain": "gain",
+    "integral_time": "integral time",
+    "derivative_time": "derivative time",
+    "derivative_filter": "derivative filter N",
+    "derivative_on": "derivative on",
+    "setpoint_weight": "setpoint weight",
+    "tuning": "tuning",
+    "closed_loop_time_constant": "closed-loop time constant",
+    "lower": "lower limit",
+    "upper": "upper limit",
+    "anti_windup": "anti-windup",
+    "tracking_time": "tracking time",
+    "limit": "limit of the command",
+    "amplitude": "height of the step",
+    "time": "time of the step",
+    "offset": "reference before the step",
+    "transport_gain": "transport gain",
+    "time_constant": "transport time constant",
+    "transport_delay": "transport time lag",
+    "duration": "duration",
+    "sample_time": "sampling period",
+    "dataset": "recording",
     "skip": "samples not judged",
-}  # fmt: skip
+}
 MANUAL_TUNING = "by hand"
 TUNINGS = {
     MANUAL_TUNING: "by hand",
@@ -56,15 +71,23 @@ _TUNED_FIELDS = ("gain", "integral_time", "derivative_time")
 _CHOICE_FIELDS = tuple(CHOICES)
 _POINTER_FIELDS = {
     "/control/tuning/closed_loop_time_constant": "closed_loop_time_constant",
-    **{f"/control/{name}": name for name in ("tuning", *_TUNED_FIELDS, *_NUMBER_FIELDS, *_CHOICE_FIELDS)},
-    "/control/input": "input", "/control/output": "output",
+    **{
+        f"/control/{name}": name
+        for name in ("tuning", *_TUNED_FIELDS, *_NUMBER_FIELDS, *_CHOICE_FIELDS)
+    },
+    "/control/input": "input",
+    "/control/output": "output",
     "/control/transport/gain": "transport_gain",
     "/control/transport/time_constant": "time_constant",
-    "/control/transport/delay": "transport_delay", "/control/reference/amplitude": "amplitude",
-    "/control/reference/time": "time", "/control/reference/offset": "offset",
-    "/sample_time": "sample_time", "/samples": "duration", "/dataset": "dataset",
+    "/control/transport/delay": "transport_delay",
+    "/control/reference/amplitude": "amplitude",
+    "/control/reference/time": "time",
+    "/control/reference/offset": "offset",
+    "/sample_time": "sample_time",
+    "/samples": "duration",
+    "/dataset": "dataset",
     "/skip": "skip",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +128,24 @@ def list_form_fields(model: Model, kind: SimulationKind) -> list[str]:
         return ["dataset", "skip", *(f"channel.{name}" for name in signals)]
     if kind == "signal":
         return [*inputs, "duration", "sample_time"]
-    return ["input", "output", "tuning", "closed_loop_time_constant", *_TUNED_FIELDS, *_NUMBER_FIELDS, *_CHOICE_FIELDS,
-            "amplitude", "time", "offset", "transport_gain", "time_constant", "transport_delay",
-            *inputs, "duration", "sample_time"]  # fmt: skip
+    return [
+        "input",
+        "output",
+        "tuning",
+        "closed_loop_time_constant",
+        *_TUNED_FIELDS,
+        *_NUMBER_FIELDS,
+        *_CHOICE_FIELDS,
+        "amplitude",
+        "time",
+        "offset",
+        "transport_gain",
+        "time_constant",
+        "transport_delay",
+        *inputs,
+        "duration",
+        "sample_time",
+    ]
 
 
 def parse_query(model: Model, query: Mapping[str, str]) -> SimulationQuery:
@@ -191,11 +229,13 @@ class _QueryReader:
             return 2, 1.0
         count = duration / period
         if not 1 <= count < MAX_SERIES_SAMPLES:
-            self.faults.append(FieldError(
-                "?duration",
-                f"{duration:g} s in steps of {period:g} s are {count:.3g} samples; need 2 to "
-                f"{MAX_SERIES_SAMPLES}",
-            ))  # fmt: skip
+            self.faults.append(
+                FieldError(
+                    "?duration",
+                    f"{duration:g} s in steps of {period:g} s are {count:.3g} samples; need 2 to "
+                    f"{MAX_SERIES_SAMPLES}",
+                )
+            )
             return 2, 1.0
         return round(count) + 1, period
 
@@ -206,21 +246,28 @@ def _loop_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
         "output": reader.read_text("output", model.outputs[0].name),
         **_controller_body(reader),
         "reference": {
-            "kind": "step", "amplitude": reader.read_number("amplitude", 1.0),
-            "time": reader.read_number("time", 0.0), "offset": reader.read_number("offset", 0.0),
+            "kind": "step",
+            "amplitude": reader.read_number("amplitude", 1.0),
+            "time": reader.read_number("time", 0.0),
+            "offset": reader.read_number("offset", 0.0),
         },
-    }  # fmt: skip
+    }
     transport = {
-        "gain": reader.read_number("transport_gain"), "time_constant": reader.read_number("time_constant"),
+        "gain": reader.read_number("transport_gain"),
+        "time_constant": reader.read_number("time_constant"),
         "delay": reader.read_number("transport_delay"),
-    }  # fmt: skip
+    }
     given = {name: value for name, value in transport.items() if value is not None}
     if given:
         control["transport"] = given
     samples, period = reader.read_samples()
     others = [one.name for one in model.inputs if one.name != control["input"]]
-    return {"control": control, "inputs": dict(_input_expressions(reader, others, "0")),
-            "samples": samples, "sample_time": period}  # fmt: skip
+    return {
+        "control": control,
+        "inputs": dict(_input_expressions(reader, others, "0")),
+        "samples": samples,
+        "sample_time": period,
+    }
 
 
 def _controller_body(reader: _QueryReader) -> dict[str, Any]:
@@ -248,8 +295,11 @@ def _controller_body(reader: _QueryReader) -> dict[str, Any]:
 def _signal_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
     names = [one.name for one in model.inputs]
     samples, period = reader.read_samples()
-    return {"inputs": dict(_input_expressions(reader, names, "")), "samples": samples,
-            "sample_time": period}  # fmt: skip
+    return {
+        "inputs": dict(_input_expressions(reader, names, "")),
+        "samples": samples,
+        "sample_time": period,
+    }
 
 
 def _input_expressions(
@@ -272,5 +322,8 @@ def _recording_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
     skip = reader.read_number("skip", 0.0) or 0.0
     if skip != int(skip):
         reader.faults.append(FieldError("?skip", f"found {skip:g}; need a whole number"))
-    return {"dataset": dataset, "channels": {k: v for k, v in chosen.items() if v},
-            "skip": int(skip)}  # fmt: skip
+    return {
+        "dataset": dataset,
+        "channels": {k: v for k, v in chosen.items() if v},
+        "skip": int(skip),
+    }

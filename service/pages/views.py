@@ -175,11 +175,15 @@ def to_estimate_view(one: Document) -> EstimateView:
     value, error = format_estimate(one["value"], stderr)
     bounds = [one[name] for name in ("lower", "upper") if one[name] is not None]
     return EstimateView(
-        name=one["name"], unit=one["unit"], value_text=value, stderr_text=error,
+        name=one["name"],
+        unit=one["unit"],
+        value_text=value,
+        stderr_text=error,
         interval_text=format_interval(one["interval95"], stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=one["status"], reason=one["reason"] or "",
-    )  # fmt: skip
+        status=one["status"],
+        reason=one["reason"] or "",
+    )
 
 
 def to_event_view(event: Event) -> EventView:

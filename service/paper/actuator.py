@@ -34,31 +34,42 @@ SEPARATE_K_B = {"k_b": {"lower": 5, "upper": 500, "scale": "log"}}
 def record_body() -> dict[str, Any]:
     """Body of the record: the reference plant, exact between its events, not the model fitted."""
     return {
-        "name": "paper Table 4: actuator", "plant": "actuator", "parameters": dict(TRUE_PARAMETERS),
+        "name": "paper Table 4: actuator",
+        "plant": "actuator",
+        "parameters": dict(TRUE_PARAMETERS),
         "inputs": {"P_a": {"kind": "expression", "expression": INPUT_EXPRESSION}},
-        "samples": SAMPLES, "sample_time": SAMPLE_TIME, "noise": {"sigma": SIGMA, "seed": 1},
-    }  # fmt: skip
+        "samples": SAMPLES,
+        "sample_time": SAMPLE_TIME,
+        "noise": {"sigma": SIGMA, "seed": 1},
+    }
 
 
 def job_body(record: str, parameters: Mapping[str, Any], reading: str) -> dict[str, Any]:
     """Body of the job; the arm starts at rest in the middle."""
     return {
-        "name": f"paper Table 4: {reading}", "model": "actuator", "datasets": [record],
+        "name": f"paper Table 4: {reading}",
+        "model": "actuator",
+        "datasets": [record],
         "parameters": {"theta(0)": {"fixed": 0.0}, **parameters},
         "algorithm": dict(published.SETTINGS),
-    }  # fmt: skip
+    }
 
 
 def loop_body(parameters: Mapping[str, float]) -> dict[str, Any]:
     """Body of the simulation of Figure 21: a step of 90° under P control through the tube."""
     return {
-        "samples": LOOP_SAMPLES, "sample_time": SAMPLE_TIME,
+        "samples": LOOP_SAMPLES,
+        "sample_time": SAMPLE_TIME,
         "parameters": {**parameters, "theta(0)": 0.0},
         "control": {
-            "input": "P_a", "output": "theta", "gain": GAIN, "limit": LIMIT,
-            "transport": TRANSPORT, "reference": {"kind": "step", "amplitude": STEP_ANGLE},
+            "input": "P_a",
+            "output": "theta",
+            "gain": GAIN,
+            "limit": LIMIT,
+            "transport": TRANSPORT,
+            "reference": {"kind": "step", "amplitude": STEP_ANGLE},
         },
-    }  # fmt: skip
+    }
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
@@ -103,12 +114,16 @@ def _printed_section(bench: StudyBench, record: str) -> Section:
         "hardly shows), so the data hold five numbers and a ridge."
         + (f" What lagid names instead of the single values: {told}." if told else ""),
         [_estimates_table(found, "Table 4, as printed")],
-        [Plot("Figure 20, as printed: RMS of the best individual",
-              figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
-              "Paper: falls gradually under the proposed search. Ours: "
-              f"{_format_final_rms(found)}. A low RMS does not make six numbers out of five.")],
+        [
+            Plot(
+                "Figure 20, as printed: RMS of the best individual",
+                figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+                "Paper: falls gradually under the proposed search. Ours: "
+                f"{_format_final_rms(found)}. A low RMS does not make six numbers out of five.",
+            )
+        ],
         links=[found["improved"].run["job"]],
-    )  # fmt: skip
+    )
 
 
 def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
@@ -117,18 +132,31 @@ def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
         unit = found["improved"].get_parameter(name)["unit"]
         true = TRUE_PARAMETERS.get(name, TRUE_PARAMETERS["k_a"])
         paper = (published.TABLE_4.simple[name], published.TABLE_4.proposed[name])
-        rows.append([
-            f"{name} [{unit}]", f"{true:.6g}", *(f"{value:.6g}" for value in paper),
-            *(_format_cell(found[method], name) for method in METHODS),
-        ])  # fmt: skip
-    rows.append(["RMS [mrad]", f"{1e3 * SIGMA:g}", "", "",
-                 *(f"{1e3 * found[m].run['rms']:.4f}" for m in METHODS)])  # fmt: skip
+        rows.append(
+            [
+                f"{name} [{unit}]",
+                f"{true:.6g}",
+                *(f"{value:.6g}" for value in paper),
+                *(_format_cell(found[method], name) for method in METHODS),
+            ]
+        )
+    rows.append(
+        [
+            "RMS [mrad]",
+            f"{1e3 * SIGMA:g}",
+            "",
+            "",
+            *(f"{1e3 * found[m].run['rms']:.4f}" for m in METHODS),
+        ]
+    )
     headings = ["parameter", "true", "paper, simple", "paper, proposed"]
     return ReportTable(
-        title, [*headings, *(f"ours, {m}" for m in METHODS)], rows,
+        title,
+        [*headings, *(f"ours, {m}" for m in METHODS)],
+        rows,
         "k_a, k_b are rates in 1/s and k_c is in Pa/rad (printed without its kilo); the table of "
         "the paper says N·m/Pa of all three.",
-    )  # fmt: skip
+    )
 
 
 def _format_cell(found: MethodRun, name: str) -> str:
@@ -143,9 +171,12 @@ def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> ReportTab
         if found["runs_away"]:
             return [name, _format_seconds(found["rise_time"]), "runs away", "", ""]
         return [
-            name, _format_seconds(found["rise_time"]), f"{found['overshoot_percent']:.1f}",
-            _format_seconds(found["settling_time"]), f"{_to_degrees(found['steady_error']):.2f}",
-        ]  # fmt: skip
+            name,
+            _format_seconds(found["rise_time"]),
+            f"{found['overshoot_percent']:.1f}",
+            _format_seconds(found["settling_time"]),
+            f"{_to_degrees(found['steady_error']):.2f}",
+        ]
 
     return ReportTable(
         "Step of 90° under P control, 10 kPa/rad, through the tube (1, 0.35 s, 0.127 s)",
@@ -175,19 +206,26 @@ def _build_plots(
     end = series["times"][-1]
     data.append(figures.line_trace("reference", [0, end], [90, 90], line=level))
     return [
-        Plot("Figure 20: RMS of the best individual",
-             figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
-             "Paper: the error becomes smaller gradually under the proposed search. "
-             f"Ours: {_format_final_rms(found)}; the noise has {1e3 * SIGMA:g} mrad."),
-        Plot("Figure 21: step response under P control", figures.plot_lines(data, "time [s]",
-                                                                     "angle θ [°]"),
-             "Paper: the response of the proposed search's model lies on the experiment's, that "
-             "of the simple search beside it. Ours: the loop closed around each identified "
-             "model, against the true parameters in place of the experiment."),
-        Plot("Response to the record's input", figures.plot_responses(found),
-             "Not in the paper: the record itself, with breaks in its course where the arm "
-             "sticks, and what is left of it."),
-    ]  # fmt: skip
+        Plot(
+            "Figure 20: RMS of the best individual",
+            figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+            "Paper: the error becomes smaller gradually under the proposed search. "
+            f"Ours: {_format_final_rms(found)}; the noise has {1e3 * SIGMA:g} mrad.",
+        ),
+        Plot(
+            "Figure 21: step response under P control",
+            figures.plot_lines(data, "time [s]", "angle θ [°]"),
+            "Paper: the response of the proposed search's model lies on the experiment's, that "
+            "of the simple search beside it. Ours: the loop closed around each identified "
+            "model, against the true parameters in place of the experiment.",
+        ),
+        Plot(
+            "Response to the record's input",
+            figures.plot_responses(found),
+            "Not in the paper: the record itself, with breaks in its course where the arm "
+            "sticks, and what is left of it.",
+        ),
+    ]
 
 
 def _build_checks(
@@ -201,11 +239,17 @@ def _build_checks(
     apart = {method: _greatest_distance(answer, exact) for method, answer in steps.items()}
     text = ", ".join(f"{method} {value:.2f}°" for method, value in apart.items())
     return [
-        Check(f"`improved` finds each parameter within 2 % (farthest: {worst}, "
-              f"{100 * off[worst]:.2f} %)", off[worst] <= 0.02),
-        Check("the loop around the model of `improved` follows that of the true parameters within "
-              f"1° ({text} at most)", apart["improved"] <= 1),
-    ]  # fmt: skip
+        Check(
+            f"`improved` finds each parameter within 2 % (farthest: {worst}, "
+            f"{100 * off[worst]:.2f} %)",
+            off[worst] <= 0.02,
+        ),
+        Check(
+            "the loop around the model of `improved` follows that of the true parameters within "
+            f"1° ({text} at most)",
+            apart["improved"] <= 1,
+        ),
+    ]
 
 
 def _greatest_distance(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:

@@ -53,8 +53,9 @@ def plot_lines(data: list[Line], x: str, y: str, **more: Any) -> Figure:
     }
 
 
-def plot_convergence(found: Mapping[str, MethodRun], names: Sequence[str],
-                true: Mapping[str, float]) -> Figure:  # fmt: skip
+def plot_convergence(
+    found: Mapping[str, MethodRun], names: Sequence[str], true: Mapping[str, float]
+) -> Figure:
     """Champion's parameters over the generations, method by method, one plot a parameter."""
     end = _last_generation(found)
     data: list[Line] = []
@@ -156,8 +157,15 @@ def band_trace(
     """The area between two lines, in the method's colour."""
     colour = theme.SHADE if method == "" else theme.fade(method_style(method)["color"], 0.16)
     around = [*x, *reversed(x)], [*upper, *reversed(lower)]
-    return line_trace("", *around, fill="toself", fillcolor=colour, line={"width": 0},
-                hoverinfo="skip", showlegend=False)  # fmt: skip
+    return line_trace(
+        "",
+        *around,
+        fill="toself",
+        fillcolor=colour,
+        line={"width": 0},
+        hoverinfo="skip",
+        showlegend=False,
+    )
 
 
 def marker_trace(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Line:

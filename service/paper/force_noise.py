@@ -18,13 +18,17 @@ BARE_TERM = "q(k-2))/m"
 NOISE_TERMS = {
     "force": ("q(k-2) - sigma*phi(k-2))/m", "N"),
     "printed": ("q(k-2))/m + sigma*phi(k-2)", "m"),
-}  # fmt: skip
+}
 N_DRAWS = 20
 # Draws of unit deviation, one a channel; the models scale them.
 NOISE_MODEL = {
-    "name": "noise", "form": "difference", "states": {"x": "1"}, "equations": {"x": "0"},
-    "outputs": {f"phi_{n}": "x" for n in range(N_DRAWS)}, "initial": {"x": 0},
-}  # fmt: skip
+    "name": "noise",
+    "form": "difference",
+    "states": {"x": "1"},
+    "equations": {"x": "0"},
+    "outputs": {f"phi_{n}": "x" for n in range(N_DRAWS)},
+    "initial": {"x": 0},
+}
 SAMPLING = {"samples": published.SAMPLES, "sample_time": published.SAMPLE_TIME}
 
 
@@ -35,10 +39,12 @@ def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
     if equation.count(BARE_TERM) != 1:
         raise ValueError(f"the recursion {equation!r} has no {BARE_TERM!r} to put the noise beside")
     return {
-        **known, "name": f"duffing-{kind}-noise", "inputs": {**known["inputs"], "phi": "1"},
+        **known,
+        "name": f"duffing-{kind}-noise",
+        "inputs": {**known["inputs"], "phi": "1"},
         "parameters": {**known["parameters"], "sigma": {"lower": 0, "upper": 10, "unit": unit}},
         "equations": {"x": equation.replace(BARE_TERM, after)},
-    }  # fmt: skip
+    }
 
 
 def build_section(bench: StudyBench, exact: str) -> Section:
@@ -46,15 +52,20 @@ def build_section(bench: StudyBench, exact: str) -> Section:
     draws = 3 if bench.quick else 8
     known = bench.client.model(EXAMPLE_1.recursion)["document"]
     bench.say("paper Figure 15: records with noise inside the equation")
-    noise = bench.client.simulate_dataset({
-        **SAMPLING, "name": "φ of Eq. 13, unit deviation", "model": NOISE_MODEL,
-        "noise": {"sigma": 1.0, "seed": 1},
-    })["id"]  # fmt: skip
+    noise = bench.client.simulate_dataset(
+        {
+            **SAMPLING,
+            "name": "φ of Eq. 13, unit deviation",
+            "model": NOISE_MODEL,
+            "noise": {"sigma": 1.0, "seed": 1},
+        }
+    )["id"]
     force, printed = (model_document(known, kind) for kind in NOISE_TERMS)
     records = [
         (sigma, _simulate_record(bench, force, noise, sigma, draw))
-        for sigma in FORCE_SIGMAS for draw in range(draws)
-    ]  # fmt: skip
+        for sigma in FORCE_SIGMAS
+        for draw in range(draws)
+    ]
     kept = [(sigma, record) for sigma, record in records if record is not None]
     runs = bench.run_job(job_body(kept, exact))
     lost = [
@@ -77,33 +88,52 @@ def build_section(bench: StudyBench, exact: str) -> Section:
         f"{draws} draws for each σ, identified without knowledge of φ, the error taken against "
         "the response without φ. As printed, φ(k) is added to the displacement at every step.",
         [
-            ReportTable("φ as a force: median error of the identified response [m]", ["σ [N]", *METHODS],
-                  [[f"{sigma:g}", *(f"{medians[m][n]:.4f}" for m in METHODS)]
-                   for n, sigma in enumerate(FORCE_SIGMAS)]),
-            ReportTable(f"φ as printed: records that diverge within 300 samples, of {N_DRAWS} draws",
-                  ["", *(f"σ = {sigma:g} m" for sigma, _ in lost)],
-                  [["diverge", *(str(count) for _, count in lost)]]),
+            ReportTable(
+                "φ as a force: median error of the identified response [m]",
+                ["σ [N]", *METHODS],
+                [
+                    [f"{sigma:g}", *(f"{medians[m][n]:.4f}" for m in METHODS)]
+                    for n, sigma in enumerate(FORCE_SIGMAS)
+                ],
+            ),
+            ReportTable(
+                f"φ as printed: records that diverge within 300 samples, of {N_DRAWS} draws",
+                ["", *(f"σ = {sigma:g} m" for sigma, _ in lost)],
+                [["diverge", *(str(count) for _, count in lost)]],
+            ),
         ],
-        [Plot("Figure 15: φ as a force", _plot_errors(runs, medians),
-              "Paper: low up to σ about 0.5, then rising. Ours: medians and single runs. Force "
-              "noise bends the estimates of every method alike, since a search for the free "
-              "run's error takes the motion that φ made for the system's own.")],
+        [
+            Plot(
+                "Figure 15: φ as a force",
+                _plot_errors(runs, medians),
+                "Paper: low up to σ about 0.5, then rising. Ours: medians and single runs. Force "
+                "noise bends the estimates of every method alike, since a search for the free "
+                "run's error takes the motion that φ made for the system's own.",
+            )
+        ],
         links=[runs[0]["job"]],
-    )  # fmt: skip
+    )
 
 
 def job_body(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]:
     """Body of the job: every record with every method."""
     return {
-        "name": "paper Figure 15: force noise", "model": EXAMPLE_1.recursion,
-        "datasets": [records[0][1]], "validation": {"datasets": [exact]},
+        "name": "paper Figure 15: force noise",
+        "model": EXAMPLE_1.recursion,
+        "datasets": [records[0][1]],
+        "validation": {"datasets": [exact]},
         "algorithm": dict(published.SETTINGS),
-        "sweep": {"axes": [
-            {"path": "/datasets", "values": [[record] for _, record in records],
-             "labels": [{"sigma": sigma} for sigma, _ in records]},
-            {"path": "/algorithm/method", "values": list(METHODS)},
-        ]},
-    }  # fmt: skip
+        "sweep": {
+            "axes": [
+                {
+                    "path": "/datasets",
+                    "values": [[record] for _, record in records],
+                    "labels": [{"sigma": sigma} for sigma, _ in records],
+                },
+                {"path": "/algorithm/method", "values": list(METHODS)},
+            ]
+        },
+    }
 
 
 def _simulate_record(
@@ -113,10 +143,15 @@ def _simulate_record(
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": published.OMEGA}
     phi = {"kind": "dataset", "dataset": noise, "channel": f"phi_{draw}"}
     try:
-        made = bench.client.simulate_dataset({
-            **SAMPLING, "name": f"paper example 1, φ of σ {sigma:g}, draw {draw}", "model": model,
-            "parameters": {**EXAMPLE_1.true, "sigma": sigma}, "inputs": {"q": wave, "phi": phi},
-        })  # fmt: skip
+        made = bench.client.simulate_dataset(
+            {
+                **SAMPLING,
+                "name": f"paper example 1, φ of σ {sigma:g}, draw {draw}",
+                "model": model,
+                "parameters": {**EXAMPLE_1.true, "sigma": sigma},
+                "inputs": {"q": wave, "phi": phi},
+            }
+        )
     except ProblemError as problem:
         if "diverges" not in str(problem):
             raise
@@ -126,10 +161,12 @@ def _simulate_record(
 
 def _select_errors(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> list[float]:
     return [
-        run["rms_validation"] for run in runs
-        if run["cell"]["/algorithm/method"] == method and run["labels"]["sigma"] == sigma
+        run["rms_validation"]
+        for run in runs
+        if run["cell"]["/algorithm/method"] == method
+        and run["labels"]["sigma"] == sigma
         and run["rms_validation"] is not None
-    ]  # fmt: skip
+    ]
 
 
 def _median_error(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> float:

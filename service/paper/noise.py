@@ -29,8 +29,12 @@ class ReplicateErrors:
 
 def noise_free_body(samples: int) -> dict[str, Any]:
     """Body of a record without noise."""
-    return {**record_body(EXAMPLE_1, list_readings(EXAMPLE_1)[0]), "name": "paper example 1, no noise",
-            "samples": samples, "noise": {"sigma": 0.0}}  # fmt: skip
+    return {
+        **record_body(EXAMPLE_1, list_readings(EXAMPLE_1)[0]),
+        "name": "paper example 1, no noise",
+        "samples": samples,
+        "noise": {"sigma": 0.0},
+    }
 
 
 def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
@@ -40,15 +44,20 @@ def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
     """
     together = {"range": [0, replicates], "zip": "replicate"}
     return {
-        "name": "paper Figure 15: noise sweep", "model": EXAMPLE_1.recursion,
-        "datasets": [record], "validation": {"datasets": [exact]},
+        "name": "paper Figure 15: noise sweep",
+        "model": EXAMPLE_1.recursion,
+        "datasets": [record],
+        "validation": {"datasets": [exact]},
         "algorithm": dict(published.SETTINGS),
-        "sweep": {"axes": [
-            {"path": "/noise/sigma", "values": list(SIGMAS)},
-            {"path": "/noise/seed", **together}, {"path": "/seed", **together},
-            {"path": "/algorithm/method", "values": list(METHODS)},
-        ]},
-    }  # fmt: skip
+        "sweep": {
+            "axes": [
+                {"path": "/noise/sigma", "values": list(SIGMAS)},
+                {"path": "/noise/seed", **together},
+                {"path": "/seed", **together},
+                {"path": "/algorithm/method", "values": list(METHODS)},
+            ]
+        },
+    }
 
 
 def group_replicates(
@@ -59,10 +68,12 @@ def group_replicates(
     for method in METHODS:
         for sigma in SIGMAS:
             values = [
-                run[field] for run in runs
+                run[field]
+                for run in runs
                 if run["cell"]["/algorithm/method"] == method
-                and run["cell"]["/noise/sigma"] == sigma and run[field] is not None
-            ]  # fmt: skip
+                and run["cell"]["/noise/sigma"] == sigma
+                and run[field] is not None
+            ]
             low, middle, high = (float(q) for q in np.quantile(values, QUANTILES))
             found.setdefault(method, []).append(ReplicateErrors(sigma, values, (low, middle, high)))
     return found
@@ -82,30 +93,38 @@ def build_sections(bench: StudyBench) -> list[Section]:
     )
     runs = bench.run_job(job_body(record, exact, replicates))
     errors, fits = group_replicates(runs, "rms_validation"), group_replicates(runs, "rms")
-    return [Section(
-        "Figure 15: noise and RMS error",
-        f"Example 1, Eq. 16 with cos(ωhk); white Gaussian noise on the displacement, "
-        f"{replicates} draws of noise and of the search for each σ, {len(runs)} identifications "
-        "in one job. Error: the identified response against the response without noise.",
-        [_median_table(errors)],
-        [
-            Plot("Figure 15: error of the identified response", plot_spread(errors, True),
-                 "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
-                 "10 to 90 % (band) and single runs (points). The error of `improved` grows in "
-                 "proportion to σ from the start, along the floor σ√(p/N), without a knee. The "
-                 "two methods of the paper have an error of their search besides, which hides "
-                 "that of the noise while σ is small: a flat part and a rise like the paper's. "
-                 "Where the noise is great a search that stops early does not follow the noise "
-                 "either, so there the simple one is no worse; the parameters' bounds hold all "
-                 "below the floor, which knows no bounds."),
-            Plot("Figure 15, measured otherwise: RMS against the noisy record",
-                 plot_spread(fits, False),
-                 "The paper does not say against which record. Against the noisy one every RMS "
-                 "is at least about σ, so it shows the noise and not the identification."),
-        ],
-        _build_checks(errors),
-        links=[runs[0]["job"]],
-    ), forces.build_section(bench, exact)]  # fmt: skip
+    return [
+        Section(
+            "Figure 15: noise and RMS error",
+            f"Example 1, Eq. 16 with cos(ωhk); white Gaussian noise on the displacement, "
+            f"{replicates} draws of noise and of the search for each σ, {len(runs)} identifications "
+            "in one job. Error: the identified response against the response without noise.",
+            [_median_table(errors)],
+            [
+                Plot(
+                    "Figure 15: error of the identified response",
+                    plot_spread(errors, True),
+                    "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
+                    "10 to 90 % (band) and single runs (points). The error of `improved` grows in "
+                    "proportion to σ from the start, along the floor σ√(p/N), without a knee. The "
+                    "two methods of the paper have an error of their search besides, which hides "
+                    "that of the noise while σ is small: a flat part and a rise like the paper's. "
+                    "Where the noise is great a search that stops early does not follow the noise "
+                    "either, so there the simple one is no worse; the parameters' bounds hold all "
+                    "below the floor, which knows no bounds.",
+                ),
+                Plot(
+                    "Figure 15, measured otherwise: RMS against the noisy record",
+                    plot_spread(fits, False),
+                    "The paper does not say against which record. Against the noisy one every RMS "
+                    "is at least about σ, so it shows the noise and not the identification.",
+                ),
+            ],
+            _build_checks(errors),
+            links=[runs[0]["job"]],
+        ),
+        forces.build_section(bench, exact),
+    ]
 
 
 def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
@@ -129,10 +148,13 @@ def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> di
 
 def _median_table(found: dict[str, list[ReplicateErrors]]) -> ReportTable:
     rows = [
-        [f"{sigma:g}", *(f"{found[method][n].quantiles[1]:.4f}" for method in METHODS),
-         f"{response_floor(sigma):.4f}"]
+        [
+            f"{sigma:g}",
+            *(f"{found[method][n].quantiles[1]:.4f}" for method in METHODS),
+            f"{response_floor(sigma):.4f}",
+        ]
         for n, sigma in enumerate(SIGMAS)
-    ]  # fmt: skip
+    ]
     return ReportTable("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao floor"], rows)
 
 
@@ -142,11 +164,18 @@ def _build_checks(found: dict[str, list[ReplicateErrors]]) -> list[Check]:
     ]
     worst = max(
         found["improved"][n].quantiles[1] / found["simple"][n].quantiles[1]
-        for n, sigma in enumerate(SIGMAS) if 0 < sigma <= 0.2
-    )  # fmt: skip
+        for n, sigma in enumerate(SIGMAS)
+        if 0 < sigma <= 0.2
+    )
     return [
-        Check("the median of `improved` is below that of `simple` up to σ = 0.2 m (greatest "
-              f"ratio {worst:.2f})", worst < 1),
-        Check("the median of `improved` stays within twice the Cramér–Rao floor (greatest ratio "
-              f"{max(ratios):.2f})", max(ratios) <= 2),
-    ]  # fmt: skip
+        Check(
+            "the median of `improved` is below that of `simple` up to σ = 0.2 m (greatest "
+            f"ratio {worst:.2f})",
+            worst < 1,
+        ),
+        Check(
+            "the median of `improved` stays within twice the Cramér–Rao floor (greatest ratio "
+            f"{max(ratios):.2f})",
+            max(ratios) <= 2,
+        ),
+    ]

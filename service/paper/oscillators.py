@@ -42,50 +42,73 @@ class EquationReading:
 
 
 EXAMPLE_1 = Example(
-    1, 1, (7, 8, 9, 10), published.TRUE_1, published.TABLE_1, "duffing-eq16", "duffing-delay",
+    1,
+    1,
+    (7, 8, 9, 10),
+    published.TRUE_1,
+    published.TABLE_1,
+    "duffing-eq16",
+    "duffing-delay",
     "stops near generation 54",
-)  # fmt: skip
+)
 EXAMPLE_2 = Example(
-    2, 2, (11, 12, 13, 14), published.TRUE_2, published.TABLE_2, "coulomb-eq16", "coulomb-delay",
+    2,
+    2,
+    (11, 12, 13, 14),
+    published.TRUE_2,
+    published.TABLE_2,
+    "coulomb-eq16",
+    "coulomb-delay",
     "cannot lower the error further",
-)  # fmt: skip
+)
 
 
 def list_readings(example: Example) -> list[EquationReading]:
     """The corrected reading first, then the differential equation, then the letter."""
     return [
         EquationReading(
-            "Eq. 16 with cos(ωhk)", example.recursion, published.OMEGA,
+            "Eq. 16 with cos(ωhk)",
+            example.recursion,
+            published.OMEGA,
             "the paper's recursion, the input sampled at the times hk",
         ),
         EquationReading(
-            "Eq. 13 itself", example.continuous, published.OMEGA,
+            "Eq. 13 itself",
+            example.continuous,
+            published.OMEGA,
             "the delay differential equation, which the recursion approximates",
         ),
         EquationReading(
-            "Eq. 16 as printed, cos(ωk)", example.recursion,
+            "Eq. 16 as printed, cos(ωk)",
+            example.recursion,
             published.OMEGA / published.SAMPLE_TIME,
             "the input as printed, without h: 250 rad/s, which samples 0.02 s apart cannot follow",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def record_body(example: Example, reading: EquationReading) -> dict[str, Any]:
     """Body of the record: the reading's model with the true parameters and measurement noise."""
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": reading.omega}
     return {
-        "name": f"paper example {example.number}, {reading.title}", "model": reading.model,
-        "parameters": dict(example.true), "inputs": {"q": wave}, "samples": published.SAMPLES,
-        "sample_time": published.SAMPLE_TIME, "noise": {"sigma": published.SIGMA, "seed": 1},
-    }  # fmt: skip
+        "name": f"paper example {example.number}, {reading.title}",
+        "model": reading.model,
+        "parameters": dict(example.true),
+        "inputs": {"q": wave},
+        "samples": published.SAMPLES,
+        "sample_time": published.SAMPLE_TIME,
+        "noise": {"sigma": published.SIGMA, "seed": 1},
+    }
 
 
 def job_body(example: Example, reading: EquationReading, record: str) -> dict[str, Any]:
     """Body of the job, with the settings of section 4."""
     return {
-        "name": f"paper Table {example.table}: {reading.title}", "model": reading.model,
-        "datasets": [record], "algorithm": dict(published.SETTINGS),
-    }  # fmt: skip
+        "name": f"paper Table {example.table}: {reading.title}",
+        "model": reading.model,
+        "datasets": [record],
+        "algorithm": dict(published.SETTINGS),
+    }
 
 
 def build_sections(bench: StudyBench, example: Example) -> list[Section]:
@@ -124,27 +147,41 @@ def estimates_table(
     rows = []
     for name, true in example.true.items():
         unit = found["improved"].get_parameter(name)["unit"]
-        rows.append([
-            f"{name} [{unit}]", f"{true:g}", f"{example.columns.simple[name]:.6f}",
-            f"{example.columns.proposed[name]:.6f}",
-            *(format_estimate(found[method], name) for method in METHODS),
-            format_number(least[name], 2),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{name} [{unit}]",
+                f"{true:g}",
+                f"{example.columns.simple[name]:.6f}",
+                f"{example.columns.proposed[name]:.6f}",
+                *(format_estimate(found[method], name) for method in METHODS),
+                format_number(least[name], 2),
+            ]
+        )
     for name, true in example.true.items():
         printed = (example.columns.simple[name], example.columns.proposed[name])
         ours = [found[method].get_estimate(name) for method in METHODS]
-        rows.append([
-            f"error of {name}", "", *(f"{abs(value - true):.4f}" for value in (*printed, *ours)),
-            "",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"error of {name}",
+                "",
+                *(f"{abs(value - true):.4f}" for value in (*printed, *ours)),
+                "",
+            ]
+        )
     return ReportTable(
         f"Table {example.table}",
-        ["parameter", "true", "paper, simple", "paper, proposed",
-         *(f"ours, {method}" for method in METHODS), "Cramér–Rao sd"],
+        [
+            "parameter",
+            "true",
+            "paper, simple",
+            "paper, proposed",
+            *(f"ours, {method}" for method in METHODS),
+            "Cramér–Rao sd",
+        ],
         rows,
         "Ours: estimate ± standard error. The paper's draw of the noise is not known; its columns "
         f"are the same under every reading. {_compare_with_bound(example, least)}",
-    )  # fmt: skip
+    )
 
 
 def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
@@ -172,12 +209,13 @@ def format_estimate(found: MethodRun, name: str) -> str:
 def efforts_table(found: Mapping[str, MethodRun]) -> ReportTable:
     """RMS and number of simulations of each method."""
     return ReportTable(
-        "Search", ["", *METHODS],
+        "Search",
+        ["", *METHODS],
         [
             ["RMS [m]", *(f"{found[m].run['rms']:.6f}" for m in METHODS)],
             ["simulations", *(str(found[m].run["evaluations"]) for m in METHODS)],
         ],
-    )  # fmt: skip
+    )
 
 
 def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
@@ -211,7 +249,7 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
             + ", ".join(f"{value / published.SIGMA:.2f} ({m})" for m, value in reached.items())
             + "; 1 is a perfect fit.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _absolute_errors(found: MethodRun, true: Mapping[str, float]) -> dict[str, float]:
@@ -232,16 +270,25 @@ def build_checks(
     """What this study says about the paper's claim and about the data."""
     rms = {method: found[method].run["rms"] for method in METHODS}
     ours = found["improved"]
-    within = {name: abs(ours.get_estimate(name) - true) / least[name]
-              for name, true in example.true.items()}  # fmt: skip
+    within = {
+        name: abs(ours.get_estimate(name) - true) / least[name]
+        for name, true in example.true.items()
+    }
     worst = max(within, key=lambda name: within[name])
     return [
-        Check("the sequence search ends no higher than the simple search "
-              f"({rms['improved-paper']:.5f} against {rms['simple']:.5f} m)",
-              rms["improved-paper"] <= rms["simple"]),
-        Check("`improved` reaches the noise: RMS at most 1.01 of its sd "
-              f"({rms['improved'] / published.SIGMA:.3f})",
-              rms["improved"] <= 1.01 * published.SIGMA),
-        Check(f"`improved` lies within three Cramér–Rao sd of the truth (farthest: {worst}, "
-              f"{within[worst]:.2f} sd)", within[worst] <= 3),
-    ]  # fmt: skip
+        Check(
+            "the sequence search ends no higher than the simple search "
+            f"({rms['improved-paper']:.5f} against {rms['simple']:.5f} m)",
+            rms["improved-paper"] <= rms["simple"],
+        ),
+        Check(
+            "`improved` reaches the noise: RMS at most 1.01 of its sd "
+            f"({rms['improved'] / published.SIGMA:.3f})",
+            rms["improved"] <= 1.01 * published.SIGMA,
+        ),
+        Check(
+            f"`improved` lies within three Cramér–Rao sd of the truth (farthest: {worst}, "
+            f"{within[worst]:.2f} sd)",
+            within[worst] <= 3,
+        ),
+    ]

@@ -9,9 +9,12 @@ TRUE_2 = {"c": 0.2, "L": 0.5, "b": 5.0, "mu": 0.5}
 AMPLITUDE, OMEGA, SAMPLE_TIME, SAMPLES = 10.0, 5.0, 0.02, 300
 SIGMA = 0.01
 SETTINGS = {
-    "population": 50, "selection_rate": 0.5, "mutation": [[0, 0.2], [50, 0.8]],
-    "generations": 400, "stagnation": 30,
-}  # fmt: skip
+    "population": 50,
+    "selection_rate": 0.5,
+    "mutation": [[0, 0.2], [50, 0.8]],
+    "generations": 400,
+    "stagnation": 30,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +44,20 @@ TABLE_3 = (
 )
 # In SI units: k_a and k_b are rates, k_c was printed in kPa/rad (the table says N·m/Pa of all).
 TABLE_4 = PublishedColumns(
-    simple={"J": 3.6e-4, "F_c": 1.0068e-2, "F_max": 3.5288e-2, "k_a": 83.0890, "k_b": 121.7009,
-            "k_c": 416.9110e3},
-    proposed={"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.0890, "k_b": 121.6784,
-              "k_c": 456.9892e3},
-)  # fmt: skip
+    simple={
+        "J": 3.6e-4,
+        "F_c": 1.0068e-2,
+        "F_max": 3.5288e-2,
+        "k_a": 83.0890,
+        "k_b": 121.7009,
+        "k_c": 416.9110e3,
+    },
+    proposed={
+        "J": 3.6e-4,
+        "F_c": 1.2317e-2,
+        "F_max": 3.3333e-2,
+        "k_a": 83.0890,
+        "k_b": 121.6784,
+        "k_c": 456.9892e3,
+    },
+)

@@ -14,11 +14,18 @@ from service.paper.document import Plot, Section, describe_check
 def render_report(sections: Sequence[Section], *, quick: bool) -> str:
     """The report: tables, figures with captions, and what held."""
     return render_template(
-        "paper.html", sections=sections, made=datetime.now(UTC), quick=quick,
-        policy=jobs.security_policy(), style=load_stylesheet(), plotly_code=jobs.plotly_script(), draw=jobs.draw_script(),
+        "paper.html",
+        sections=sections,
+        made=datetime.now(UTC),
+        quick=quick,
+        policy=jobs.security_policy(),
+        style=load_stylesheet(),
+        plotly_code=jobs.plotly_script(),
+        draw=jobs.draw_script(),
         templates=templates_json(),
-        figure_json=_figure_json, verdict=describe_check,
-    )  # fmt: skip
+        figure_json=_figure_json,
+        verdict=describe_check,
+    )
 
 
 def _figure_json(plot: Plot) -> Markup:

@@ -12,19 +12,24 @@ from service.paper.document import Plot, ReportTable, Section
 RATE, END_TIME = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)
 # As printed, y(kT+1) follows y(kT): one second later. That is a step only where T is one second.
-READINGS = (("as printed: y(kT + 1), so T = 1 s", 1.0),
-            ("as corrected: y((k + 1)T), T = 0.02 s", 0.02))  # fmt: skip
+READINGS = (
+    ("as printed: y(kT + 1), so T = 1 s", 1.0),
+    ("as corrected: y((k + 1)T), T = 0.02 s", 0.02),
+)
 
 
 def model_document(n: int) -> dict[str, Any]:
     """Model document of Eq. 7 with terms up to power n."""
     powers = [f"(L*h*(k-1))**{i}/{factorial(i)}" for i in range(1, n + 1)]
     return {
-        "name": f"exponential-{n}", "form": "difference", "states": {"y": "1"},
+        "name": f"exponential-{n}",
+        "form": "difference",
+        "states": {"y": "1"},
         "parameters": {"L": {"lower": 0, "upper": 2, "unit": "1/s"}},
         "equations": {"y": f"y(k-1) + h*({' + '.join(['1', *powers])})"},
-        "outputs": {"y": "y"}, "initial": {"y": 0},
-    }  # fmt: skip
+        "outputs": {"y": "y"},
+        "initial": {"y": 0},
+    }
 
 
 def exact_solution(t: float) -> float:
@@ -47,19 +52,30 @@ def build_sections(bench: StudyBench) -> list[Section]:
             "Figures 2 and 3: truncated exponential series",
             f"dy/dt = exp(Lt), L = {RATE:g} 1/s, from y(0) = 0 to {END_TIME:g} s; the paper gives "
             "neither T nor the span.",
-            [ReportTable(f"Error at {END_TIME:g} s", ["reading", *(f"n = {n}" for n in TERMS)], rows,
-                   "More terms help until the step itself (Euler's) is the greater error: with "
-                   "T = 1 s a longer series cannot mend it.")],
+            [
+                ReportTable(
+                    f"Error at {END_TIME:g} s",
+                    ["reading", *(f"n = {n}" for n in TERMS)],
+                    rows,
+                    "More terms help until the step itself (Euler's) is the greater error: with "
+                    "T = 1 s a longer series cannot mend it.",
+                )
+            ],
             plots,
         )
-    ]  # fmt: skip
+    ]
 
 
 def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[float], list[float]]:
-    made = bench.client.simulate_dataset({
-        "name": f"paper Figure 2, n = {n}, T = {period:g} s", "model": model_document(n),
-        "parameters": {"L": RATE}, "samples": round(END_TIME / period) + 1, "sample_time": period,
-    })  # fmt: skip
+    made = bench.client.simulate_dataset(
+        {
+            "name": f"paper Figure 2, n = {n}, T = {period:g} s",
+            "model": model_document(n),
+            "parameters": {"L": RATE},
+            "samples": round(END_TIME / period) + 1,
+            "sample_time": period,
+        }
+    )
     series = bench.client.signals(made["id"])["channels"][0]
     return series["times"], series["values"]
 
@@ -77,11 +93,17 @@ def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) 
         errors.append(figures.line_trace(f"n = {n}", x, off, line={**looks, "dash": "solid"}))
     first, last = (abs(lines[n][1][-1] - exact_solution(times[-1])) for n in (TERMS[0], TERMS[-1]))
     return [
-        Plot(f"Figure 2, {title}", figures.plot_lines(outputs, "time [s]", "y"),
-             "Paper: the broken lines of the series near the solid exact solution as n grows. "
-             f"Ours too; n = {TERMS[-1]} reaches "
-             f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % of it at {END_TIME:g} s."),
-        Plot(f"Figure 3, {title}", figures.plot_lines(errors, "time [s]", "ŷ − y"),
-             "Paper: the error shrinks with n. Ours: at the end "
-             f"{first:.3g} with n = {TERMS[0]} and {last:.3g} with n = {TERMS[-1]}."),
-    ]  # fmt: skip
+        Plot(
+            f"Figure 2, {title}",
+            figures.plot_lines(outputs, "time [s]", "y"),
+            "Paper: the broken lines of the series near the solid exact solution as n grows. "
+            f"Ours too; n = {TERMS[-1]} reaches "
+            f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % of it at {END_TIME:g} s.",
+        ),
+        Plot(
+            f"Figure 3, {title}",
+            figures.plot_lines(errors, "time [s]", "ŷ − y"),
+            "Paper: the error shrinks with n. Ours: at the end "
+            f"{first:.3g} with n = {TERMS[0]} and {last:.3g} with n = {TERMS[-1]}.",
+        ),
+    ]

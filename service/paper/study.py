@@ -18,9 +18,13 @@ PARTS: Mapping[str, StudyPart] = {
     "table4": actuator.build_sections,
 }
 _FIGURES: Mapping[str, Iterable[int]] = {
-    "series": (2, 3), "table1": range(7, 11), "table2": range(11, 15), "noise": (15,),
-    "table3": (17, 18), "table4": (20, 21),
-}  # fmt: skip
+    "series": (2, 3),
+    "table1": range(7, 11),
+    "table2": range(11, 15),
+    "noise": (15,),
+    "table3": (17, 18),
+    "table4": (20, 21),
+}
 _PART_BY_FIGURE = {f"figure{number}": part for part, all_ in _FIGURES.items() for number in all_}
 
 

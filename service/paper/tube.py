@@ -43,12 +43,15 @@ def store_records(bench: StudyBench) -> TubeRecords:
         return TubeRecords(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
     bench.say("paper Table 3: the reference plant makes the records, as LAGID_DATA has none")
     made = [
-        bench.client.simulate_dataset({
-            "name": f"paper Table 3: tube {LENGTH_M} m, pattern {pattern}", "plant": "tube",
-            "parameters": {"length_m": LENGTH_M, "pattern": pattern, "gauges": pattern},
-        })["id"]
+        bench.client.simulate_dataset(
+            {
+                "name": f"paper Table 3: tube {LENGTH_M} m, pattern {pattern}",
+                "plant": "tube",
+                "parameters": {"length_m": LENGTH_M, "pattern": pattern, "gauges": pattern},
+            }
+        )["id"]
         for pattern in (1, 2)
-    ]  # fmt: skip
+    ]
     return TubeRecords(made, "P1", "P2", "LAGID_DATA has no records, so the service made them")
 
 
@@ -60,15 +63,22 @@ def job_body(records: TubeRecords) -> dict[str, Any]:
     """Body of the job: both patterns, each by itself, with every method."""
     labels = [{"pattern": float(n)} for n in (1, 2)]
     return {
-        "name": f"paper Table 3: tube {LENGTH_M} m", "model": "tube",
+        "name": f"paper Table 3: tube {LENGTH_M} m",
+        "model": "tube",
         "datasets": records.datasets[:1],
         "channels": {"u": records.inlet, "y": records.outlet},
         "algorithm": dict(published.SETTINGS),
-        "sweep": {"axes": [
-            {"path": "/datasets", "values": [[one] for one in records.datasets], "labels": labels},
-            {"path": "/algorithm/method", "values": list(METHODS)},
-        ]},
-    }  # fmt: skip
+        "sweep": {
+            "axes": [
+                {
+                    "path": "/datasets",
+                    "values": [[one] for one in records.datasets],
+                    "labels": labels,
+                },
+                {"path": "/algorithm/method", "values": list(METHODS)},
+            ]
+        },
+    }
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
@@ -79,16 +89,18 @@ def build_sections(bench: StudyBench) -> list[Section]:
     for run in runs:
         pattern = int(run["labels"]["pattern"]) - 1
         found[pattern][run["cell"]["/algorithm/method"]] = bench.read_run(run)
-    return [Section(
-        TITLE,
-        "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
-        f"other. {records.origin}: a gas-dynamic model of the paper's tube with gauges of 12 bit "
-        "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
-        [_estimates_table(found)],
-        [plot for n, one in enumerate(found) for plot in _build_plots(bench, n, one, records)],
-        build_checks(found),
-        links=[runs[0]["job"]],
-    )]  # fmt: skip
+    return [
+        Section(
+            TITLE,
+            "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
+            f"other. {records.origin}: a gas-dynamic model of the paper's tube with gauges of 12 bit "
+            "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
+            [_estimates_table(found)],
+            [plot for n, one in enumerate(found) for plot in _build_plots(bench, n, one, records)],
+            build_checks(found),
+            links=[runs[0]["job"]],
+        )
+    ]
 
 
 def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
@@ -98,20 +110,24 @@ def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
         for n, by_method in enumerate(found):
             printed = published.TABLE_3[n]
             label = name if unit == "1" else f"{name} [{unit}]"
-            rows.append([
-                f"{label}, pattern {n + 1}", f"{printed.simple[name]:.4f}",
-                f"{printed.proposed[name]:.4f}",
-                *(format_estimate(by_method[method], name) for method in METHODS),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    f"{label}, pattern {n + 1}",
+                    f"{printed.simple[name]:.4f}",
+                    f"{printed.proposed[name]:.4f}",
+                    *(format_estimate(by_method[method], name) for method in METHODS),
+                ]
+            )
     for n, by_method in enumerate(found):
         rms = (f"{by_method[m].run['rms'] / 1e3:.3f}" for m in METHODS)
         rows.append([f"RMS [kPa], pattern {n + 1}", "", "", *rms])
     return ReportTable(
         "Table 3",
-        ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)], rows,
+        ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)],
+        rows,
         "A first-order model of a long tube leaves structure in the residuals; the standard errors "
         "allow for their colour.",
-    )  # fmt: skip
+    )
 
 
 def _build_plots(
@@ -120,14 +136,18 @@ def _build_plots(
     pattern = number + 1
     rms = ", ".join(f"{m} ends at {found[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
     return [
-        Plot(f"Figure 17: input and output, pattern {pattern}",
-             _plot_signals(bench, found, records, number),
-             "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
-             "response of the model that `improved` found."),
-        Plot(f"Figure 18: RMS of the best individual, pattern {pattern}",
-             figures.plot_rms_history(found, "kPa", scale=1e-3),
-             f"Paper: the error of the proposed search is the smaller. Ours: {rms}."),
-    ]  # fmt: skip
+        Plot(
+            f"Figure 17: input and output, pattern {pattern}",
+            _plot_signals(bench, found, records, number),
+            "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
+            "response of the model that `improved` found.",
+        ),
+        Plot(
+            f"Figure 18: RMS of the best individual, pattern {pattern}",
+            figures.plot_rms_history(found, "kPa", scale=1e-3),
+            f"Paper: the error of the proposed search is the smaller. Ours: {rms}.",
+        ),
+    ]
 
 
 def _plot_signals(
@@ -137,10 +157,14 @@ def _plot_signals(
     channels = {one["name"]: one for one in answer["channels"]}
     looks = {records.inlet: (theme.GREEN, "inlet (1)"), records.outlet: (theme.GREY, "outlet (2)")}
     data = [
-        figures.line_trace(text, channels[name]["times"], _to_kilo(channels[name]["values"]),
-                     line={"color": colour, "width": 1.6})
+        figures.line_trace(
+            text,
+            channels[name]["times"],
+            _to_kilo(channels[name]["values"]),
+            line={"color": colour, "width": 1.6},
+        )
         for name, (colour, text) in looks.items()
-    ]  # fmt: skip
+    ]
     model = found["improved"].response["experiments"][0]["simulated"][0]
     dashed = {**figures.method_style("improved"), "dash": "dash", "width": 1.4}
     data.append(figures.line_trace("model", model["times"], _to_kilo(model["values"]), line=dashed))
@@ -157,8 +181,14 @@ def build_checks(found: list[dict[str, MethodRun]]) -> list[Check]:
     lag = abs(first.get_estimate("L") - second.get_estimate("L"))
     constant = abs(first.get_estimate("T") - second.get_estimate("T")) / first.get_estimate("T")
     return [
-        Check(f"L of the two patterns agrees within {1e3 * L_TOLERANCE_S:g} ms ({1e3 * lag:.2f} ms; "
-              "the paper's differ by 15.6 ms)", lag <= L_TOLERANCE_S),
-        Check(f"T of the two patterns agrees within {100 * T_TOLERANCE:g} % ({100 * constant:.2f} %; "
-              "the paper's differ by 6.3 %)", constant <= T_TOLERANCE),
-    ]  # fmt: skip
+        Check(
+            f"L of the two patterns agrees within {1e3 * L_TOLERANCE_S:g} ms ({1e3 * lag:.2f} ms; "
+            "the paper's differ by 15.6 ms)",
+            lag <= L_TOLERANCE_S,
+        ),
+        Check(
+            f"T of the two patterns agrees within {100 * T_TOLERANCE:g} % ({100 * constant:.2f} %; "
+            "the paper's differ by 6.3 %)",
+            constant <= T_TOLERANCE,
+        ),
+    ]

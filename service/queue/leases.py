@@ -146,10 +146,18 @@ class LeaseQueue:
             .with_for_update(skip_locked=True, of=waiting)
         )
         now = self._read_clock()
-        taken = update(Job).where(Job.id == first.scalar_subquery()).values(
-            state=JobState.RUNNING, attempt=Job.attempt + 1, lease_owner=owner,
-            lease_until=now + lease, started_at=func.coalesce(Job.started_at, now),
-        ).returning(Job)  # fmt: skip
+        taken = (
+            update(Job)
+            .where(Job.id == first.scalar_subquery())
+            .values(
+                state=JobState.RUNNING,
+                attempt=Job.attempt + 1,
+                lease_owner=owner,
+                lease_until=now + lease,
+                started_at=func.coalesce(Job.started_at, now),
+            )
+            .returning(Job)
+        )
         job = self._session.scalar(taken, execution_options=RETURNING_OPTIONS)
         if job is None:
             return None
@@ -206,9 +214,10 @@ class LeaseQueue:
     def write_progress(self, lease: Lease, progress: JobProgress) -> None:
         """Write how far the job has come, and tell it as an event."""
         values: dict[str, Any] = {
-            "evaluations": progress.evaluations, "generation": progress.generation,
+            "evaluations": progress.evaluations,
+            "generation": progress.generation,
             "seconds_left": progress.seconds_left,
-        }  # fmt: skip
+        }
         if progress.best_rms is not None:
             values["best_rms"] = choose_smaller_rms(progress.best_rms)
         job = self._update_job(lease, values)
@@ -236,9 +245,15 @@ class LeaseQueue:
         """
         job = self._update_job(
             lease,
-            {"state": state, "error": error, "finished_at": self._read_clock(), "lease_until": None,
-             "lease_owner": None, "seconds_left": None},
-        )  # fmt: skip
+            {
+                "state": state,
+                "error": error,
+                "finished_at": self._read_clock(),
+                "lease_until": None,
+                "lease_owner": None,
+                "seconds_left": None,
+            },
+        )
         self._correct_best_rms(job)
         if state is JobState.SUCCEEDED:
             self._check_runs_finished(job)
@@ -342,11 +357,12 @@ class LeaseQueue:
             self._end_job(job, JobState.CANCELLED, None)
         elif job.lost_leases >= most:
             self._end_job(
-                job, JobState.FAILED,
+                job,
+                JobState.FAILED,
                 f"the dispatcher ended or fell silent {job.lost_leases} times, or lost its "
                 f"workers, and the job did not go on between; the last was {job.lease_owner}; "
                 "see its log, and resume the job when the cause is gone",
-            )  # fmt: skip
+            )
         else:
             self._requeue_job(job)
         return job.state

@@ -61,8 +61,11 @@ def _log_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
     reasons = ", ".join(
         f"{owner} {_explain_reaping(owner, owners)}" for owner in sorted(reaped.owners)
     )
-    taken = (("queued again", reaped.requeued), ("failed", reaped.failed),
-             ("cancelled", reaped.cancelled))  # fmt: skip
+    taken = (
+        ("queued again", reaped.requeued),
+        ("failed", reaped.failed),
+        ("cancelled", reaped.cancelled),
+    )
     fates = "; ".join(f"{fate}: {', '.join(jobs)}" for fate, jobs in taken if jobs)
     _log.warning("%s; its jobs: %s", reasons, fates)
 

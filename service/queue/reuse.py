@@ -13,9 +13,19 @@ from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_
 from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
 
 _COPIED_COLUMNS = (
-    "result", "valid", "best_rms", "rms_noise_free", "fit_estimation", "fit_validation",
-    "evaluations", "generations", "seconds", "signals_sha256", "signals_start", "signals_size",
-)  # fmt: skip
+    "result",
+    "valid",
+    "best_rms",
+    "rms_noise_free",
+    "fit_estimation",
+    "fit_validation",
+    "evaluations",
+    "generations",
+    "seconds",
+    "signals_sha256",
+    "signals_start",
+    "signals_size",
+)
 
 
 def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
@@ -36,10 +46,12 @@ def find_computed_runs(
     for chunk in split_chunks(hashes):
         first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
         query = first.where(
-            Job.deleted_at.is_(None), Run.project_id == project_id, Run.spec_hash.in_(chunk),
+            Job.deleted_at.is_(None),
+            Run.project_id == project_id,
+            Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
             Run.signals_sha256.is_not(None),  # one whose signals could not be stored is not whole
-        )  # fmt: skip
+        )
         found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})
     return found
 

@@ -104,10 +104,15 @@ class RunWriter:
         """Mark queued runs as running."""
         self._lock_job()
         for chunk in split_chunks(run_ids):
-            begun = update(Run).where(self._filter_runs(chunk), Run.state == JobState.QUEUED).values(
-                state=JobState.RUNNING, attempt=self._lease.attempt,
-                started_at=func.coalesce(Run.started_at, self._clock()),
-            )  # fmt: skip
+            begun = (
+                update(Run)
+                .where(self._filter_runs(chunk), Run.state == JobState.QUEUED)
+                .values(
+                    state=JobState.RUNNING,
+                    attempt=self._lease.attempt,
+                    started_at=func.coalesce(Run.started_at, self._clock()),
+                )
+            )
             self._session.execute(begun, execution_options=RETURNING_OPTIONS)
 
     def write_kills(self, kills: Mapping[str, int]) -> None:
@@ -158,10 +163,16 @@ class RunWriter:
         self._lock_job()
         now = self._clock()
         rows = (
-            {"run_id": run_id, "job_id": self._lease.job_id, "attempt": self._lease.attempt,
-             "evaluations": evaluations, "state": state, "created_at": now}
+            {
+                "run_id": run_id,
+                "job_id": self._lease.job_id,
+                "attempt": self._lease.attempt,
+                "evaluations": evaluations,
+                "state": state,
+                "created_at": now,
+            }
             for run_id, evaluations, state in states
-        )  # fmt: skip
+        )
         upsert(self._session, Checkpoint, rows)
 
     def read_checkpoints(self) -> dict[str, bytes]:
@@ -210,19 +221,28 @@ def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
     now = utc_now()
     for chunk in split_chunks(cells):
         rows = [
-            {**_build_run_values(cell), **_RUN_DEFAULTS, "id": run_id, "project_id": job.project_id,
-             "job_id": job.id, "created_at": now}
+            {
+                **_build_run_values(cell),
+                **_RUN_DEFAULTS,
+                "id": run_id,
+                "project_id": job.project_id,
+                "job_id": job.id,
+                "created_at": now,
+            }
             for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
-        ]  # fmt: skip
+        ]
         insert_missing(session, Run, rows)
 
 
 def _build_outcome_values(one: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
     values = {name: getattr(one, name) for name in RunOutcome.__slots__ if name != "run_id"}
     return {
-        **values, "id": one.run_id, "estimates": _extract_estimates(one.result), "attempt": attempt,
+        **values,
+        "id": one.run_id,
+        "estimates": _extract_estimates(one.result),
+        "attempt": attempt,
         "finished_at": now,
-    }  # fmt: skip
+    }
 
 
 def _build_run_values(cell: NewRun) -> dict[str, Any]:

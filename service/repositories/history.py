@@ -52,17 +52,29 @@ def pack_history(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
         part = list(mine)
         count = len(part[0].parameters)
         pack = _make_point_struct(count).pack
-        data = b"".join([
-            pack(one.island, one.number, one.generation, one.evaluations, one.rms,
-                 _NUMBER_OF[one.phase], *one.parameters)
-            for one in part
-        ])  # fmt: skip
+        data = b"".join(
+            [
+                pack(
+                    one.island,
+                    one.number,
+                    one.generation,
+                    one.evaluations,
+                    one.rms,
+                    _NUMBER_OF[one.phase],
+                    *one.parameters,
+                )
+                for one in part
+            ]
+        )
         yield {
-            "run_id": run, "digest": _hash_part(data), "n_parameters": count,
+            "run_id": run,
+            "digest": _hash_part(data),
+            "n_parameters": count,
             "generation": max([int(one.generation) for one in part]),
             "evaluations": max([int(one.evaluations) for one in part]),
-            "rms": min([float(one.rms) for one in part]), "points": data,
-        }  # fmt: skip
+            "rms": min([float(one.rms) for one in part]),
+            "points": data,
+        }
 
 
 def pack_migrants(points: Iterable[MigrantPoint]) -> Iterator[dict[str, Any]]:

@@ -63,10 +63,12 @@ class JobRepository:
                 job = self._insert_job(new)
                 self._session.add(
                     IdempotencyKey(
-                        project_id=self._project_id, key=key, request_hash=request_hash,
+                        project_id=self._project_id,
+                        key=key,
+                        request_hash=request_hash,
                         job_id=job.id,
                     )
-                )  # fmt: skip
+                )
         except IntegrityError:
             known = self._find_by_key(key, request_hash)
             if known is None:
@@ -155,9 +157,12 @@ class JobRepository:
         job.state, job.cancel_requested = JobState.QUEUED, False
         job.error = job.finished_at = None
         job.lost_leases = job.n_failed = 0
-        job.n_done = self._session.scalar(
-            select(func.count()).where(Run.job_id == job_id, Run.state == JobState.SUCCEEDED)
-        ) or 0  # fmt: skip
+        job.n_done = (
+            self._session.scalar(
+                select(func.count()).where(Run.job_id == job_id, Run.state == JobState.SUCCEEDED)
+            )
+            or 0
+        )
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job
@@ -186,10 +191,16 @@ class JobRepository:
 
     def _insert_job(self, new: NewJob) -> Job:
         job = Job(
-            id=new_id("job"), project_id=self._project_id, name=new.name, spec=new.spec,
-            n_runs=new.n_runs, priority=new.priority, max_attempts=new.max_attempts,
-            state=JobState.QUEUED, attempt=0,
-        )  # fmt: skip
+            id=new_id("job"),
+            project_id=self._project_id,
+            name=new.name,
+            spec=new.spec,
+            n_runs=new.n_runs,
+            priority=new.priority,
+            max_attempts=new.max_attempts,
+            state=JobState.QUEUED,
+            attempt=0,
+        )
         self._session.add(job)
         self._session.flush()
         EventRepository(self._session).append_state(job)

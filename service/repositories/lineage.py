@@ -100,7 +100,7 @@ def list_dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> l
 
 def list_reference_names(
     session: Session, run_id: str, project_id: str = DEFAULT_PROJECT
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Names under which a run was accepted as a reference, now or before."""
     query = select(AcceptedReference.name).where(
         AcceptedReference.project_id == project_id, AcceptedReference.run_id == run_id

@@ -95,10 +95,13 @@ class ModelRepository:
             ModelVersion.project_id == self._project_id, ModelVersion.name == name
         )
         model = ModelVersion(
-            id=new_id("mdl"), project_id=self._project_id, name=name,
-            version=(self._session.scalar(used) or 0) + 1, document=document,
+            id=new_id("mdl"),
+            project_id=self._project_id,
+            name=name,
+            version=(self._session.scalar(used) or 0) + 1,
+            document=document,
             document_hash=digest,
-        )  # fmt: skip
+        )
         self._session.add(model)
         self._session.flush()
         return model

@@ -46,9 +46,13 @@ class ReferenceRepository:
             if latest is not None and _is_same_acceptance(latest, run_id, accepted_by, note):
                 return latest
             new = AcceptedReference(
-                project_id=self._project_id, name=name, run_id=run_id, accepted_by=accepted_by,
-                note=note, number=1 if latest is None else latest.number + 1,
-            )  # fmt: skip
+                project_id=self._project_id,
+                name=name,
+                run_id=run_id,
+                accepted_by=accepted_by,
+                note=note,
+                number=1 if latest is None else latest.number + 1,
+            )
             try:
                 # Two requests may want the same number: the later one tries again.
                 with self._session.begin_nested():
@@ -85,28 +89,36 @@ class ReferenceRepository:
         mine = AcceptedReference.project_id == self._project_id
         last = (
             select(AcceptedReference.name, func.max(AcceptedReference.number).label("number"))
-            .where(mine).group_by(AcceptedReference.name)
-            .order_by(AcceptedReference.name).limit(limit + 1)
-        )  # fmt: skip
+            .where(mine)
+            .group_by(AcceptedReference.name)
+            .order_by(AcceptedReference.name)
+            .limit(limit + 1)
+        )
         if cursor is not None:
             last = last.where(AcceptedReference.name > cursor)
         chosen = last.subquery()
         query = (
             select(AcceptedReference, Run.job_id, Run.labels, Run.estimates)
-            .join(chosen, (AcceptedReference.name == chosen.c.name)
-                  & (AcceptedReference.number == chosen.c.number))
+            .join(
+                chosen,
+                (AcceptedReference.name == chosen.c.name)
+                & (AcceptedReference.number == chosen.c.number),
+            )
             .join(Run, Run.id == AcceptedReference.run_id)
-            .where(mine).order_by(AcceptedReference.name)
-        )  # fmt: skip
+            .where(mine)
+            .order_by(AcceptedReference.name)
+        )
         found = [CurrentReference(*row) for row in self._session.execute(query)]
         return make_page(found, limit, (one.accepted.name for one in found))
 
     def list_names(self) -> Sequence[str]:
         """Names in use."""
         query = (
-            select(AcceptedReference.name).distinct()
-            .where(AcceptedReference.project_id == self._project_id).limit(_MAX_NAMES)
-        )  # fmt: skip
+            select(AcceptedReference.name)
+            .distinct()
+            .where(AcceptedReference.project_id == self._project_id)
+            .limit(_MAX_NAMES)
+        )
         return self._session.scalars(query).all()
 
     def _find_latest(self, name: str) -> AcceptedReference | None:

@@ -30,10 +30,14 @@ RunOrder = Literal[
     "number", "best_rms", "fit_estimation", "fit_validation", "sigma", "seconds", "evaluations"
 ]
 _ORDER_COLUMNS: dict[RunOrder, InstrumentedAttribute[Any]] = {
-    "number": Run.number, "best_rms": Run.best_rms, "fit_estimation": Run.fit_estimation,
-    "fit_validation": Run.fit_validation, "sigma": Run.sigma, "seconds": Run.seconds,
+    "number": Run.number,
+    "best_rms": Run.best_rms,
+    "fit_estimation": Run.fit_estimation,
+    "fit_validation": Run.fit_validation,
+    "sigma": Run.sigma,
+    "seconds": Run.seconds,
     "evaluations": Run.evaluations,
-}  # fmt: skip
+}
 
 
 class RunRow(NamedTuple):

@@ -48,9 +48,14 @@ class SummaryQuantity:
     """A number of each run that quantiles are wanted of."""
 
     kind: Literal[
-        "rms", "rms_noise_free", "fit_estimation", "fit_validation", "evaluations", "estimate",
+        "rms",
+        "rms_noise_free",
+        "fit_estimation",
+        "fit_validation",
+        "evaluations",
+        "estimate",
         "stderr",
-    ]  # fmt: skip
+    ]
     parameter: str = ""
 
     @property
@@ -83,9 +88,13 @@ class RunGroup:
 
 
 def read_groups(
-    session: Session, job_id: str, keys: Sequence[GroupKey], quantities: Sequence[SummaryQuantity],
-    limit: int, project_id: str = DEFAULT_PROJECT,
-) -> list[RunGroup]:  # fmt: skip
+    session: Session,
+    job_id: str,
+    keys: Sequence[GroupKey],
+    quantities: Sequence[SummaryQuantity],
+    limit: int,
+    project_id: str = DEFAULT_PROJECT,
+) -> list[RunGroup]:
     """Groups of a job's runs in the order of the sweep, at most `limit` + 1 of them.
 
     Quantiles are those of runs that succeeded, linearly interpolated between neighbours.
@@ -97,12 +106,20 @@ def read_groups(
     counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in JobState]
     query = (
         select(
-            func.min(Run.number), func.sum(case((Run.valid.is_(True), 1), else_=0)),
-            func.avg(_restrict_to_succeeded(Run.evaluations)), func.avg(_restrict_to_succeeded(Run.seconds)),
-            func.min(Run.sigma), func.max(Run.sigma), *counts, *columns,
+            func.min(Run.number),
+            func.sum(case((Run.valid.is_(True), 1), else_=0)),
+            func.avg(_restrict_to_succeeded(Run.evaluations)),
+            func.avg(_restrict_to_succeeded(Run.seconds)),
+            func.min(Run.sigma),
+            func.max(Run.sigma),
+            *counts,
+            *columns,
         )
-        .where(*mine).group_by(*columns).order_by(func.min(Run.number)).limit(limit + 1)
-    )  # fmt: skip
+        .where(*mine)
+        .group_by(*columns)
+        .order_by(func.min(Run.number))
+        .limit(limit + 1)
+    )
     found: dict[str, RunGroup] = {}
     for first, valid, evaluations, seconds, low, high, *rest in session.execute(query):
         key = tuple(rest[len(counts) :])
@@ -122,10 +139,13 @@ def find_quietest_run(
 ) -> Run | None:
     """The best valid run of a cell among those with the least noise; None if none succeeded."""
     query = select(Run).where(
-        Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED,
-        Run.valid.is_(True), Run.best_rms.is_not(None),
+        Run.job_id == job_id,
+        Run.project_id == project_id,
+        Run.state == JobState.SUCCEEDED,
+        Run.valid.is_(True),
+        Run.best_rms.is_not(None),
         *(entry_equals(session, Run.cell, path, value) for path, value in cell.items()),
-    )  # fmt: skip
+    )
     return session.scalar(query.order_by(Run.sigma, Run.best_rms, Run.number).limit(1))
 
 
@@ -134,9 +154,11 @@ def _restrict_to_succeeded(column: Any) -> ColumnElement[Any]:
 
 
 def _read_quantiles(
-    session: Session, mine: Sequence[ColumnElement[bool]], keys: Sequence[Any],
+    session: Session,
+    mine: Sequence[ColumnElement[bool]],
+    keys: Sequence[Any],
     quantities: Sequence[SummaryQuantity],
-) -> Iterator[tuple[int, SummaryQuantity, tuple[float, ...]]]:  # fmt: skip
+) -> Iterator[tuple[int, SummaryQuantity, tuple[float, ...]]]:
     """The first number of each group, a quantity, its quantiles: only values beside them are read.
 
     One statement takes what it needs out of each row's documents once, and then ranks numbers.
@@ -146,11 +168,18 @@ def _read_quantiles(
     names = [f"q{i}" for i in range(len(quantities))]
     group: ColumnElement[int] = func.dense_rank().over(order_by=list(keys)) if keys else literal(1)
     # Also of runs that did not succeed, so that a group's first run is the same everywhere.
-    wide = select(
-        group.label("grp"), Run.number.label("number"),
-        *(_restrict_to_succeeded(one.column).label(name)
-          for one, name in zip(quantities, names, strict=True)),
-    ).where(*mine).cte("wide")  # fmt: skip
+    wide = (
+        select(
+            group.label("grp"),
+            Run.number.label("number"),
+            *(
+                _restrict_to_succeeded(one.column).label(name)
+                for one, name in zip(quantities, names, strict=True)
+            ),
+        )
+        .where(*mine)
+        .cte("wide")
+    )
     nothing = literal(0)
     firsts = select(literal(-1), wide.c.grp, func.min(wide.c.number), nothing, nothing)
     statement = union_all(
@@ -176,9 +205,9 @@ def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
     place = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
     # The count is a window's too: SQLite joins a table of counts by trying every pair.
     count = func.count().over(partition_by=wide.c.grp).label("n")
-    ranked = select(wide.c.grp, value.label("value"), place, count).where(
-        value.is_not(None)
-    ).subquery()  # fmt: skip
+    ranked = (
+        select(wide.c.grp, value.label("value"), place, count).where(value.is_not(None)).subquery()
+    )
     n = cast(ranked.c.n, Integer)
     lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES_PER_MILLE]
     return select(literal(which), ranked).where(

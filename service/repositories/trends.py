@@ -40,8 +40,9 @@ def read_trend_rows(
     query = (
         select(*columns)
         .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED)
-        .order_by(Run.number).limit(limit)
-    )  # fmt: skip
+        .order_by(Run.number)
+        .limit(limit)
+    )
     return [TrendRow(*row) for row in session.execute(query)]
 
 

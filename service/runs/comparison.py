@@ -39,10 +39,11 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
     titles = _build_titles(ordered)
     parameters = list(_compare_parameters(ordered, titles))
     return ComparisonOut(
-        unit=_find_common_unit(ordered), runs=[_to_compared_run(one, titles[one.run.id]) for one in ordered],
+        unit=_find_common_unit(ordered),
+        runs=[_to_compared_run(one, titles[one.run.id]) for one in ordered],
         parameters=parameters,
         notes=[one.note for one in parameters if one.differs] + list(_list_notes(ordered)),
-    )  # fmt: skip
+    )
 
 
 def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
@@ -87,11 +88,13 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
         other = _collect_data_settings(one)
         apart = [text for name, text in _DATA_DIFFERENCES.items() if other[name] != first[name]]
         if apart:
-            faults.append(FieldError(
-                f"/runs/{number}",
-                f"run {one.run.id!r} has {' and '.join(apart)} than {candidates[0].run.id!r}; "
-                "only runs on the same data compare",
-            ))  # fmt: skip
+            faults.append(
+                FieldError(
+                    f"/runs/{number}",
+                    f"run {one.run.id!r} has {' and '.join(apart)} than {candidates[0].run.id!r}; "
+                    "only runs on the same data compare",
+                )
+            )
     if faults:
         raise InvalidRequest(faults)
 
@@ -109,14 +112,24 @@ def _to_compared_run(one: StoredRun, title: str) -> ComparedRun:
     result = one.result
     criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
     return ComparedRun(
-        run=one.run.id, job=one.job.id, number=one.run.number, model=one.model.name, title=title,
-        cell=one.run.cell, parameters=criteria["parameters"],
-        samples=criteria["samples"], rms=result["rms"],
-        rms_validation=result["rms_validation"], fit_estimation=fit["estimation"],
-        fit_validation=fit["validation"], aic=criteria["aic"], bic=criteria["bic"],
-        residuals_passed=tests.get("passed"), residuals_data=tests.get("data"),
+        run=one.run.id,
+        job=one.job.id,
+        number=one.run.number,
+        model=one.model.name,
+        title=title,
+        cell=one.run.cell,
+        parameters=criteria["parameters"],
+        samples=criteria["samples"],
+        rms=result["rms"],
+        rms_validation=result["rms_validation"],
+        fit_estimation=fit["estimation"],
+        fit_validation=fit["validation"],
+        aic=criteria["aic"],
+        bic=criteria["bic"],
+        residuals_passed=tests.get("passed"),
+        residuals_data=tests.get("data"),
         evaluations=result["evaluations"],
-    )  # fmt: skip
+    )
 
 
 def _compare_parameters(
@@ -133,13 +146,20 @@ def _compare_parameters(
         pair = _find_furthest_pair([estimate for _, estimate in found])
         note = ""
         if pair is not None:
-            note = _describe_difference(name, unit, [(titles[found[i][0].run.id], found[i][1]) for i in pair],
-                         same_model=len({one.model.name for one, _ in found}) == 1)  # fmt: skip
+            note = _describe_difference(
+                name,
+                unit,
+                [(titles[found[i][0].run.id], found[i][1]) for i in pair],
+                same_model=len({one.model.name for one, _ in found}) == 1,
+            )
         known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
-            name=name, unit=unit, differs=None if known < 2 else pair is not None, note=note,
+            name=name,
+            unit=unit,
+            differs=None if known < 2 else pair is not None,
+            note=note,
             values=[ComparedValue.model_validate({**e, "run": one.run.id}) for one, e in found],
-        )  # fmt: skip
+        )
 
 
 def _find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
@@ -160,7 +180,7 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 
 def _describe_difference(
     name: str, unit: str, pair: Sequence[tuple[str, ResultDocument]], *, same_model: bool
-) -> str:  # fmt: skip
+) -> str:
     told = ", ".join(
         f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
         for title, estimate in pair

@@ -69,10 +69,14 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
     rows = _read_datasets(session, stored.body)
     values = tuple(_read_values(stored))
     return IdentifiedModel(
-        stored.model, values, _compute_covariance(stored.result, values), _find_sample_time(stored, rows),
+        stored.model,
+        values,
+        _compute_covariance(stored.result, values),
+        _find_sample_time(stored, rows),
         {one.name: _find_hold(one.name, stored, rows) for one in stored.model.inputs},
-        version("lagid"), _describe_provenance(stored, rows),
-    )  # fmt: skip
+        version("lagid"),
+        _describe_provenance(stored, rows),
+    )
 
 
 def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
@@ -114,9 +118,10 @@ def _find_channels(
 def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
     """The sampling period that all measured outputs have; None if they have no common one."""
     periods = [
-        one["sample_time"] for output in stored.model.outputs
+        one["sample_time"]
+        for output in stored.model.outputs
         for one in _find_channels(output.name, stored, rows)
-    ]  # fmt: skip
+    ]
     if not periods or None in periods or max(periods) - min(periods) > 1e-6 * min(periods):
         return None
     return float(periods[0])

@@ -195,9 +195,11 @@ def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
     value = float(estimate["value"])
     known = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
     return {
-        "fixed": value, "scale": "linear", "lower": min([value, *known]),
+        "fixed": value,
+        "scale": "linear",
+        "lower": min([value, *known]),
         "upper": max([value, *known]),
-    }  # fmt: skip
+    }
 
 
 def _search_starts(problem: "Problem") -> FloatArray:
@@ -259,11 +261,15 @@ def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun
         )
     names = [one.name for one in problem.model.outputs]
     return FreeRun(
-        run=run_id, dataset=row.id, records=problem.records,
-        simulated=tuple(tuple(p[name] for name in names) for p in problem.split_by_output(predicted)),
+        run=run_id,
+        dataset=row.id,
+        records=problem.records,
+        simulated=tuple(
+            tuple(p[name] for name in names) for p in problem.split_by_output(predicted)
+        ),
         metrics=metrics,
         starts=dict(zip(problem.free_names, theta.tolist(), strict=True)),
-    )  # fmt: skip
+    )
 
 
 def _apply_recorded_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:

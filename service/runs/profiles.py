@@ -73,9 +73,9 @@ def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
     for place, name in enumerate(body.parameters or ()):
         if name not in free:
             raise InvalidRequest.from_fault(
-                f"/parameters/{place}", f"the run has no free parameter {name!r}"
-                f"{suggest_name(name, free)}",
-            )  # fmt: skip
+                f"/parameters/{place}",
+                f"the run has no free parameter {name!r}{suggest_name(name, free)}",
+            )
     return list(dict.fromkeys(body.parameters or free))
 
 

@@ -61,9 +61,13 @@ def get_residuals(session: Session, store: ObjectStore, run_id: str) -> Residual
     if tested is None:
         raise NotFound("residuals of run", run_id, f"; the run is {stored.run.state.value}")
     return ResidualsOut(
-        id=run_id, data=tested.verdict.data, passed=tested.verdict.passed, level=TEST_LEVEL,
-        note=tested.input_note, tests=[_to_correlation_out(one) for one in tested.correlations],
-    )  # fmt: skip
+        id=run_id,
+        data=tested.verdict.data,
+        passed=tested.verdict.passed,
+        level=TEST_LEVEL,
+        note=tested.input_note,
+        tests=[_to_correlation_out(one) for one in tested.correlations],
+    )
 
 
 def analyse_residuals(
@@ -105,9 +109,12 @@ def _to_correlation_out(one: CorrelationFunction) -> CorrelationOut:
 
 
 def _build_series(
-    body: JobBody, tested: Sequence[FittedOutput], fits: Sequence[FittedOutput],
-    inputs: Sequence[tuple[Channel, ...]], times: Mapping[str, float],
-) -> Iterator[ResidualSeries]:  # fmt: skip
+    body: JobBody,
+    tested: Sequence[FittedOutput],
+    fits: Sequence[FittedOutput],
+    inputs: Sequence[tuple[Channel, ...]],
+    times: Mapping[str, float],
+) -> Iterator[ResidualSeries]:
     """Residuals of the tested outputs as the loss saw them, less those that were skipped."""
     loss = body["loss"]
     scale = float(loss["scale"]) if loss["kind"] == "soft-l1" else 0.0
@@ -119,10 +126,16 @@ def _build_series(
         scored = np.arange(first, first + fit.times.size) >= body["skip"]
         weight = weights[fit.name]
         yield make_residual_series(
-            number, fit.name, fit.times, weight * fit.measured, weight * fit.simulated,
-            scored & np.isfinite(fit.measured), inputs[number] if number < len(inputs) else (),
-            scale, times.get(fit.name, 0.0),
-        )  # fmt: skip
+            number,
+            fit.name,
+            fit.times,
+            weight * fit.measured,
+            weight * fit.simulated,
+            scored & np.isfinite(fit.measured),
+            inputs[number] if number < len(inputs) else (),
+            scale,
+            times.get(fit.name, 0.0),
+        )
 
 
 def _count_earlier_samples(
@@ -139,8 +152,10 @@ def _compute_weights(body: JobBody, fits: Sequence[FittedOutput]) -> dict[str, f
     names = {fit.name for fit in fits}
     if len(names) == 1:
         return dict.fromkeys(names, 1.0)
-    return {name: (body["weights"] or {}).get(name) or _compute_default_weight(body, fits, name)
-            for name in names}  # fmt: skip
+    return {
+        name: (body["weights"] or {}).get(name) or _compute_default_weight(body, fits, name)
+        for name in names
+    }
 
 
 def _compute_default_weight(body: JobBody, fits: Sequence[FittedOutput], name: str) -> float:

@@ -40,10 +40,15 @@ def list_runs(
     """Runs of a job."""
     job = JobRepository(session).get(job_id)
     found = RunRepository(session).list_page(
-        job.id, cursor=cursor, limit=limit, states=choice.states,
-        cell=parse_filters("cell", choice.cell), labels=parse_filters("label", choice.labels),
-        order=choice.order, descending=choice.descending,
-    )  # fmt: skip
+        job.id,
+        cursor=cursor,
+        limit=limit,
+        states=choice.states,
+        cell=parse_filters("cell", choice.cell),
+        labels=parse_filters("label", choice.labels),
+        order=choice.order,
+        descending=choice.descending,
+    )
     known = read_written_progress(session, [run.id for run in found.items if run.result is None])
     items = [to_run_out(run, job, known.get(run.id)) for run in found.items]
     return Page(items=items, next=found.next)
@@ -64,21 +69,34 @@ def get_run(session: Session, run_id: str) -> RunOut:
 def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunOut:
     """A run as it is told: its result document, or how far it is."""
     so_far: dict[str, Any] = {
-        "rms": run.best_rms, "evaluations": run.evaluations, "generations": run.generations,
-    }  # fmt: skip
+        "rms": run.best_rms,
+        "evaluations": run.evaluations,
+        "generations": run.generations,
+    }
     if known is not None:
         so_far = {
-            "rms": known.rms, "evaluations": known.evaluations, "generations": known.generation,
-        }  # fmt: skip
+            "rms": known.rms,
+            "evaluations": known.evaluations,
+            "generations": known.generation,
+        }
     return RunOut.model_validate(
         {
-            **so_far, **(run.result or {}), "id": run.id, "job": run.job_id,
-            "number": run.number, "cell": run.cell, "labels": run.labels,
-            "state": run.state.value, "progress": _compute_progress(run, job, known), "error": run.error,
-            "created_at": run.created_at, "started_at": run.started_at,
-            "finished_at": run.finished_at, "has_signals": run.signals_sha256 is not None,
+            **so_far,
+            **(run.result or {}),
+            "id": run.id,
+            "job": run.job_id,
+            "number": run.number,
+            "cell": run.cell,
+            "labels": run.labels,
+            "state": run.state.value,
+            "progress": _compute_progress(run, job, known),
+            "error": run.error,
+            "created_at": run.created_at,
+            "started_at": run.started_at,
+            "finished_at": run.finished_at,
+            "has_signals": run.signals_sha256 is not None,
         }
-    )  # fmt: skip
+    )
 
 
 def get_history(session: Session, run_id: str) -> HistoryOut:
@@ -107,12 +125,18 @@ def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str,
     reason = f"the run was {stored.run.state.value} before its standard errors were computed"
     return [
         {
-            "name": one.name, "unit": one.unit, "value": value, "lower": one.lower,
-            "upper": one.upper, "stderr": None, "interval95": None, "status": "unfinished",
+            "name": one.name,
+            "unit": one.unit,
+            "value": value,
+            "lower": one.lower,
+            "upper": one.upper,
+            "stderr": None,
+            "interval95": None,
+            "status": "unfinished",
             "reason": reason,
         }
         for one, value in zip(_list_free_parameters(session, stored), best.parameters, strict=False)
-    ]  # fmt: skip
+    ]
 
 
 def _list_free_names(session: Session, stored: StoredRun) -> list[str]:

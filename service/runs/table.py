@@ -19,8 +19,19 @@ RUNS_PER_PART = 500
 FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
 """What a formula begins with, in one spreadsheet or another."""
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
-COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",
-           "evaluations", "generations", "seconds", "error")  # fmt: skip
+COLUMNS = (
+    "number",
+    "id",
+    "state",
+    "valid",
+    "best_rms",
+    "fit_estimation",
+    "fit_validation",
+    "evaluations",
+    "generations",
+    "seconds",
+    "error",
+)
 COLUMN_UNITS = {"fit_estimation": "%", "fit_validation": "%"}
 """Of columns that do not have it in their name, and not from the job."""
 
@@ -93,12 +104,15 @@ def _build_row(run: Run, layout: _TableLayout) -> list[Any]:
     statuses = {one["name"]: one["status"] for one in _get_estimates(run)}
     found = [told.get(key) or {} for key in layout.parameters]
     return [
-        run.number, run.id, run.state.value, *(getattr(run, name) for name in COLUMNS[3:]),
+        run.number,
+        run.id,
+        run.state.value,
+        *(getattr(run, name) for name in COLUMNS[3:]),
         *(_to_csv_value(run.cell.get(path)) for path in layout.paths),
         *(_to_csv_value(run.labels.get(name)) for name in layout.labels),
         *(one.get(what) for one in found for what in ("value", "stderr")),
         *(statuses.get(name) for name in layout.parameter_names),
-    ]  # fmt: skip
+    ]
 
 
 def _get_estimates(run: Run) -> list[dict[str, Any]]:

@@ -14,10 +14,18 @@ T = TypeVar("T")
 TRANSIENT_ERRORS = (OperationalError, InterfaceError)
 """What SQLAlchemy raises when the database is to blame, and by some drivers for mistakes too."""
 
-_SQLITE_CODES = frozenset((
-    sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_INTERRUPT,
-    sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PROTOCOL,
-))  # fmt: skip
+_SQLITE_CODES = frozenset(
+    (
+        sqlite3.SQLITE_BUSY,
+        sqlite3.SQLITE_LOCKED,
+        sqlite3.SQLITE_NOMEM,
+        sqlite3.SQLITE_INTERRUPT,
+        sqlite3.SQLITE_IOERR,
+        sqlite3.SQLITE_FULL,
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_PROTOCOL,
+    )
+)
 _POSTGRESQL_STATES = ("08", "40", "53", "55P03", "57", "58")
 """Connection, deadlock, resources such as disk and memory, a lock not got, shutdown, I/O."""
 

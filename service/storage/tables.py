@@ -79,10 +79,14 @@ class Dataset(Base):
     __table_args__ = (
         Index("ix_datasets_project_id_id", "project_id", "id"),
         Index(
-            "uq_datasets_project_id_source_key", "project_id", "source_key", unique=True,
-            sqlite_where=text("deleted_at IS NULL"), postgresql_where=text("deleted_at IS NULL"),
+            "uq_datasets_project_id_source_key",
+            "project_id",
+            "source_key",
+            unique=True,
+            sqlite_where=text("deleted_at IS NULL"),
+            postgresql_where=text("deleted_at IS NULL"),
         ),
-    )  # fmt: skip
+    )
 
     id: Mapped[str] = mapped_column(primary_key=True)
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))

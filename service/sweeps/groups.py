@@ -73,8 +73,11 @@ class _GroupedSweep:
         self._keys = keys
         self._groups = read_axis_groups(spec)
         self._lengths = [len(steps) for steps in self._groups]
-        self._places = [place for place, steps in enumerate(self._groups)
-                        if any(_sets_key(steps, key) for key in keys)]  # fmt: skip
+        self._places = [
+            place
+            for place, steps in enumerate(self._groups)
+            if any(_sets_key(steps, key) for key in keys)
+        ]
 
     def find_key(self, number: int) -> tuple[Any, ...]:
         """The key of the group that a run belongs to."""
@@ -95,8 +98,10 @@ class _GroupedSweep:
                 yield PendingGroup(self._build_key(positions), first, size)
 
     def _build_key(self, positions: Sequence[int]) -> tuple[Any, ...]:
-        cells = [self._groups[place][position].cell
-                 for place, position in zip(self._places, positions, strict=True)]  # fmt: skip
+        cells = [
+            self._groups[place][position].cell
+            for place, position in zip(self._places, positions, strict=True)
+        ]
         return tuple(_get_key_value(cells, key) for key in self._keys)
 
 
@@ -133,9 +138,14 @@ def _build_empty_group(part: PendingGroup, keys: Sequence[GroupKey]) -> RunGroup
     swept = dict(zip((key.name for key in keys), part.key, strict=True)).get(SIGMA_PATH)
     sigma = None if swept is None else (float(swept), float(swept))
     return RunGroup(
-        key=part.key, first_number=part.first, states=dict.fromkeys(JobState, 0), n_valid=0, sigma=sigma,
-        mean_evaluations=None, mean_seconds=None,
-    )  # fmt: skip
+        key=part.key,
+        first_number=part.first,
+        states=dict.fromkeys(JobState, 0),
+        n_valid=0,
+        sigma=sigma,
+        mean_evaluations=None,
+        mean_seconds=None,
+    )
 
 
 CACHE_SIZE = 32

@@ -59,9 +59,12 @@ class _SweepBase(NamedTuple):
 
 
 def submit_noise_sweep(
-    database: Database, store: ObjectStore, settings: Settings, body: NoiseSweepIn,
+    database: Database,
+    store: ObjectStore,
+    settings: Settings,
+    body: NoiseSweepIn,
     key: str | None = None,
-) -> JobOut:  # fmt: skip
+) -> JobOut:
     """Queue the sweep as an ordinary job, after simulating its record if need be.
 
     All is checked before the record is stored: a body that is refused leaves nothing behind.
@@ -165,9 +168,11 @@ def _build_job(
         "zip": "replicate",
     }
     axes = [
-        sigma, {"path": "/noise/seed", **together}, {"path": "/seed", **together},
+        sigma,
+        {"path": "/noise/seed", **together},
+        {"path": "/seed", **together},
         {"path": "/algorithm/method", "values": body.methods},
-    ]  # fmt: skip
+    ]
     return JobIn.model_validate({**plain.job, "sweep": {"axes": axes}})
 
 

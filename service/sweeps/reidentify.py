@@ -58,17 +58,21 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     }
     reference = _to_job_reference(body.reference)
     trend = {
-        "x": body.label, "parameters": body.look_at, "predict": body.predict,
+        "x": body.label,
+        "parameters": body.look_at,
+        "predict": body.predict,
         "reference": reference,
-    }  # fmt: skip
-    return JobIn.model_validate({
-        "name": f"{_choose_model_name(body.model)} over {body.label}"[:200],
-        **body.job_fields,
-        "datasets": chosen[0].datasets,
-        "sweep": {"axes": [axis]},
-        "warm_start": _choose_warm_start(body, reference),
-        "trend": trend,
-    })  # fmt: skip
+    }
+    return JobIn.model_validate(
+        {
+            "name": f"{_choose_model_name(body.model)} over {body.label}"[:200],
+            **body.job_fields,
+            "datasets": chosen[0].datasets,
+            "sweep": {"axes": [axis]},
+            "warm_start": _choose_warm_start(body, reference),
+            "trend": trend,
+        }
+    )
 
 
 def _choose_model_name(model: Any) -> str:
@@ -109,9 +113,12 @@ def _move_pointer(pointer: str, order: list[int]) -> str:
     if pointer.startswith("/datasets"):
         return "/".join([f"/batch/{order[0]}", *parts[1:]])
     for theirs, ours in (
-        ("/trend/parameters", "/look_at"), ("/trend/reference", "/reference"),
-        ("/trend/predict", "/predict"), ("/trend/x", "/label"), ("/warm_start", "/reference"),
-    ):  # fmt: skip
+        ("/trend/parameters", "/look_at"),
+        ("/trend/reference", "/reference"),
+        ("/trend/predict", "/predict"),
+        ("/trend/x", "/label"),
+        ("/warm_start", "/reference"),
+    ):
         if pointer.startswith(theirs):
             return ours + pointer.removeprefix(theirs)
     return pointer

@@ -26,9 +26,11 @@ from sysid.core.errors import suggest_name
 MOST_GROUPS = 2_000
 MEDIAN = QUANTILES_PER_MILLE.index(500)
 RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
-    SummaryQuantity("rms"), SummaryQuantity("rms_noise_free"), SummaryQuantity("fit_estimation"),
+    SummaryQuantity("rms"),
+    SummaryQuantity("rms_noise_free"),
+    SummaryQuantity("fit_estimation"),
     SummaryQuantity("fit_validation"),
-)  # fmt: skip
+)
 SUCCESS_NOTE = "a run succeeds if it ends with a finite simulation"
 SAFE_LIMIT_NOTE = "a run succeeds if it ends with an RMS within the safe limit"
 BOUND_NOTE = (
@@ -153,10 +155,11 @@ def _to_group_out(
         rms_noise_free=_list_quantiles(group, RMS_NOISE_FREE),
         rms_floor=scale_to_sigma(problem.get("rms"), group.sigma),
         fit_percent={
-            "estimation": _list_quantiles(group, FIT_ESTIMATION), "validation": _list_quantiles(group, FIT_VALIDATION),
+            "estimation": _list_quantiles(group, FIT_ESTIMATION),
+            "validation": _list_quantiles(group, FIT_VALIDATION),
         },
         parameters=list(_summarise_parameters(group, units, problem)),
-    )  # fmt: skip
+    )
 
 
 def _summarise_parameters(
@@ -170,12 +173,14 @@ def _summarise_parameters(
         if values is not None:
             reference = known.get(name)
             yield ParameterSummaryOut(
-                name=name, unit=unit, value=values,
+                name=name,
+                unit=unit,
+                value=values,
                 stderr=None if errors is None else errors[MEDIAN],
                 reference=reference,
                 error=None if reference is None else [value - reference for value in values],
                 floor=scale_to_sigma(floors.get(name), group.sigma),
-            )  # fmt: skip
+            )
 
 
 def _list_quantiles(group: RunGroup, quantity: SummaryQuantity) -> Any:

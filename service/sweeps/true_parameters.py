@@ -10,9 +10,9 @@ from service.storage.tables import Dataset
 from sysid.models.model import EstimatedInitial, Model, name_initial_state
 
 
-def find_true_parameters(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
-    dict[str, float] | None
-):  # fmt: skip
+def find_true_parameters(
+    session: Session, reference: Any, datasets: Sequence[Dataset]
+) -> dict[str, float] | None:
     """True values of a model's parameters and starts, by their names in a result.
 
     None unless every dataset was simulated from this very model with the same parameters: another

@@ -40,9 +40,10 @@ class BatchReference:
         if self.x is not None and self.x in places:
             return f"{self.why_no_trend}: compared with the reference run only"
         where = (
-            f"the reference run has no label {x!r}" if self.x is None
+            f"the reference run has no label {x!r}"
+            if self.x is None
             else f"the reference run is at {x} = {self.x:g}, where this batch has none"
-        )  # fmt: skip
+        )
         return f"{where}, and {self.why_no_trend}: nothing to compare with"
 
 

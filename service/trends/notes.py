@@ -69,9 +69,10 @@ def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
     if all(law.kind != "power" for law in fitted.laws):
         wrong = [f"{x:g}" for x in _list_used_x(one) if not x > 0]
         yield "no power law: " + (
-            f"it needs x above 0, found {', '.join(wrong)}" if wrong
+            f"it needs x above 0, found {', '.join(wrong)}"
+            if wrong
             else "these points do not determine one"
-        )  # fmt: skip
+        )
     _, (_, value, error) = chosen.coefficients
     if error > abs(value):
         name = "slope" if chosen.kind == "line" else "exponent"

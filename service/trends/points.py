@@ -106,8 +106,13 @@ def build_quantities(
 
 
 def _add_estimate(
-    columns: dict[str, _QuantityEstimates], name: str, unit: str, kind: QuantityKind, x: float, entry: _RunEstimate
-) -> _QuantityEstimates:  # fmt: skip
+    columns: dict[str, _QuantityEstimates],
+    name: str,
+    unit: str,
+    kind: QuantityKind,
+    x: float,
+    entry: _RunEstimate,
+) -> _QuantityEstimates:
     column = columns.setdefault(name, _QuantityEstimates(unit, kind))
     column.entries.setdefault(x, []).append(entry)
     return column
@@ -176,15 +181,21 @@ def _build_point(
     values = [one.value for one in entries if one.value is not None]
     value = sum(values) / len(values) if values else None
     return TrendPoint(
-        x, tuple(one.run for one in entries), ", ".join(states), estimate,
+        x,
+        tuple(one.run for one in entries),
+        ", ".join(states),
+        estimate,
         value if estimate is None else estimate.value,
-    )  # fmt: skip
+    )
 
 
 def to_label_out(
-    x: float, rows: Sequence[TrendRow], datasets: Mapping[str, Sequence[str]], known: DatasetChannels,
+    x: float,
+    rows: Sequence[TrendRow],
+    datasets: Mapping[str, Sequence[str]],
+    known: DatasetChannels,
     channels: Mapping[str, str],
-) -> BatchLabelOut:  # fmt: skip
+) -> BatchLabelOut:
     """All runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
@@ -201,10 +212,12 @@ def to_label_out(
                 output=one["output"], channel=channel, unit=unit, lower=low, upper=high
             )
     return BatchLabelOut(
-        x=x, runs=[row.id for row in rows], evaluations=sum(row.evaluations for row in rows),
+        x=x,
+        runs=[row.id for row in rows],
+        evaluations=sum(row.evaluations for row in rows),
         spans=list(spans.values()),
         warnings=list(dict.fromkeys(text for row in rows for text in row.warnings)),
-    )  # fmt: skip
+    )
 
 
 def _find_unit(

@@ -58,10 +58,11 @@ def _list_distinct_facts(
     for body in bodies:
         settings = {name: body[name] for name in _COMPARED_FIELDS}
         kinds = [
-            sorted((one["name"], one["unit"], one["hold"])
-                   for one in known.get(dataset, {}).values())
+            sorted(
+                (one["name"], one["unit"], one["hold"]) for one in known.get(dataset, {}).values()
+            )
             for dataset in body["datasets"]
-        ]  # fmt: skip
+        ]
         key = repr((settings, kinds))
         if key not in told:
             told.add(key)
@@ -69,8 +70,16 @@ def _list_distinct_facts(
 
 
 _COMPARED_FIELDS = (
-    "model", "channels", "hold", "loss", "weights", "prediction", "skip", "noise", "parameters",
-)  # fmt: skip
+    "model",
+    "channels",
+    "hold",
+    "loss",
+    "weights",
+    "prediction",
+    "skip",
+    "noise",
+    "parameters",
+)
 
 
 def _collect_facts(session: Session, body: JobBody, known: DatasetChannels) -> RunFacts:
@@ -105,10 +114,14 @@ def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
     loss, weights = body["loss"], body["weights"]
     scale = "" if loss["kind"] == "squares" else f" of scale {loss['scale']:g}"
     yield "loss", loss["kind"] + scale
-    yield "weights", (
-        ", ".join(f"{name} {value:g}" for name, value in sorted(weights.items()))
-        if weights else "by standard deviation"
-    )  # fmt: skip
+    yield (
+        "weights",
+        (
+            ", ".join(f"{name} {value:g}" for name, value in sorted(weights.items()))
+            if weights
+            else "by standard deviation"
+        ),
+    )
     yield "prediction", body["prediction"]
     yield "skip", f"{body['skip']:d}"
     yield "added noise", f"{body['noise']['sigma']:g}"

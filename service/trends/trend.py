@@ -75,7 +75,8 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
             describe_differences(session, reference.run, list(bodies.values()), known),
         ]
     return TrendOut(
-        job=job.id, x=asked["x"],
+        job=job.id,
+        x=asked["x"],
         reference=None if reference is None else reference.run.id,
         reference_x=None if reference is None else reference.x,
         reference_names=[] if reference is None else list(reference.names),
@@ -83,9 +84,10 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
             to_label_out(x, rows, datasets, known, bodies[rows[0].id]["channels"])
             for x, rows in places.items()
         ],
-        quantities=told, missing=job.n_runs - count_succeeded(session, job.id),
+        quantities=told,
+        missing=job.n_runs - count_succeeded(session, job.id),
         notes=[note for note in notes if note],
-    )  # fmt: skip
+    )
 
 
 def _collect_quantities(
@@ -150,10 +152,14 @@ def _to_quantity_out(
     n = sum(point.estimate is not None for other in all_ for point in other.points)
     drifts = compare_with_reference(one, reference, n)
     points = [
-        _to_point_out(point, next(influences, None) if point.estimate is not None else None,
-               drifts.get(point.x, []), bool(fitted.laws))
+        _to_point_out(
+            point,
+            next(influences, None) if point.estimate is not None else None,
+            drifts.get(point.x, []),
+            bool(fitted.laws),
+        )
         for point in one.points
-    ]  # fmt: skip
+    ]
     return QuantityOut.from_source(
         one,
         points=points,

@@ -105,9 +105,13 @@ class ClosedLoop:
         return {name_initial_state(name, 0): before if isfinite(before) else 0.0}
 
     def _evaluate_start(
-        self, tree: Expression, inputs: Sequence[Channel], values: Mapping[str, float],
-        at: float, side: str,
-    ) -> float:  # fmt: skip
+        self,
+        tree: Expression,
+        inputs: Sequence[Channel],
+        values: Mapping[str, float],
+        at: float,
+        side: str,
+    ) -> float:
         """Value of an expression where the loop starts, just before or just after."""
         given = {one.name: _interpolate_channel(one, at, side) for one in inputs}
         starts = {
@@ -160,9 +164,14 @@ def close_loop(model: Model, control: PidControl, period: float | None = None) -
     )
     closed = parse_model(document)
     return ClosedLoop(
-        closed, loop.reference, control.input, loop.command, loop.controller_delay_steps, renamed,
+        closed,
+        loop.reference,
+        control.input,
+        loop.command,
+        loop.controller_delay_steps,
+        renamed,
         loop.law.filter,
-    )  # fmt: skip
+    )
 
 
 def _choose_parameter_names(model: Model) -> dict[str, str]:

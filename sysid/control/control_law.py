@@ -60,9 +60,14 @@ ParameterFactory = Callable[..., Symbol]
 
 
 def build_control_law(
-    control: PidControl, reference: str, output: Expression, *,
-    is_sampled: bool, fixed: ParameterFactory, state: Callable[[str], str],
-) -> ControlLaw:  # fmt: skip
+    control: PidControl,
+    reference: str,
+    output: Expression,
+    *,
+    is_sampled: bool,
+    fixed: ParameterFactory,
+    state: Callable[[str], str],
+) -> ControlLaw:
     """The law of a controller.
 
     Parameters
@@ -83,9 +88,14 @@ def build_control_law(
 
 class _ControlLawBuilder:
     def __init__(
-        self, control: PidControl, reference: str, output: Expression, is_sampled: bool,
-        fixed: ParameterFactory, state: Callable[[str], str],
-    ) -> None:  # fmt: skip
+        self,
+        control: PidControl,
+        reference: str,
+        output: Expression,
+        is_sampled: bool,
+        fixed: ParameterFactory,
+        state: Callable[[str], str],
+    ) -> None:
         self.control, self.output, self.is_sampled = control, output, is_sampled
         self.add_parameter, self.choose_state_name = fixed, state
         self.reference = PastValue(reference, "input", 0, None)

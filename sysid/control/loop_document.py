@@ -44,9 +44,13 @@ class LoopDocumentBuilder:
         self.taken = taken
         self.new_parameters: dict[str, dict[str, Any]] = {}
         self.law = build_control_law(
-            control, self.reference, self.output.expression,
-            is_sampled=self.clock == "k", fixed=self._add_parameter, state=self._reserve_state_name,
-        )  # fmt: skip
+            control,
+            self.reference,
+            self.output.expression,
+            is_sampled=self.clock == "k",
+            fixed=self._add_parameter,
+            state=self._reserve_state_name,
+        )
         self.transport_gain = (
             None
             if control.transport is None
@@ -60,8 +64,11 @@ class LoopDocumentBuilder:
         name = choose_free_name(name, self.taken)
         self.taken.add(name)
         self.new_parameters[name] = {
-            "lower": min(value, 0.0), "upper": max(value, 0.0) or 1.0, "unit": unit, "fixed": value,
-        }  # fmt: skip
+            "lower": min(value, 0.0),
+            "upper": max(value, 0.0) or 1.0,
+            "unit": unit,
+            "fixed": value,
+        }
         return Symbol(name, "parameter")
 
     def _reserve_state_name(self, name: str) -> str:

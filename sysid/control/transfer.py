@@ -205,11 +205,15 @@ def compute_transfer_functions(identified: IdentifiedModel) -> TransferFunctions
         for name, column in columns.items()
     }
     pairs = tuple(
-        TransferFunction(name, output.name, _compute_numerator(identified, form, name, states, denominator),
-                 denominator)
+        TransferFunction(
+            name,
+            output.name,
+            _compute_numerator(identified, form, name, states, denominator),
+            denominator,
+        )
         for output, form in zip(model.outputs, linear.outputs, strict=True)
         for name, states in inside.items()
-    )  # fmt: skip
+    )
     return TransferFunctions(pairs, linear, period)
 
 

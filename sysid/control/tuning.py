@@ -100,10 +100,15 @@ class Tuning:
 
 
 def tune_controller(
-    identified: IdentifiedModel, input: str, output: str, *, rule: TuningRule = "simc",
-    controller: ControllerKind = "PI", closed_loop_time_constant: float | None = None,
+    identified: IdentifiedModel,
+    input: str,
+    output: str,
+    *,
+    rule: TuningRule = "simc",
+    controller: ControllerKind = "PI",
+    closed_loop_time_constant: float | None = None,
     transport: Transport | None = None,
-) -> Tuning:  # fmt: skip
+) -> Tuning:
     """A controller of one output by one input by a rule.
 
     Parameters
@@ -130,9 +135,10 @@ def tune_controller(
     process = factors.reduce_order(2 if controller == "PID" and rule == "simc" else 1)
     try:
         found = (
-            _tune_amigo(process, controller) if rule == "amigo"
+            _tune_amigo(process, controller)
+            if rule == "amigo"
             else _tune_simc(process, controller, closed_loop_time_constant)
-        )  # fmt: skip
+        )
     except ZeroDivisionError:  # of numbers whose product is too small to be one
         raise _make_refusal(_describe_impossible_gain(inf, process)) from None
     if not 0.0 < abs(found.gain) < LARGEST_NUMBER:
@@ -285,9 +291,15 @@ def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float 
     else:
         formulas += ["K = K', T_i = T_i'"]
     return Tuning(
-        "simc", controller, series_gain * factor, series_time * factor, derivative / factor,
-        process, tau, tuple(formulas),
-    )  # fmt: skip
+        "simc",
+        controller,
+        series_gain * factor,
+        series_time * factor,
+        derivative / factor,
+        process,
+        tau,
+        tuple(formulas),
+    )
 
 
 def _tune_amigo(process: ProcessModel, controller: ControllerKind) -> Tuning:

@@ -24,15 +24,28 @@ import numpy as np
 from sysid.core.code_cache import digest_files, load_code, store_code, warn_not_cached
 
 _SOURCE_PATTERNS = (
-    "search/*.py", "islands/*.py", "kernels/*.py", "plants/*.py", "simulation/*.py",
+    "search/*.py",
+    "islands/*.py",
+    "kernels/*.py",
+    "plants/*.py",
+    "simulation/*.py",
     "uncertainty/sensitivities.py",
-)  # fmt: skip
+)
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
 _REDUCED_PARTS = 9  # of a compiled function; the last are environments
 _CACHE_ERRORS = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError,
-    OSError, RuntimeError, TypeError, ValueError, pickle.PickleError,
-)  # fmt: skip
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    pickle.PickleError,
+)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -103,9 +116,14 @@ class _FunctionCache:
         if self._source is None:
             raise OSError(f"{self._code.co_filename} cannot be read")
         parts = (
-            get_sources_digest(), _VERSIONS, target_context.codegen().magic_tuple(), self._name,
-            self._code.co_firstlineno, self._source, str(sig),
-        )  # fmt: skip
+            get_sources_digest(),
+            _VERSIONS,
+            target_context.codegen().magic_tuple(),
+            self._name,
+            self._code.co_firstlineno,
+            self._source,
+            str(sig),
+        )
         return sha256(repr(parts).encode()).hexdigest()
 
 

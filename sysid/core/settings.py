@@ -60,10 +60,15 @@ class Migration:
 
     def __post_init__(self) -> None:
         _require_count(self.every, "migration/every")
-        _require(self.topology in TOPOLOGIES, "migration/topology", self.topology,
-                 ", ".join(TOPOLOGIES))  # fmt: skip
-        _require(0 <= self.migrants <= MAX_GENERATIONS, "migration/migrants", self.migrants,
-                 f"0 to {MAX_GENERATIONS}")  # fmt: skip
+        _require(
+            self.topology in TOPOLOGIES, "migration/topology", self.topology, ", ".join(TOPOLOGIES)
+        )
+        _require(
+            0 <= self.migrants <= MAX_GENERATIONS,
+            "migration/migrants",
+            self.migrants,
+            f"0 to {MAX_GENERATIONS}",
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +92,12 @@ class Stop:
         for name in ("evaluations", "seconds", "rms", "settled"):
             value = getattr(self, name)
             _require(value is None or value > 0, f"stop/{name}", value, "positive")
-        _require(self.evaluations is None or self.evaluations <= MAX_EVALUATIONS,
-                 "stop/evaluations", self.evaluations, f"1 to {MAX_EVALUATIONS}")  # fmt: skip
+        _require(
+            self.evaluations is None or self.evaluations <= MAX_EVALUATIONS,
+            "stop/evaluations",
+            self.evaluations,
+            f"1 to {MAX_EVALUATIONS}",
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,23 +148,40 @@ class GeneticAlgorithm:
 
     def __post_init__(self) -> None:
         _require(self.method in SEARCH_METHODS, "method", self.method, ", ".join(SEARCH_METHODS))
-        _require(self.population >= MIN_POPULATION, "population", self.population,
-                 f"{MIN_POPULATION} or more")  # fmt: skip
+        _require(
+            self.population >= MIN_POPULATION,
+            "population",
+            self.population,
+            f"{MIN_POPULATION} or more",
+        )
         _require_count(self.generations, "generations")
         _require(1 <= self.bits <= MAX_BITS, "bits", self.bits, f"1 to {MAX_BITS}")
-        _require(0 < self.selection_rate < 1, "selection_rate", self.selection_rate,
-                 "between 0 and 1")  # fmt: skip
+        _require(
+            0 < self.selection_rate < 1, "selection_rate", self.selection_rate, "between 0 and 1"
+        )
         _require_count(self.stagnation, "stagnation")
         _require_schedule(self.mutation, "mutation")
-        _require(self.safe_limit is None or self.safe_limit > 0, "safe_limit", self.safe_limit,
-                 "positive")  # fmt: skip
+        _require(
+            self.safe_limit is None or self.safe_limit > 0,
+            "safe_limit",
+            self.safe_limit,
+            "positive",
+        )
         _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
         budget = self.stop.evaluations
-        _require(budget is None or budget >= self.population, "stop/evaluations", budget,
-                 f"{self.population} or more, the simulations of one population of "
-                 f"{self.population} individuals")  # fmt: skip
-        _require(self.population >= MIN_POPULATION * self.n_islands, "population", self.population,
-                 f"{MIN_POPULATION} or more for each of the {self.n_islands} islands")  # fmt: skip
+        _require(
+            budget is None or budget >= self.population,
+            "stop/evaluations",
+            budget,
+            f"{self.population} or more, the simulations of one population of "
+            f"{self.population} individuals",
+        )
+        _require(
+            self.population >= MIN_POPULATION * self.n_islands,
+            "population",
+            self.population,
+            f"{MIN_POPULATION} or more for each of the {self.n_islands} islands",
+        )
 
     @property
     def n_islands(self) -> int:
@@ -253,10 +279,12 @@ def _require_count(found: int, pointer: str) -> None:
 def _require_schedule(found: MutationSchedule, pointer: str) -> None:
     generations = [generation for generation, _ in found]
     holds = (
-        bool(generations) and generations[0] == 0 and generations[-1] <= MAX_GENERATIONS
+        bool(generations)
+        and generations[0] == 0
+        and generations[-1] <= MAX_GENERATIONS
         and generations == sorted(set(generations))
         and all(0 <= rate <= 1 for _, rate in found)
-    )  # fmt: skip
+    )
     right = f"[generation, rate] pairs from generation 0 up to {MAX_GENERATIONS}, rates 0 to 1"
     _require(holds, pointer, found, right)
 

@@ -116,24 +116,68 @@ _UNPREFIXED = {
     "ppm": _Unit(_DIMENSIONLESS, Fraction(1, 10**6)),
     "ppb": _Unit(_DIMENSIONLESS, Fraction(1, 10**9)),
 }
-_PREFIXES = {"p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3,
-             "M": 6, "G": 9, "T": 12}  # fmt: skip
+_PREFIXES = {
+    "p": -12,
+    "n": -9,
+    "µ": -6,
+    "u": -6,
+    "m": -3,
+    "c": -2,
+    "d": -1,
+    "h": 2,
+    "k": 3,
+    "M": 6,
+    "G": 9,
+    "T": 12,
+}
 
 _OFFSET_SCALES = {
-    "°C": "°C", "℃": "°C", "degC": "°C", "Celsius": "°C", "celsius": "°C",
-    "°F": "°F", "℉": "°F", "degF": "°F", "Fahrenheit": "°F", "fahrenheit": "°F",
-}  # fmt: skip
+    "°C": "°C",
+    "℃": "°C",
+    "degC": "°C",
+    "Celsius": "°C",
+    "celsius": "°C",
+    "°F": "°F",
+    "℉": "°F",
+    "degF": "°F",
+    "Fahrenheit": "°F",
+    "fahrenheit": "°F",
+}
 
 _UNCONVERTIBLE = ("dB", "dBm", "pH", "count", "counts", "px")
 """Units that many have and no factor leads to: known, and compared with nothing."""
 
 _SPELLED_OUT = {
-    "second": "s", "minute": "min", "hour": "h", "metre": "m", "meter": "m", "gram": "g",
-    "ampere": "A", "amp": "A", "volt": "V", "watt": "W", "joule": "J", "newton": "N",
-    "pascal": "Pa", "bars": "bar", "hertz": "Hz", "kelvin": "K", "liter": "L", "litre": "L",
-    "degree": "deg", "radian": "rad", "percent": "%", "pct": "%", "foot": "ft", "feet": "ft",
-    "mol": "mol", "mole": "mol", "none": "1", "unitless": "1", "dimensionless": "1",
-}  # fmt: skip
+    "second": "s",
+    "minute": "min",
+    "hour": "h",
+    "metre": "m",
+    "meter": "m",
+    "gram": "g",
+    "ampere": "A",
+    "amp": "A",
+    "volt": "V",
+    "watt": "W",
+    "joule": "J",
+    "newton": "N",
+    "pascal": "Pa",
+    "bars": "bar",
+    "hertz": "Hz",
+    "kelvin": "K",
+    "liter": "L",
+    "litre": "L",
+    "degree": "deg",
+    "radian": "rad",
+    "percent": "%",
+    "pct": "%",
+    "foot": "ft",
+    "feet": "ft",
+    "mol": "mol",
+    "mole": "mol",
+    "none": "1",
+    "unitless": "1",
+    "dimensionless": "1",
+}
 _COMMON_PREFIXES = "µmckMh"  # prefixes of what is suggested
 _MIN_LIKENESS = 0.6  # of the letters of a name, for which another is suggested
 
@@ -219,8 +263,10 @@ def suggest_unit(unit: str) -> str:
     if is_known_unit(unit):
         return ""
     parts = re.split(r"([A-Za-zµΩ]+)", unit[:_MAX_CHARACTERS].strip())
-    names = [part if at % 2 == 0 or _find_named_unit(part) else _find_nearest_unit(part)
-             for at, part in enumerate(parts)]  # fmt: skip
+    names = [
+        part if at % 2 == 0 or _find_named_unit(part) else _find_nearest_unit(part)
+        for at, part in enumerate(parts)
+    ]
     meant = "".join(names)
     return f"; did you mean {meant!r}?" if meant and is_readable_unit(meant) else ""
 

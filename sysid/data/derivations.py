@@ -85,9 +85,10 @@ def _add_channel_noise(channel: Channel, noise: Noise, stream: int) -> Channel:
         return replace(channel, values=channel.values + draw_noise(noise, size, stream))
     drawn = draw_noise(noise, size + history.values.size, stream)
     return replace(
-        channel, values=channel.values + drawn[:size],
+        channel,
+        values=channel.values + drawn[:size],
         history=history._replace(values=history.values + drawn[size:]),
-    )  # fmt: skip
+    )
 
 
 def trim_recording(recording: Recording, given: StepArguments) -> Recording:

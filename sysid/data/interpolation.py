@@ -51,9 +51,13 @@ class FineInput:
 
 
 def interpolate_input(
-    channel: Channel, start: float, step: float, steps: int, lag: float,
+    channel: Channel,
+    start: float,
+    step: float,
+    steps: int,
+    lag: float,
     mean: Literal["around", "after"] | None = None,
-) -> FineInput:  # fmt: skip
+) -> FineInput:
     """Lay an input onto the fine grid.
 
     A held input that is read with an unknown lag is given as its mean over one integration step,

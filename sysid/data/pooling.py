@@ -150,9 +150,13 @@ def _pool_input(
 
 
 def _compute_bin_medians(
-    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float,
+    channel: Channel,
+    segments: tuple[Segment, ...],
+    start: float,
+    stop: float,
+    width: float,
     first: float | None = None,
-) -> Channel | None:  # fmt: skip
+) -> Channel | None:
     """Medians of the samples from start to stop; a bin begins at `first`, or else at the start."""
     gathered = _collect_samples(channel, segments, start, stop)
     if gathered is None:

@@ -58,9 +58,11 @@ def resample_recording(recording: Recording, given: StepArguments) -> Recording:
 
 
 def _resample_channel(
-    channel: Channel, grid: FloatArray, period: float,
+    channel: Channel,
+    grid: FloatArray,
+    period: float,
     read: Callable[[Channel, FloatArray, float], FloatArray],
-) -> Channel:  # fmt: skip
+) -> Channel:
     """A channel on a grid, and before it as far as anything is known."""
     whole = channel.history_and_samples
     known = max(floor((grid[0] - whole.times[0]) / period + _BORDER_TOLERANCE), 0)

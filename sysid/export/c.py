@@ -124,20 +124,38 @@ def write_c_source(identified: IdentifiedModel) -> str:
         names.make_identifier(f"{stem}_{suffix}")
     program = GeneratedProgram(identified, language, names, prefix="p->")
     loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
-    body = [*_write_checks(program), *_write_step_count(program), *_write_delays(program), *_write_state_arrays(program), *loop,
-            "free(work);", "return 0;"]  # fmt: skip
+    body = [
+        *_write_checks(program),
+        *_write_step_count(program),
+        *_write_delays(program),
+        *_write_state_arrays(program),
+        *loop,
+        "free(work);",
+        "return 0;",
+    ]
     helpers = needed_helpers(HELPERS, program.helper_names | language.called_functions, identified)
     parts = [
-        _write_header(identified, stem), "#include <math.h>\n#include <stdlib.h>\n",
-        _write_struct(program, stem), _write_identified_function(program, stem), *helpers,
-        _write_simulate_comment(program), _write_signature(program, stem), "{", *indented(body), "}",
-    ]  # fmt: skip
+        _write_header(identified, stem),
+        "#include <math.h>\n#include <stdlib.h>\n",
+        _write_struct(program, stem),
+        _write_identified_function(program, stem),
+        *helpers,
+        _write_simulate_comment(program),
+        _write_signature(program, stem),
+        "{",
+        *indented(body),
+        "}",
+    ]
     return "\n".join(parts) + "\n"
 
 
 def _write_header(identified: IdentifiedModel, stem: str) -> str:
-    lines = [*describe_model(identified), "", f"{stem}_identified() gives the values that were found.",
-             f"{stem}_simulate() runs the model freely; link with -lm."]  # fmt: skip
+    lines = [
+        *describe_model(identified),
+        "",
+        f"{stem}_identified() gives the values that were found.",
+        f"{stem}_simulate() runs the model freely; link with -lm.",
+    ]
     told = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
     return f"/*\n{told}\n */"
 
@@ -223,14 +241,16 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
     if program.grid_step is None:
         count = f"(n - 1)*{substeps}" if substeps > 1 else "n - 1"
         divided = f"/{write_number(substeps)}" if substeps > 1 else ""
-        lines = [f"const double {period} = sample_time{divided};",
-                 f"const long steps = {count};"]  # fmt: skip
+        lines = [f"const double {period} = sample_time{divided};", f"const long steps = {count};"]
     else:
         own = write_number(program.grid_step)
-        lines = [f"const double dt = {own}/{write_number(substeps)};",
-                 f"const long points = (long)ceil((t[n - 1] - t[0])/{own} - 0.01);",
-                 "if (points < 1)", "    return 1;",
-                 f"const long steps = points*{substeps};"]  # fmt: skip
+        lines = [
+            f"const double dt = {own}/{write_number(substeps)};",
+            f"const long points = (long)ceil((t[n - 1] - t[0])/{own} - 0.01);",
+            "if (points < 1)",
+            "    return 1;",
+            f"const long steps = points*{substeps};",
+        ]
         if program.helper_names & {"between", "held", "averaged"}:
             lines.append("const double ratio = dt/sample_time;")
     if "held" in program.helper_names:
@@ -245,23 +265,31 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
 def _write_delays(program: GeneratedProgram) -> list[str]:
     lines = []
     for lag, name in program.delay_names.items():
-        lines += [f"const double {name} = {write_delay_steps(program, lag)}; /* integration steps */",
-                  f"if (!({name} < 1e9))", "    return 1;"]  # fmt: skip
+        lines += [
+            f"const double {name} = {write_delay_steps(program, lag)}; /* integration steps */",
+            f"if (!({name} < 1e9))",
+            "    return 1;",
+        ]
     return lines
 
 
 def _write_state_arrays(program: GeneratedProgram) -> list[str]:
     states = program.identified.model.states
-    lines = [f"double *const work = malloc({len(states)}*((size_t)steps + 1)*sizeof *work);",
-             "if (work == NULL)", "    return 2;"]  # fmt: skip
+    lines = [
+        f"double *const work = malloc({len(states)}*((size_t)steps + 1)*sizeof *work);",
+        "if (work == NULL)",
+        "    return 2;",
+    ]
     for i, state in enumerate(states):
         offset = f" + {i}*(steps + 1)" if i else ""
         lines.append(f"double *const {program.array_names[state.name]} = work{offset};")
     for state in states:
         every, start = program.array_names[state.name], program.start_names[state.name]
         size = _write_array_size(program, start)
-        lines += [f"for (long i = 0; i < {program.n_start_samples} && i <= steps; ++i)",
-                  f"    {every}[i] = p->{start}{'[i]' if size else ''};"]  # fmt: skip
+        lines += [
+            f"for (long i = 0; i < {program.n_start_samples} && i <= steps; ++i)",
+            f"    {every}[i] = p->{start}{'[i]' if size else ''};",
+        ]
     return lines
 
 
@@ -299,8 +327,11 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
         return _write_interpolated_outputs(program)
     model, substeps = program.identified.model, program.substeps
     place = f"i*{substeps}" if substeps > 1 else "i"
-    lines = ["for (long i = 0; i < n; ++i) {", f"    const long {program.loop_variable} = {place};",
-             f"    (void){program.loop_variable};"]  # fmt: skip
+    lines = [
+        "for (long i = 0; i < n; ++i) {",
+        f"    const long {program.loop_variable} = {place};",
+        f"    (void){program.loop_variable};",
+    ]
     for output in model.outputs:
         text = write_expression(output.expression, program.language, LoopScope(program, "output"))
         lines += indented(_wrap_statement(f"{program.output_names[output.name]}[i] = ", text))
@@ -318,14 +349,20 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
         lines += [
             "{",
             "    double *const grid = malloc(((size_t)points + 1)*sizeof *grid);",
-            "    if (grid == NULL) {", "        free(work);", "        return 2;", "    }",
+            "    if (grid == NULL) {",
+            "        free(work);",
+            "        return 2;",
+            "    }",
             "    for (long i = 0; i <= points; ++i) {",
-            f"        const long step = i*{program.substeps};", "        (void)step;",
-            *indented(_wrap_statement("grid[i] = ", text), 2), "    }",
+            f"        const long step = i*{program.substeps};",
+            "        (void)step;",
+            *indented(_wrap_statement("grid[i] = ", text), 2),
+            "    }",
             "    for (long i = 0; i < n; ++i)",
             f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{own});",
-            "    free(grid);", "}",
-        ]  # fmt: skip
+            "    free(grid);",
+            "}",
+        ]
     return lines
 
 
@@ -453,7 +490,15 @@ static double greatest(double a, double b)
 }
 """
 HELPERS: Mapping[str, str] = {
-    "sign": _SIGN_LEVEL, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
-    "held on grid": _HELD_ON_GRID, "averaged": _AVERAGED,
-    "sample": _SAMPLE, "past": _PAST, "past cubic": _PAST_CUBIC, "lately": _LATELY,
-}  # fmt: skip
+    "sign": _SIGN_LEVEL,
+    "least": _LEAST,
+    "greatest": _GREATEST,
+    "between": _BETWEEN,
+    "held": _HELD,
+    "held on grid": _HELD_ON_GRID,
+    "averaged": _AVERAGED,
+    "sample": _SAMPLE,
+    "past": _PAST,
+    "past cubic": _PAST_CUBIC,
+    "lately": _LATELY,
+}

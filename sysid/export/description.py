@@ -119,7 +119,9 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
         "lagid": identified.version or None,
         "model": dict(identified.model.document),
         "values": [_to_value_document(one) for one in identified.values],
-        "covariance": None if covariance is None else {
+        "covariance": None
+        if covariance is None
+        else {
             "names": list(covariance.names),
             "matrix": [[_to_finite(value) for value in row] for row in covariance.matrix],
         },
@@ -128,14 +130,17 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
             "hold": {one.name: identified.get_hold(one.name) for one in identified.model.inputs},
         },
         "provenance": dict(identified.provenance),
-    }  # fmt: skip
+    }
 
 
 def _to_value_document(one: IdentifiedValue) -> dict[str, Any]:
     return {
-        "name": one.name, "value": float(one.value), "unit": one.unit,
-        "stderr": _to_finite(one.stderr), "status": one.status,
-    }  # fmt: skip
+        "name": one.name,
+        "value": float(one.value),
+        "unit": one.unit,
+        "stderr": _to_finite(one.stderr),
+        "status": one.status,
+    }
 
 
 def _to_finite(value: float | None) -> float | None:

@@ -24,8 +24,10 @@ EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 MAX_PADE_ORDER = 20
 
 _WRITERS: Mapping[str, Callable[[IdentifiedModel], str]] = {
-    "json": write_json_source, "python": write_python_source, "c": write_c_source,
-}  # fmt: skip
+    "json": write_json_source,
+    "python": write_python_source,
+    "c": write_c_source,
+}
 
 
 def export_model(

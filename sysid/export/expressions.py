@@ -102,9 +102,10 @@ def _write_with_level(
             return _write_unary(expression, language, scope)
         case Binary("**", base, exponent):
             return language.write_power(
-                write_expression(base, language, scope, Level.ATOM), write_expression(exponent, language, scope),
+                write_expression(base, language, scope, Level.ATOM),
+                write_expression(exponent, language, scope),
                 _find_integer_exponent(base, exponent),
-            )  # fmt: skip
+            )
         case Binary():
             return _write_binary(expression, language, scope), OPERATORS[expression.operator].level
         case FunctionCall():

@@ -5,11 +5,32 @@ import unicodedata
 from collections.abc import Iterable
 
 _GREEK = {
-    "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "epsilon", "ζ": "zeta",
-    "η": "eta", "θ": "theta", "ι": "iota", "κ": "kappa", "λ": "lambda", "μ": "mu", "ν": "nu",
-    "ξ": "xi", "ο": "omicron", "π": "pi", "ρ": "rho", "σ": "sigma", "ς": "sigma", "τ": "tau",
-    "υ": "upsilon", "φ": "phi", "χ": "chi", "ψ": "psi", "ω": "omega",
-}  # fmt: skip
+    "α": "alpha",
+    "β": "beta",
+    "γ": "gamma",
+    "δ": "delta",
+    "ε": "epsilon",
+    "ζ": "zeta",
+    "η": "eta",
+    "θ": "theta",
+    "ι": "iota",
+    "κ": "kappa",
+    "λ": "lambda",
+    "μ": "mu",
+    "ν": "nu",
+    "ξ": "xi",
+    "ο": "omicron",
+    "π": "pi",
+    "ρ": "rho",
+    "σ": "sigma",
+    "ς": "sigma",
+    "τ": "tau",
+    "υ": "upsilon",
+    "φ": "phi",
+    "χ": "chi",
+    "ψ": "psi",
+    "ω": "omega",
+}
 
 
 class Identifiers:
@@ -30,8 +51,10 @@ class Identifiers:
 
 
 def _to_ascii(name: str) -> str:
-    spelled = "".join(_GREEK.get(c, _GREEK.get(c.lower(), c).capitalize() if c.lower() in _GREEK
-                                 else c) for c in unicodedata.normalize("NFKC", name))  # fmt: skip
+    spelled = "".join(
+        _GREEK.get(c, _GREEK.get(c.lower(), c).capitalize() if c.lower() in _GREEK else c)
+        for c in unicodedata.normalize("NFKC", name)
+    )
     plain = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode()
     stem = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60]
     return stem if stem and not stem[0].isdigit() else f"p_{stem}".rstrip("_")

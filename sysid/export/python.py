@@ -140,8 +140,9 @@ def _write_signature(program: GeneratedProgram) -> str:
     numbers = found.value_by_name
     required = [
         program.start_names[state.name]
-        for i, state in enumerate(found.model.states) if program.find_initial_value(i) is None
-    ]  # fmt: skip
+        for i, state in enumerate(found.model.states)
+        if program.find_initial_value(i) is None
+    ]
     given = [
         f"{program.parameter_names[one.name]}={write_number(numbers[one.name])}"
         for one in found.model.parameters
@@ -158,8 +159,14 @@ def _write_signature(program: GeneratedProgram) -> str:
 
 def _write_function_docstring(program: GeneratedProgram) -> list[str]:
     model = program.identified.model
-    lines = ['"""Free run of the model from its start.', "", "Parameters", "----------",
-             "t : array (N,)", "    Times in s, one sampling period apart."]  # fmt: skip
+    lines = [
+        '"""Free run of the model from its start.',
+        "",
+        "Parameters",
+        "----------",
+        "t : array (N,)",
+        "    Times in s, one sampling period apart.",
+    ]
     for one in model.inputs:
         lines += _describe_signal(program.input_names[one.name], "Input", one)
     for name, line in describe_values(
@@ -188,11 +195,13 @@ def _write_arrays(program: GeneratedProgram) -> list[str]:
     lines += [f"{name} = np.asarray({name}, dtype=np.float64)" for name in signals]
     shapes = [f"{name}.shape != t.shape" for name in signals]
     wrong = " or ".join(["t.ndim != 1", "t.size < 2", *shapes])
-    lines += [*_wrap_statement("if ", wrong, ":"),
-              '    raise ValueError("t and the inputs must have one shape (N,), N > 1")',
-              "sample_time = (t[-1] - t[0])/(t.size - 1)",
-              "if not np.max(np.abs(np.diff(t) - sample_time)) < 0.1*sample_time:",
-              '    raise ValueError("t must be regular; resample the inputs first")']  # fmt: skip
+    lines += [
+        *_wrap_statement("if ", wrong, ":"),
+        '    raise ValueError("t and the inputs must have one shape (N,), N > 1")',
+        "sample_time = (t[-1] - t[0])/(t.size - 1)",
+        "if not np.max(np.abs(np.diff(t) - sample_time)) < 0.1*sample_time:",
+        '    raise ValueError("t must be regular; resample the inputs first")',
+    ]
     if program.parameter_names:
         targets = ", ".join(program.parameter_names.values())
         both = _wrap_lines(targets + ",", "    ")
@@ -209,9 +218,12 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
         lines = [f"{period} = sample_time{divided}", f"steps = {count}"]
     else:
         own = write_number(program.grid_step)
-        lines = [f"dt = {own}/{substeps}" if substeps > 1 else f"dt = {own}",
-                 f"points = int(np.ceil((t[-1] - t[0])/{own} - 0.01))",
-                 f"steps = points*{substeps}", "ratio = dt/sample_time"]  # fmt: skip
+        lines = [
+            f"dt = {own}/{substeps}" if substeps > 1 else f"dt = {own}",
+            f"points = int(np.ceil((t[-1] - t[0])/{own} - 0.01))",
+            f"steps = points*{substeps}",
+            "ratio = dt/sample_time",
+        ]
     if "held" in program.helper_names:
         lines.append(f"ramp = {program.write_ramp_width()}  # samples: half the width of a jump")
     if "averaged" in program.helper_names:
@@ -250,17 +262,22 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
     target = ", ".join(following) if len(following) > 1 else f"({following[0]},)"
     return [
         f"def rates(step, part, {', '.join(states)}):  # at `part` of a step after it began",
-        "    return np.array([", *slopes, "    ])", "",
+        "    return np.array([",
+        *slopes,
+        "    ])",
+        "",
         "for step in range(steps):",
         f"    now = np.array([{now}])",
         "    slope_1 = rates(step, 0.0, *now)",
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
         "    slope_3 = rates(step, 0.5, *(now + dt/2*slope_2))",
         "    slope_4 = rates(step, 1.0, *(now + dt*slope_3))",
-        *indented(_wrap_statement(
-            f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
-        )),
-    ]  # fmt: skip
+        *indented(
+            _wrap_statement(
+                f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
+            )
+        ),
+    ]
 
 
 def _write_outputs(program: GeneratedProgram) -> list[str]:
@@ -271,8 +288,12 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
         text = write_expression(output.expression, program.language, LoopScope(program, "output"))
         loop = f"for {program.loop_variable} in range({by})"
         target = program.output_names[output.name]
-        lines += [f"{target} = np.array([", *indented(_wrap_statement("", text)), f"    {loop}",
-                  "], dtype=np.float64)"]  # fmt: skip
+        lines += [
+            f"{target} = np.array([",
+            *indented(_wrap_statement("", text)),
+            f"    {loop}",
+            "], dtype=np.float64)",
+        ]
         if program.grid_step is not None:
             grid = f"t[0] + {write_number(program.grid_step)}*np.arange(points + 1)"
             lines.append(f"{target} = np.interp(t, {grid}, {target})")
@@ -353,8 +374,11 @@ _LATELY = '''def lately(array, before, step, part, there, lag):
     return past(array, before, step, lag - part)
 '''
 HELPERS: Mapping[str, str] = {
-    "between": _BETWEEN, "held": _HELD, "held on grid": _HELD_ON_GRID,
+    "between": _BETWEEN,
+    "held": _HELD,
+    "held on grid": _HELD_ON_GRID,
     "averaged": _AVERAGED,
-    "past": _PAST, "past cubic": _PAST_CUBIC,
+    "past": _PAST,
+    "past cubic": _PAST_CUBIC,
     "lately": _LATELY,
-}  # fmt: skip
+}

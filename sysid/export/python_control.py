@@ -130,11 +130,13 @@ def _describe_constants(identified: IdentifiedModel, found: TransferFunctions) -
     model = identified.model
     constants = [
         f"the output {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.outputs, found.linear_form.outputs, strict=True) if form.constant
+        for one, form in zip(model.outputs, found.linear_form.outputs, strict=True)
+        if form.constant
     ] + [
         f"the equation of {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.states, found.linear_form.equations, strict=True) if form.constant
-    ]  # fmt: skip
+        for one, form in zip(model.states, found.linear_form.equations, strict=True)
+        if form.constant
+    ]
     if not constants:
         return []
     return wrap_source(f"Transfer functions are of deviations: {'; '.join(constants)}.", 94)

@@ -76,9 +76,12 @@ def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
 
 
 def rank_active_bounds(
-    space: tuple[Parameter, ...], reaches: tuple[Interval, ...], influence: FloatArray,
-    columns: FloatArray, place: FloatArray,
-) -> tuple[ActiveBound, ...]:  # fmt: skip
+    space: tuple[Parameter, ...],
+    reaches: tuple[Interval, ...],
+    influence: FloatArray,
+    columns: FloatArray,
+    place: FloatArray,
+) -> tuple[ActiveBound, ...]:
     """Which bounds to widen together, the costliest first; arrays as in `is_active`.
 
     Parameters
@@ -132,9 +135,13 @@ class _LinearStep(NamedTuple):
 
     @classmethod
     def from_place(
-        cls, space: tuple[Parameter, ...], reaches: tuple[Interval, ...], influence: FloatArray,
-        columns: FloatArray, place: FloatArray,
-    ) -> "_LinearStep":  # fmt: skip
+        cls,
+        space: tuple[Parameter, ...],
+        reaches: tuple[Interval, ...],
+        influence: FloatArray,
+        columns: FloatArray,
+        place: FloatArray,
+    ) -> "_LinearStep":
         """The step from a place (D,)."""
         basis, root = np.linalg.qr(columns)
         target = -(basis.T @ influence)

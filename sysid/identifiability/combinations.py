@@ -130,9 +130,13 @@ def express_combinations(
 
 
 def _make_combination(
-    block: ParameterBlock, names: Sequence[str], covariance: FloatArray, text: str, value: float,
+    block: ParameterBlock,
+    names: Sequence[str],
+    covariance: FloatArray,
+    text: str,
+    value: float,
     slope: FloatArray,
-) -> IdentifiableCombination:  # fmt: skip
+) -> IdentifiableCombination:
     inside = covariance[np.ix_(block.members, block.members)]
     stderr = sqrt(max(float(slope @ inside @ slope), 0.0))
     members = tuple(names[d] for d, s in zip(block.members, slope, strict=True) if s != 0.0)
@@ -281,9 +285,13 @@ class SingularDirections:
 
 
 def classify_directions(
-    singular: FloatArray, rows: FloatArray, null: BoolArray, moved: BoolArray,
-    covariance: FloatArray, noise: float,
-) -> SingularDirections:  # fmt: skip
+    singular: FloatArray,
+    rows: FloatArray,
+    null: BoolArray,
+    moved: BoolArray,
+    covariance: FloatArray,
+    noise: float,
+) -> SingularDirections:
     """What a covariance (D, D) of the places makes of the singular directions (D, D).
 
     Parameters

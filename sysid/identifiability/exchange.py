@@ -161,9 +161,11 @@ def _iterate_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[i
     alike = [
         (i, j)
         for i, j in combinations(range(theta.size), 2)
-        if units[i] is not None and units[i] == units[j]
-        and lower[i] <= theta[j] <= upper[i] and lower[j] <= theta[i] <= upper[j]
-    ]  # fmt: skip
+        if units[i] is not None
+        and units[i] == units[j]
+        and lower[i] <= theta[j] <= upper[i]
+        and lower[j] <= theta[i] <= upper[j]
+    ]
     if not alike:
         return
     lagged = set().union(
@@ -209,10 +211,12 @@ def _exclude_unlikely(
         spent += len(members)
         answers = _simulate_perturbed(problem, theta, members, low, high)
         kept = [
-            (i, j) for i, j in kept
-            if i not in group or not np.isfinite([answers[i], answers[j]]).all()
+            (i, j)
+            for i, j in kept
+            if i not in group
+            or not np.isfinite([answers[i], answers[j]]).all()
             or _is_same_output(answers[i], answers[j])
-        ]  # fmt: skip
+        ]
     return kept, spent
 
 
@@ -245,8 +249,9 @@ def _test_exchange(
     evaluator, pair = problem.evaluator, np.array([one, other])
     low, high = evaluator.lower[pair].max(axis=0), evaluator.upper[pair].min(axis=0)
     least = 0.5 * _LEAST_DISTANCE * _scale_values(theta[pair], high - low).max(axis=0)
-    half = np.minimum(np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least),
-                      0.5 * (high - low))  # fmt: skip
+    half = np.minimum(
+        np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least), 0.5 * (high - low)
+    )
     middle = np.minimum(np.maximum(0.5 * theta[pair].sum(axis=0), low + half), high - half)
     # Each to the side on which it is, so that sections stay what they are.
     half = np.where(theta[pair[0]] < theta[pair[1]], -half, half)

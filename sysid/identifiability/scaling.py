@@ -33,8 +33,11 @@ from sysid.models.model import (
 from sysid.models.parameters import Parameter
 
 _ARITHMETIC: Mapping[str, Callable[[Fraction, Fraction], Fraction]] = {
-    "+": add, "-": sub, "*": mul, "/": truediv,
-}  # fmt: skip
+    "+": add,
+    "-": sub,
+    "*": mul,
+    "/": truediv,
+}
 _LARGEST_DENOMINATOR, _FRACTION_TOLERANCE = 1000, 1e-14
 
 ScalingWeight = Mapping[str, Fraction]
@@ -63,16 +66,22 @@ def find_scalings(model: Model, parameters: Sequence[Parameter]) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _find_cached_scalings(
-    states: tuple[str, ...], equations: tuple[Expression, ...], outputs: tuple[Expression, ...],
-    initial: tuple[InitialState, ...], parameters: tuple[Parameter, ...],
-) -> FloatArray:  # fmt: skip
+    states: tuple[str, ...],
+    equations: tuple[Expression, ...],
+    outputs: tuple[Expression, ...],
+    initial: tuple[InitialState, ...],
+    parameters: tuple[Parameter, ...],
+) -> FloatArray:
     """The same, kept for the many runs of one model; not to be written to."""
     free = [p.name for p in parameters if p.is_free]
     walk = _WeightEquations(
-        {p.name: nan if p.fixed is None else p.fixed for p in parameters
-         if not p.is_free and p.fixed != 0.0},
+        {
+            p.name: nan if p.fixed is None else p.fixed
+            for p in parameters
+            if not p.is_free and p.fixed != 0.0
+        },
         {p.name for p in parameters if p.fixed == 0.0},
-    )  # fmt: skip
+    )
     for state, equation in zip(states, equations, strict=True):
         walk.require_equal({state: Fraction(1)}, walk.weigh_expression(equation))
     for output in outputs:

@@ -107,9 +107,11 @@ def _list_delay_operands(lag: Expression | None) -> tuple[Expression, ...]:
 
 
 def _match_operands(
-    ones: tuple[Expression, ...], others: tuple[Expression, ...], names: _Renaming,
+    ones: tuple[Expression, ...],
+    others: tuple[Expression, ...],
+    names: _Renaming,
     left: Iterator[int],
-) -> Iterator[_Renaming]:  # fmt: skip
+) -> Iterator[_Renaming]:
     if not ones:
         yield names
         return

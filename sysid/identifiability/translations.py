@@ -20,9 +20,12 @@ _SAME_TOLERANCE = 1e-10  # of the output's size: rounding
 
 
 def find_translations(
-    problem: Problem, theta: FloatArray, columns: FloatArray, scale: FloatArray,
+    problem: Problem,
+    theta: FloatArray,
+    columns: FloatArray,
+    scale: FloatArray,
     most: int | None = None,
-) -> tuple[FloatArray, int]:  # fmt: skip
+) -> tuple[FloatArray, int]:
     """Directions along which the output stays, and the simulations this took.
 
     Parameters
@@ -77,8 +80,10 @@ def _is_invariant(
     """Whether the output is the same a good way off, on the side that lies inside the bounds."""
     step = _MOVE_SHARE / np.max(np.abs(direction / scale)) * direction
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
-    room = [np.min(np.where(s < 0, theta - lower, upper - theta)[s != 0] / np.abs(s[s != 0]))
-            for s in (step, -step)]  # fmt: skip
+    room = [
+        np.min(np.where(s < 0, theta - lower, upper - theta)[s != 0] / np.abs(s[s != 0]))
+        for s in (step, -step)
+    ]
     side = int(np.argmax(room))
     moved = theta + min(1.0, room[side]) * (step if side == 0 else -step)
     if min(1.0, room[side]) < 0.1:

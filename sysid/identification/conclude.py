@@ -77,9 +77,12 @@ def conclude_run(
 
 
 def _build_identification(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, validation: Problem | None,
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    validation: Problem | None,
     deadline: Deadline,
-) -> Identification:  # fmt: skip
+) -> Identification:
     refined, ends, noise, analysis = _refine_and_analyse(problem, algorithm, state, deadline)
     problem, theta = resolve_noise_model(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
@@ -203,9 +206,12 @@ def _get_champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatAr
 
 
 def _refine_champions(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray],
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    champions: list[FloatArray],
     deadline: Deadline,
-) -> tuple[RefinedCandidate | None, ...]:  # fmt: skip
+) -> tuple[RefinedCandidate | None, ...]:
     if not _should_refine(algorithm, len(champions)):
         return (None,) * len(champions)
     left = _count_budget_left(algorithm, state, ())
@@ -221,10 +227,14 @@ def _should_refine(algorithm: GeneticAlgorithm, islands: int) -> bool:
 
 
 def _search_local_minima(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
-    refined: tuple[RefinedCandidate | None, ...], end: tuple[FloatArray, float], analysis: Analysis,
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    end: tuple[FloatArray, float],
+    analysis: Analysis,
     deadline: Deadline,
-) -> tuple[RefinedCandidate, Analysis]:  # fmt: skip
+) -> tuple[RefinedCandidate, Analysis]:
     """The best of the minima beside an estimate, with intervals that allow for the others.
 
     The evaluations of it are those of all the islands' ends in its place, and of the search here.
@@ -268,9 +278,14 @@ def _widen_intervals(problem: Problem, analysis: Analysis, found: LocalMinima) -
 
 
 def _apply_noise_model(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
-    refined: tuple[RefinedCandidate | None, ...], theta: FloatArray, analysis: Analysis, deadline: Deadline,
-) -> tuple[GeneralisedEstimate, Analysis]:  # fmt: skip
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    theta: FloatArray,
+    analysis: Analysis,
+    deadline: Deadline,
+) -> tuple[GeneralisedEstimate, Analysis]:
     """The estimates under the noise model that was asked for or chosen, and their analysis.
 
     Those of the paper's methods stay as found; so do all where residuals may as well be white.
@@ -375,9 +390,11 @@ class _ValidationResult(NamedTuple):
 
 
 def _validate_estimates(
-    validation: Problem, estimation: Problem, estimates: tuple[Estimate, ...],
+    validation: Problem,
+    estimation: Problem,
+    estimates: tuple[Estimate, ...],
     correlation_times: Mapping[str, float],
-) -> _ValidationResult:  # fmt: skip
+) -> _ValidationResult:
     """Agreement and simulation on data that were not used.
 
     The model's parameters are those of the estimate, and so are the weights, so that both RMS
@@ -397,9 +414,10 @@ def _validate_estimates(
         theta = middle if start is None else start.theta
     simulated = known.predict(theta[None])[0]
     return _ValidationResult(
-        compute_metrics(known, simulated), _select_scored_part(known, _split_outputs(known, simulated)),
+        compute_metrics(known, simulated),
+        _select_scored_part(known, _split_outputs(known, simulated)),
         run_residual_tests(known, simulated, "validation", correlation_times),
-    )  # fmt: skip
+    )
 
 
 def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:

@@ -100,9 +100,8 @@ def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> 
 
 
 def fit_generalised_least_squares(
-    problem: Problem, theta: FloatArray, covariance: FloatArray, seed: int,
-    most: int | None = None,
-) -> GeneralisedEstimate:  # fmt: skip
+    problem: Problem, theta: FloatArray, covariance: FloatArray, seed: int, most: int | None = None
+) -> GeneralisedEstimate:
     """Estimates under first-order noise, from those of least squares (D,).
 
     With no more than `most` simulations. Where all residuals may as well be white the estimates
@@ -155,9 +154,13 @@ def _select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
 
 
 def _to_estimate(
-    problem: Problem, theta: FloatArray, place: FloatArray, known: Mapping[str, float],
-    search: "_WhitenedLeastSquares", is_complete: bool,
-) -> GeneralisedEstimate:  # fmt: skip
+    problem: Problem,
+    theta: FloatArray,
+    place: FloatArray,
+    known: Mapping[str, float],
+    search: "_WhitenedLeastSquares",
+    is_complete: bool,
+) -> GeneralisedEstimate:
     """The estimates at a place, those there were where no correlation was found."""
     if any(known.values()):
         theta = from_unit(problem.evaluator, place[None])[0]
@@ -166,9 +169,12 @@ def _to_estimate(
 
 
 def _draw_starts(
-    search: "_WhitenedLeastSquares", place: FloatArray, white: Whitening, covariance: FloatArray,
+    search: "_WhitenedLeastSquares",
+    place: FloatArray,
+    white: Whitening,
+    covariance: FloatArray,
     random: np.random.Generator,
-) -> list[FloatArray]:  # fmt: skip
+) -> list[FloatArray]:
     """Places around one (D,), those that lie lowest of some that are drawn."""
     count = _N_DRAWN + _MAX_STARTS * search.round_simulations
     if search.simulations_left < count or count * search.problem.n_steps > _MAX_WORK:

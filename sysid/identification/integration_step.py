@@ -35,9 +35,12 @@ _MAX_STEPS = 2_000_000
 
 
 def warn_integration_step(
-    problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], simulated: FloatArray,
+    problem: Problem,
+    theta: FloatArray,
+    estimates: tuple[Estimate, ...],
+    simulated: FloatArray,
     is_late: Callable[[], bool] | None = None,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Estimates (D,) that would be others with half the integration step; simulated (M,)."""
     plain = problem.loss.noise_model != "ar1"
     if is_difference(problem.model) or not plain or _SUBSTEP_FACTOR * problem.n_steps > _MAX_STEPS:
@@ -95,9 +98,12 @@ def _refit_estimate(
 
 
 def _predict_estimate(
-    problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], move: FloatArray,
+    problem: Problem,
+    theta: FloatArray,
+    estimates: tuple[Estimate, ...],
+    move: FloatArray,
     error: FloatArray,
-) -> _FineEstimate:  # fmt: skip
+) -> _FineEstimate:
     """Where it would end if outputs that move by so little (n,) are linear."""
     held = {one.name for one in estimates if one.status == "at bound"}
     found = compute_sensitivities(problem, theta)
@@ -110,9 +116,12 @@ def _predict_estimate(
 
 
 def _describe_shifts(
-    problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], end: FloatArray,
+    problem: Problem,
+    theta: FloatArray,
+    estimates: tuple[Estimate, ...],
+    end: FloatArray,
     share: float,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Estimates that move by much of their standard error, and by that share of themselves."""
     by = dict(zip(problem.free_names, (end - theta).tolist(), strict=True))
     told = []

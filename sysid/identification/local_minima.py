@@ -83,9 +83,13 @@ def count_affordable_simulations(problem: Problem, is_late: bool) -> int:
 
 
 def find_local_minima(
-    problem: Problem, theta: FloatArray, rms: float, linear: LinearOutputModel, seed: int,
+    problem: Problem,
+    theta: FloatArray,
+    rms: float,
+    linear: LinearOutputModel,
+    seed: int,
     left: int | None = None,
-) -> LocalMinima:  # fmt: skip
+) -> LocalMinima:
     """Look for minima around an estimate (D,) with a linear model, in at most `left` runs."""
     look = _LocalSearch(problem, linear, seed, 2**62 if left is None else left)
     first = best = RefinedCandidate(theta, rms, 0)
@@ -103,9 +107,11 @@ def find_local_minima(
         best = found[-1]
     better = best if best.rms < rms * (1.0 - _GAIN_TOLERANCE) else None
     return LocalMinima(
-        better, np.array([one.theta for one in found]), np.array([one.rms for one in found]),
+        better,
+        np.array([one.theta for one in found]),
+        np.array([one.rms for one in found]),
         look.evaluations,
-    )  # fmt: skip
+    )
 
 
 class _LocalSearch:
@@ -179,9 +185,12 @@ class _LocalSearch:
 
 
 def widen_intervals(
-    estimates: tuple[Estimate, ...], names: tuple[str, ...], n: int, found: LocalMinima,
+    estimates: tuple[Estimate, ...],
+    names: tuple[str, ...],
+    n: int,
+    found: LocalMinima,
     share: FloatArray,
-) -> tuple[Estimate, ...]:  # fmt: skip
+) -> tuple[Estimate, ...]:
     """Estimates whose intervals hold those of all minima that the data do not rule out.
 
     `share` (D,) is that of `LinearOutputModel`, of the parameters of these names.

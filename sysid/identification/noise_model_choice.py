@@ -133,9 +133,12 @@ _MIN_RECORD_TIMES = 5.0  # correlation times that a record lasts at least
 
 
 def is_ar1_indicated(
-    problem: Problem, theta: FloatArray, analysis: Analysis,
-    is_late: Callable[[], bool] | None = None, most: int | None = None,
-) -> bool:  # fmt: skip
+    problem: Problem,
+    theta: FloatArray,
+    analysis: Analysis,
+    is_late: Callable[[], bool] | None = None,
+    most: int | None = None,
+) -> bool:
     """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
 
     The analysis of those estimates tells the colour: no more is looked at where it is white. What

@@ -31,11 +31,10 @@ __all__ = [
     "advance_island",
     "advance_run",
     "begin_run",
-    "conclude_run",
     "exchange_migrants",
     "find_next_border",
     "is_finished",
-]  # fmt: skip
+]
 
 CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
@@ -122,19 +121,29 @@ def advance_run(
     way = make_search_plan(problem, algorithm, state.seed, is_warm=state.is_warm)
     size = algorithm.population // algorithm.n_islands
     pace = _CallBudget(
-        seconds, algorithm.stop.seconds, state.seconds, should_stop,
+        seconds,
+        algorithm.stop.seconds,
+        state.seconds,
+        should_stop,
         FIRST_CALL_STEPS // (size * max(problem.n_steps, 1)),
-    )  # fmt: skip
+    )
     while not is_finished(algorithm, state) and not pace.is_over():
         before, left = _count_generations(state), algorithm.generations - state.generation
         stand = evolve_islands(
-            problem.evaluator, way, state.islands, state.generation, state.epoch,
+            problem.evaluator,
+            way,
+            state.islands,
+            state.generation,
+            state.epoch,
             pace.count_affordable_generations(left * algorithm.n_islands),
-        )  # fmt: skip
+        )
         state = replace(
-            state, islands=stand.islands, generation=stand.generation, epoch=stand.epoch,
+            state,
+            islands=stand.islands,
+            generation=stand.generation,
+            epoch=stand.epoch,
             migrations=state.migrations + stand.migrants,
-        )  # fmt: skip
+        )
         pace.record_call(_count_generations(state) - before)
         ended = stand.has_crossed and _has_ended(algorithm, state)
         state = replace(state, has_ended=ended, seconds=pace.measure_used_seconds())

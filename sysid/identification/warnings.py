@@ -383,9 +383,11 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
     found = []
     for quantity in problem.model.inputs:
         values = [
-            one.values for record in problem.records for one in record.inputs
+            one.values
+            for record in problem.records
+            for one in record.inputs
             if one.name == quantity.name
-        ]  # fmt: skip
+        ]
         if blind and all(float(np.ptp(one)) == 0.0 for one in values):
             found.append(
                 f"input {quantity.name!r} is constant, so it excites nothing; these data leave "

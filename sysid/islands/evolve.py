@@ -36,8 +36,15 @@ _MOST_BORDERS, _MOST_MIGRANTS = 100, 100_000
 
 
 _INTEGER_FIELDS = (
-    "island", "first_individual", "method", "bits", "survivors", "stagnation", "is_relative", "most_evaluations",
-)  # fmt: skip
+    "island",
+    "first_individual",
+    "method",
+    "bits",
+    "survivors",
+    "stagnation",
+    "is_relative",
+    "most_evaluations",
+)
 
 
 class PackedPlans(NamedTuple):
@@ -133,27 +140,40 @@ def _make_shared_search_plan(
     planned = make_shared_plans(algorithm, n, scale)
     longest = max(plan.mutation_starts.size for plan in planned)
     plans = PackedPlans(
-        0, algorithm.population, scale, np.zeros(0),
-        np.array([[getattr(plan, name) for name in _INTEGER_FIELDS] for plan in planned], dtype=np.int64),
+        0,
+        algorithm.population,
+        scale,
+        np.zeros(0),
+        np.array(
+            [[getattr(plan, name) for name in _INTEGER_FIELDS] for plan in planned], dtype=np.int64
+        ),
         np.array([(plan.beta, plan.target_rms) for plan in planned]),
         np.array([_pad_schedule(plan.mutation_starts, longest) for plan in planned]),
         np.array([_pad_schedule(plan.mutation_rates, longest) for plan in planned]),
-    )  # fmt: skip
+    )
     ways = make_routes([plan.bits for plan in planned], algorithm.migration, algorithm.population)
     room = _MOST_MIGRANTS // max(1, len(ways.edges) * ways.most_migrants)
     borders = (
         1 if is_warm else max(1, min(_MOST_BORDERS, room))
     )  # a warm one's history is looked at
     return SearchPlan(
-        plans, ways, make_stopping_rule(algorithm, is_warm=is_warm), get_border_interval(algorithm, is_warm=is_warm),
-        algorithm.migration.every, borders,
-    )  # fmt: skip
+        plans,
+        ways,
+        make_stopping_rule(algorithm, is_warm=is_warm),
+        get_border_interval(algorithm, is_warm=is_warm),
+        algorithm.migration.every,
+        borders,
+    )
 
 
 def evolve_islands(
-    evaluator: Evaluator, way: SearchPlan, islands: Sequence[Island], generation: int, epoch: int,
+    evaluator: Evaluator,
+    way: SearchPlan,
+    islands: Sequence[Island],
+    generation: int,
+    epoch: int,
     budget: int,
-) -> ArchipelagoState:  # fmt: skip
+) -> ArchipelagoState:
     """The islands of a run after at most `budget` generations of all of them together.
 
     Parameters
@@ -163,9 +183,10 @@ def evolve_islands(
     """
     fleet, edges = pack_islands(islands), len(way.routes.edges)
     news = allocate_log(
-        budget + way.most_borders * (len(islands) + edges), way.most_borders * edges * way.routes.most_migrants,
+        budget + way.most_borders * (len(islands) + edges),
+        way.most_borders * edges * way.routes.most_migrants,
         fleet.champions.shape[1],
-    )  # fmt: skip
+    )
     at, epoch, has_crossed = _run_epochs(evaluator, way, fleet, generation, epoch, budget, news)
     return ArchipelagoState(
         unpack_islands(fleet, news, islands), list_migrants(news), at, epoch, has_crossed
@@ -181,9 +202,23 @@ def unpack_plan(plans: PackedPlans, i: int) -> IslandPlan:
     """The plan of one island."""
     own, floats = plans.integers[i], plans.floats[i]
     return IslandPlan(
-        plans.seed, own[0], own[1], plans.population, own[2], own[3], own[4], own[5], own[6], own[7],
-        floats[0], floats[1], plans.loss_scale, plans.mutation_starts[i], plans.mutation_rates[i], plans.progress,
-    )  # fmt: skip
+        plans.seed,
+        own[0],
+        own[1],
+        plans.population,
+        own[2],
+        own[3],
+        own[4],
+        own[5],
+        own[6],
+        own[7],
+        floats[0],
+        floats[1],
+        plans.loss_scale,
+        plans.mutation_starts[i],
+        plans.mutation_rates[i],
+        plans.progress,
+    )
 
 
 @jit_compile
@@ -194,9 +229,14 @@ def compute_next_border(generation: int, step: int, every: int, generations_: in
 
 @jit_compile
 def _run_epochs(
-    evaluator: Evaluator, way: SearchPlan, fleet: PackedIslands, generation: int, epoch: int, budget: int,
+    evaluator: Evaluator,
+    way: SearchPlan,
+    fleet: PackedIslands,
+    generation: int,
+    epoch: int,
+    budget: int,
     news: EvolutionLog,
-) -> tuple[int, int, bool]:  # fmt: skip
+) -> tuple[int, int, bool]:
     """Go on in place; gives the last border, the migrations and whether it was passed just now."""
     for _ in range(way.most_borders):
         target = compute_next_border(

@@ -49,8 +49,9 @@ def make_routes(bits: Sequence[int], migration: Migration, largest: int) -> Migr
     pairs = list_edges(migration.topology, len(bits))
     return MigrationRoutes(
         np.array(pairs, dtype=np.int64).reshape(len(pairs), 2),
-        np.array(bits, dtype=np.int64), min(migration.migrants, largest),
-    )  # fmt: skip
+        np.array(bits, dtype=np.int64),
+        min(migration.migrants, largest),
+    )
 
 
 def migrate(

@@ -86,19 +86,26 @@ def unpack_islands(
     ends = fleet.offsets.tolist()
     return tuple(
         Island(
-            island.index, island.seed, fleet.chromosomes[begin:end], fleet.fitness[begin:end],
-            fleet.search[i, ...], fleet.points[i], (*island.history, *better[i]),
+            island.index,
+            island.seed,
+            fleet.chromosomes[begin:end],
+            fleet.fitness[begin:end],
+            fleet.search[i, ...],
+            fleet.points[i],
+            (*island.history, *better[i]),
         )
         for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))
-    )  # fmt: skip
+    )
 
 
 def allocate_log(improvements: int, migrants: int, n: int) -> EvolutionLog:
     """Room for so many improvements of n parameters and so many migrants."""
     return EvolutionLog(
-        np.empty((improvements, COLUMN_VALUES + n)), np.empty(improvements, dtype=np.int64),
-        np.empty((migrants, 4)), np.zeros(2, dtype=np.int64),
-    )  # fmt: skip
+        np.empty((improvements, COLUMN_VALUES + n)),
+        np.empty(improvements, dtype=np.int64),
+        np.empty((migrants, 4)),
+        np.zeros(2, dtype=np.int64),
+    )
 
 
 def list_migrants(news: EvolutionLog) -> tuple[Migrant, ...]:

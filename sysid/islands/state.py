@@ -61,8 +61,9 @@ class RunState:
         most = self.rms * (1.0 + SAME_OPTIMUM)
         return any(
             one.rms <= most and one.generation <= generation
-            for history in self.history for one in history
-        )  # fmt: skip
+            for history in self.history
+            for one in history
+        )
 
     @property
     def history(self) -> tuple[tuple[Improvement, ...], ...]:

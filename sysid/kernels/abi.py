@@ -27,8 +27,17 @@ LANES = 16
 NARROW_LANES = 8
 """The same where no more are left: a block of so many takes two thirds of the time."""
 
-KERNEL_ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
-             "predictions_stride", "loss")  # fmt: skip
+KERNEL_ARGUMENTS = (
+    "P",
+    "theta",
+    "stride",
+    "ints",
+    "floats",
+    "work",
+    "predictions",
+    "predictions_stride",
+    "loss",
+)
 _INTEGER_ARGUMENTS = ("P", "stride", "predictions_stride")
 
 
@@ -60,9 +69,17 @@ def _call_kernel(
     predictions go to the rows from `first_row`. `predictions` without rows: none are stored.
     """
     signature = types.void(
-        types.int64, theta, ints, types.int64, floats, types.int64, work, predictions,
-        types.int64, loss,
-    )  # fmt: skip
+        types.int64,
+        theta,
+        ints,
+        types.int64,
+        floats,
+        types.int64,
+        work,
+        predictions,
+        types.int64,
+        loss,
+    )
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         arrays = {
@@ -82,9 +99,16 @@ def _call_kernel(
         first = shifted(7, builder.mul(values[8], columns))
         target = builder.select(none, first.type(None), first)
         arguments = [
-            stride, arrays[1].data, stride, shifted(2, values[3]), shifted(4, values[5]),
-            arrays[6].data, target, columns, arrays[9].data,
-        ]  # fmt: skip
+            stride,
+            arrays[1].data,
+            stride,
+            shifted(2, values[3]),
+            shifted(4, values[5]),
+            arrays[6].data,
+            target,
+            columns,
+            arrays[9].data,
+        ]
         integers = ir.FunctionType(ir.VoidType(), [a.type for a in arguments])
         function = builder.inttoptr(values[0], integers.as_pointer())
         builder.call(function, arguments)

@@ -44,9 +44,15 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
         [quantity.name for quantity in model.states],
         [output.expression for output in model.outputs],
         [parameter.name for parameter in model.parameters],
-        model.equations, starts, model.order, model.memory,
-        replace(model.solver, step=None), variant, describe_machine(), _digest_emitters(),
-    )  # fmt: skip
+        model.equations,
+        starts,
+        model.order,
+        model.memory,
+        replace(model.solver, step=None),
+        variant,
+        describe_machine(),
+        _digest_emitters(),
+    )
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 

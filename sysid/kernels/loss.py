@@ -14,9 +14,14 @@ class LossAccumulator:
     """Sums the loss at each grid point and stores predictions where they are asked for."""
 
     def __init__(
-        self, lanes: VectorBuilder, model: Model, variant: KernelVariant, experiment: ExperimentHead,
-        arguments: dict[str, IrValue], first: IrValue,
-    ) -> None:  # fmt: skip
+        self,
+        lanes: VectorBuilder,
+        model: Model,
+        variant: KernelVariant,
+        experiment: ExperimentHead,
+        arguments: dict[str, IrValue],
+        first: IrValue,
+    ) -> None:
         self._lanes, self._model, self._variant = lanes, model, variant
         self._experiment, self._arguments, self._column = experiment, arguments, first
         b = lanes.builder

@@ -237,9 +237,14 @@ class SignalReaders:
     """Readers of all lagged signals of a model, and the inputs without lag."""
 
     def __init__(
-        self, lanes: VectorBuilder, model: Model, experiment: ExperimentHead, states: States, lags: Delays,
+        self,
+        lanes: VectorBuilder,
+        model: Model,
+        experiment: ExperimentHead,
+        states: States,
+        lags: Delays,
         fresh: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
         self._inputs = {quantity.name: i for i, quantity in enumerate(model.inputs)}
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}

@@ -36,9 +36,17 @@ from sysid.models.ties import resolve_ties
 from sysid.models.units import check_delay_units
 
 _COMMON_FIELDS = (
-    "name", "title", "description", "source", "form", "inputs", "parameters", "constants",
-    "initial", "solver",
-)  # fmt: skip
+    "name",
+    "title",
+    "description",
+    "source",
+    "form",
+    "inputs",
+    "parameters",
+    "constants",
+    "initial",
+    "solver",
+)
 _FORMS = ("difference", "differential", "polynomial")
 _FIELDS = {
     "difference": (*_COMMON_FIELDS, "states", "equations", "outputs"),

@@ -113,8 +113,11 @@ def _read_share(reader: DocumentReader, written: object) -> float:
 def _read_term_count(reader: DocumentReader, keep: object, candidates: int, most: int) -> int:
     is_whole = isinstance(keep, int) and not isinstance(keep, bool)
     if is_whole and cast(int, keep) > most:
-        few = f"the document has {candidates} candidate terms" if most == candidates else (
-            f"a model may have {most} coefficients")  # fmt: skip
+        few = (
+            f"the document has {candidates} candidate terms"
+            if most == candidates
+            else (f"a model may have {most} coefficients")
+        )
         reader.add_fault("/terms/keep", f"found {keep}, but {few}; need 1 to {most}")
         return most
     return reader.read_whole_number(keep, "/terms/keep", 1, most)

@@ -100,11 +100,13 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
     _check_duration(float(times[-1]) - float(times[0]))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
         found = _simulate_samples(_ActuatorState(actuator), supply)
-    return Recording((
-        Channel("P_a", times, values, "Pa", supply.hold),
-        Channel("theta", times, found[:, 0].copy(), "rad"),
-        Channel("P", times, found[:, 1].copy(), "Pa"),
-    ))  # fmt: skip
+    return Recording(
+        (
+            Channel("P_a", times, values, "Pa", supply.hold),
+            Channel("theta", times, found[:, 0].copy(), "rad"),
+            Channel("P", times, found[:, 1].copy(), "Pa"),
+        )
+    )
 
 
 def _check_duration(duration: float) -> None:

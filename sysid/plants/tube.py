@@ -70,9 +70,14 @@ class Tube:
     modes: int = 0
 
     def __post_init__(self) -> None:
-        ranges = {"length_m": (0.5, 2000.0), "bore_m": (5e-4, 0.1), "volume_m3": (0.0, 1.0),
-                  "temperature": (150.0, 600.0), "cells": (0, 5000),
-                  "modes": (0, 50)}  # fmt: skip
+        ranges = {
+            "length_m": (0.5, 2000.0),
+            "bore_m": (5e-4, 0.1),
+            "volume_m3": (0.0, 1.0),
+            "temperature": (150.0, 600.0),
+            "cells": (0, 5000),
+            "modes": (0, 50),
+        }
         for name, (least, most) in ranges.items():
             value = getattr(self, name)
             if not (isfinite(value) and least <= value <= most):
@@ -138,10 +143,12 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
             "changes of pressure"
         )
     ends = found - ATMOSPHERE
-    return Recording((
-        Channel("P1", times, ends[:, 0].copy(), "Pa"),
-        Channel("P2", times, ends[:, 1].copy(), "Pa"),
-    ))  # fmt: skip
+    return Recording(
+        (
+            Channel("P1", times, ends[:, 0].copy(), "Pa"),
+            Channel("P2", times, ends[:, 1].copy(), "Pa"),
+        )
+    )
 
 
 def _count_substeps(tube: Tube, samples: int, period: float) -> int:
@@ -172,9 +179,13 @@ def _check_inlet_period(inlet: Channel) -> float:
 
 @jit_compile
 def _simulate_flow(
-    geometry: FloatArray, zeros: FloatArray, command: FloatArray, substeps: int, n: int,
+    geometry: FloatArray,
+    zeros: FloatArray,
+    command: FloatArray,
+    substeps: int,
+    n: int,
     regulator: bool,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Pressures (samples, 2) in Pa at both ends."""
     bore, wall, dt = geometry[1], geometry[3], geometry[4]
     gas = np.empty((3, n + 1))  # pressure, density, temperature at the nodes
@@ -297,9 +308,15 @@ def _step_balances(
 
 @jit_compile
 def _apply_boundary_layer(
-    zeros: FloatArray, gas: FloatArray, i: int, dt: float, bore: float, gain: float,
-    warmed: FloatArray, part: float,
-) -> float:  # fmt: skip
+    zeros: FloatArray,
+    gas: FloatArray,
+    i: int,
+    dt: float,
+    bore: float,
+    gain: float,
+    warmed: FloatArray,
+    part: float,
+) -> float:
     """Gain of pressure with the heat that a laminar boundary layer takes; part of a cell is tube.
 
     With ζ² = Pr·s·r²/ν, 2 I₁(ζ)/(ζ I₀(ζ)) is the sum of 4/(ζ² + j²) over the zeros j of J₀.
@@ -372,10 +389,12 @@ def simulate_tube_record(tube: Tube, pattern: int, samples: int, period: float) 
     times = np.arange((samples - 1) * finer + 1, dtype=np.float64) * (period / finer)
     command = Channel("P1", times, build_excitation(pattern, tube.length_m, times), "Pa")
     whole = simulate_tube(tube, command, regulator=True)
-    return Recording(tuple(
-        replace(one, times=one.times[::finer].copy(), values=one.values[::finer].copy())
-        for one in whole.channels
-    ))  # fmt: skip
+    return Recording(
+        tuple(
+            replace(one, times=one.times[::finer].copy(), values=one.values[::finer].copy())
+            for one in whole.channels
+        )
+    )
 
 
 def _generate_binary_sequence(count: int) -> FloatArray:

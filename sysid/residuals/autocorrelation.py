@@ -131,9 +131,11 @@ def compute_lagged_sums(
     """The sums over these lags, or why there are none."""
     floats = (laid.times, channel.times, channel.values, lags)
     shifted = _build_lagged_inputs(
-        laid.present.tobytes(), laid.period, channel.hold,
+        laid.present.tobytes(),
+        laid.period,
+        channel.hold,
         *(np.asarray(one, dtype=np.float64).tobytes() for one in floats),
-    )  # fmt: skip
+    )
     if isinstance(shifted, str):
         return shifted
     columns, sizes, known = shifted
@@ -147,9 +149,14 @@ def compute_lagged_sums(
 
 @lru_cache(maxsize=2)
 def _build_lagged_inputs(
-    present: bytes, period: float, hold: Hold, times: bytes, moments: bytes, values: bytes,
+    present: bytes,
+    period: float,
+    hold: Hold,
+    times: bytes,
+    moments: bytes,
+    values: bytes,
     lags: bytes,
-) -> tuple[FloatArray, FloatArray, BoolArray] | str:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, BoolArray] | str:
     """The lagged input without its mean (n, N), the lengths (n,), and which samples are known.
 
     Or why there is none. Kept for the runs of a sweep, whose residuals alone differ. The bytes are

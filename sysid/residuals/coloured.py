@@ -176,9 +176,12 @@ def _combine_series(each: Sequence[ColouredCovariance], used: FloatArray) -> Col
     grown = lost * (max(total - size, 1.0) / total)
     middles = [by * one.middle for one, by in zip(each, grown.tolist(), strict=True)]
     return ColouredCovariance(
-        np.sum(middles, axis=0), total, any(one.is_drifting for one in each),
-        series=tuple(zip(middles, degrees.tolist(), strict=True)), models=models,
-    )  # fmt: skip
+        np.sum(middles, axis=0),
+        total,
+        any(one.is_drifting for one in each),
+        series=tuple(zip(middles, degrees.tolist(), strict=True)),
+        models=models,
+    )
 
 
 def _have_unequal_variances(series: Sequence[FloatArray]) -> bool:

@@ -83,9 +83,10 @@ def estimate_joint_covariance(
         middle = (vectors * np.maximum(size, 0.0)) @ vectors.T
     counted = 1.0 / (1.0 + twice / seen.size)
     return whole._replace(
-        middle=middle, equivalent_samples=whole.equivalent_samples * counted,
+        middle=middle,
+        equivalent_samples=whole.equivalent_samples * counted,
         series=tuple((one, max(counted * degrees, 1.0)) for one, degrees in whole.series),
-    )  # fmt: skip
+    )
 
 
 def _find_correlated_pairs(problem: Problem, seen: FloatArray) -> Iterator[_CorrelatedPair]:

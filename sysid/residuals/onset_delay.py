@@ -146,8 +146,13 @@ def _estimate_pair_delay(
     known = np.isfinite(then.values)
     times, values = then.times[known], then.values[known]
     if np.any(np.diff(times) <= 0):
-        return OnsetDelay(number, first.name, then.name, None,
-                          reason="several samples share a time: repeats were pooled")  # fmt: skip
+        return OnsetDelay(
+            number,
+            first.name,
+            then.name,
+            None,
+            reason="several samples share a time: repeats were pooled",
+        )
     events = list(_find_input_events(first))
     if not events:
         reason = "the input does not rest before it moves"
@@ -186,9 +191,12 @@ def _thin_events(events: Sequence[_InputEvent]) -> Sequence[_InputEvent]:
 
 
 def _find_event_onsets(
-    event: _InputEvent, first: Channel, output: tuple[FloatArray, FloatArray],
-    noise: tuple[float, float], notable: float,
-) -> tuple[_Onset, _Onset] | None:  # fmt: skip
+    event: _InputEvent,
+    first: Channel,
+    output: tuple[FloatArray, FloatArray],
+    noise: tuple[float, float],
+    notable: float,
+) -> tuple[_Onset, _Onset] | None:
     """Onsets of input and output at one event; None if one is not clear."""
     held = first.hold == "zero"
     moved = _find_onset(first.times, first.values, event, noise[0], held=held)

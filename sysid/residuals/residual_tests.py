@@ -142,9 +142,11 @@ class ResidualSeries(NamedTuple):
 
 
 def run_residual_tests(
-    problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"],
+    problem: "Problem",
+    simulated: FloatArray,
+    data: Literal["estimation", "validation"],
     correlation_times: Mapping[str, float] | None = None,
-) -> ResidualTests:  # fmt: skip
+) -> ResidualTests:
     """Test the residuals of simulated values (M,) on the records of a problem.
 
     Of an output whose noise has a correlation time (s) they are whitened first.
@@ -171,9 +173,12 @@ def list_residual_series(
 ) -> list[ResidualSeries]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
     parts = zip(
-        problem.records, problem.split_by_output(simulated), problem.split_by_output(problem.evaluator.measured),
-        problem.split_by_output(problem.evaluator.weight), strict=True,
-    )  # fmt: skip
+        problem.records,
+        problem.split_by_output(simulated),
+        problem.split_by_output(problem.evaluator.measured),
+        problem.split_by_output(problem.evaluator.weight),
+        strict=True,
+    )
     names = {one.name for one in problem.model.inputs}
     found = []
     for number, (record, model, measured, weight) in enumerate(parts):
@@ -182,18 +187,32 @@ def list_residual_series(
         for output in (one.name for one in problem.model.outputs):
             factor = problem.output_weights[output]
             found.append(
-                make_residual_series(number, output, times[output], factor * measured[output],
-                       factor * model[output], weight[output] > 0, inputs, problem.loss_scale,
-                       (correlation_times or {}).get(output, 0.0))
-            )  # fmt: skip
+                make_residual_series(
+                    number,
+                    output,
+                    times[output],
+                    factor * measured[output],
+                    factor * model[output],
+                    weight[output] > 0,
+                    inputs,
+                    problem.loss_scale,
+                    (correlation_times or {}).get(output, 0.0),
+                )
+            )
     return found
 
 
 def make_residual_series(
-    experiment: int, output: str, times: FloatArray, measured: FloatArray, simulated: FloatArray,
-    scored: BoolArray, inputs: tuple[Channel, ...], loss_scale: float = 0.0,
+    experiment: int,
+    output: str,
+    times: FloatArray,
+    measured: FloatArray,
+    simulated: FloatArray,
+    scored: BoolArray,
+    inputs: tuple[Channel, ...],
+    loss_scale: float = 0.0,
     correlation_time: float = 0.0,
-) -> ResidualSeries:  # fmt: skip
+) -> ResidualSeries:
     """Residuals from weighted outputs (N,); of a long record the last 20 000 scored samples.
 
     `loss_scale` is that of a soft-l1 loss, 0 with squares; `correlation_time` (s) that of the
@@ -271,9 +290,13 @@ def _test_whiteness(
     test = _make_test(one, "whiteness", None, values / deviation, statistic, degrees, level)
     band = np.concatenate([[0.0], deviation])
     return CorrelationFunction(
-        test, laid.period if laid.is_regular else None, np.arange(0.0, laid.n_lags + 1),
-        np.concatenate([[1.0], values]), _BAND95 * band, _BAND99 * band,
-    )  # fmt: skip
+        test,
+        laid.period if laid.is_regular else None,
+        np.arange(0.0, laid.n_lags + 1),
+        np.concatenate([[1.0], values]),
+        _BAND95 * band,
+        _BAND99 * band,
+    )
 
 
 def _test_independence(
@@ -304,30 +327,48 @@ def _test_independence(
         parts = [past] if isinstance(future, str) else [future, past]
     band = np.concatenate([part.deviation / part.norm for part in parts])
     return CorrelationFunction(
-        test, laid.period, np.concatenate([part.lags for part in parts]),
-        np.concatenate([part.sums / part.norm for part in parts]), _BAND95 * band, _BAND99 * band,
-    )  # fmt: skip
+        test,
+        laid.period,
+        np.concatenate([part.lags for part in parts]),
+        np.concatenate([part.sums / part.norm for part in parts]),
+        _BAND95 * band,
+        _BAND99 * band,
+    )
 
 
 def _make_test(
-    one: ResidualSeries, kind: ResidualTestKind, channel: str | None, scaled: FloatArray, statistic: float,
-    degrees: float, level: float,
-) -> ResidualTest:  # fmt: skip
+    one: ResidualSeries,
+    kind: ResidualTestKind,
+    channel: str | None,
+    scaled: FloatArray,
+    statistic: float,
+    degrees: float,
+    level: float,
+) -> ResidualTest:
     p = float(chdtrc(degrees, statistic))
     size = np.abs(scaled)
     return ResidualTest(
-        one.experiment, one.output, kind, channel, "passed" if p >= level else "failed",
-        int(np.count_nonzero(one.scored)), scaled.size,
+        one.experiment,
+        one.output,
+        kind,
+        channel,
+        "passed" if p >= level else "failed",
+        int(np.count_nonzero(one.scored)),
+        scaled.size,
         np.count_nonzero(size <= _BAND95) / size.size,
-        np.count_nonzero(size <= _BAND99) / size.size, statistic, degrees, p,
-    )  # fmt: skip
+        np.count_nonzero(size <= _BAND99) / size.size,
+        statistic,
+        degrees,
+        p,
+    )
 
 
 def _make_untested(
     one: ResidualSeries, kind: ResidualTestKind, channel: str | None, reason: str
 ) -> CorrelationFunction:
     samples = int(np.count_nonzero(one.scored))
-    test = ResidualTest(one.experiment, one.output, kind, channel, "not tested", samples,
-                        reason=reason)  # fmt: skip
+    test = ResidualTest(
+        one.experiment, one.output, kind, channel, "not tested", samples, reason=reason
+    )
     none = np.zeros(0)
     return CorrelationFunction(test, None, none, none, none, none)

@@ -89,10 +89,19 @@ def fit_noise_colour(laid: SpacedResiduals, columns: FloatArray) -> NoiseColourM
     if values.size <= basis.shape[1] + 2:
         return None
     found = [
-        minimize(_compute_deviance, start, (series,), method="Nelder-Mead",
-                 options={"maxfev": _MOST_EVALUATIONS, "xatol": _SEARCH_TOLERANCE, "fatol": _SEARCH_TOLERANCE})
+        minimize(
+            _compute_deviance,
+            start,
+            (series,),
+            method="Nelder-Mead",
+            options={
+                "maxfev": _MOST_EVALUATIONS,
+                "xatol": _SEARCH_TOLERANCE,
+                "fatol": _SEARCH_TOLERANCE,
+            },
+        )
         for start in _SEARCH_STARTS
-    ]  # fmt: skip
+    ]
     best = min(found, key=lambda one: float(one.fun)).x
     innovations, power, _ = _compute_innovations(best, series)
     if not power > 0 or not _are_white(innovations):

@@ -63,9 +63,14 @@ def find_odd_increment(losses: FloatArray) -> tuple[int, float]:
 
 @jit_compile
 def _evaluate_line(
-    evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
-    first: float, last: float, most: float,
-) -> FloatArray:  # fmt: skip
+    evaluator: Evaluator,
+    factor: FloatArray,
+    point: FloatArray,
+    direction: FloatArray,
+    first: float,
+    last: float,
+    most: float,
+) -> FloatArray:
     """Squared fitness, `most` at most, at equal distances on a line through the point."""
     places, deviation = np.empty((LINE_PLACES, point.size)), np.empty(point.size)
     for p in range(LINE_PLACES):
@@ -77,9 +82,13 @@ def _evaluate_line(
 
 @jit_compile
 def has_discontinuity(
-    evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
-    base: float, search: SearchRecord,
-) -> bool:  # fmt: skip
+    evaluator: Evaluator,
+    factor: FloatArray,
+    point: FloatArray,
+    direction: FloatArray,
+    base: float,
+    search: SearchRecord,
+) -> bool:
     """Whether the loss jumps on a line through a point (D,), in at most `MOST_LINE_SIMULATIONS` simulations.
 
     Parameters

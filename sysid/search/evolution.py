@@ -90,8 +90,14 @@ def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
 
 
 @jit_compile
-def _breed_child(plan: IslandPlan, places: FloatArray, parents: WordArray, generation: int, p: int,
-           word: WordArray) -> None:  # fmt: skip
+def _breed_child(
+    plan: IslandPlan,
+    places: FloatArray,
+    parents: WordArray,
+    generation: int,
+    p: int,
+    word: WordArray,
+) -> None:
     """Write child `p`: by crossover, or by a difference of parents (differential evolution)."""
     bits, n = plan.bits, word.size
     drawn = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)

@@ -118,9 +118,15 @@ class LeastSquaresSolution:
 
 
 def solve_least_squares(
-    scored: ScoredSamples, place: FloatArray, scale: float, *, steps: int, at_once: int,
-    tolerance: float = 1e-10, is_late: Callable[[], bool] | None = None,
-) -> LeastSquaresSolution:  # fmt: skip
+    scored: ScoredSamples,
+    place: FloatArray,
+    scale: float,
+    *,
+    steps: int,
+    at_once: int,
+    tolerance: float = 1e-10,
+    is_late: Callable[[], bool] | None = None,
+) -> LeastSquaresSolution:
     """The local minimum that Levenberg-Marquardt finds from a place (D,).
 
     Parameters

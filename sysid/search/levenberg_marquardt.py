@@ -125,8 +125,9 @@ def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
 
 
 @jit_compile
-def write_damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
-                place: FloatArray) -> float:  # fmt: skip
+def write_damped_step(
+    matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float, place: FloatArray
+) -> float:
     """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
 
     Gives −gᵀ of what is left of the step there: its promised gain, in the loss's linear part.

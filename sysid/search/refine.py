@@ -82,9 +82,13 @@ def refine_candidate(
 
 
 def _refine_place(
-    problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int,
+    problem: Problem,
+    start: FloatArray,
+    place: FloatArray,
+    rms: float,
+    left: int,
     is_late: Callable[[], bool] | None = None,
-) -> RefinedCandidate:  # fmt: skip
+) -> RefinedCandidate:
     """Least squares from one start; the search may use `left` simulations.
 
     Residuals are in units of about the outputs' scale, so that the tolerances of the search and
@@ -96,9 +100,13 @@ def _refine_place(
     steps = min(_MOST_STEPS, (left - _END_EVALUATIONS) // (place.size + N_TRIED))
     at_once = steps_at_once(place.size, problem.n_steps)
     solved = solve_least_squares(
-        ScoredSamples(evaluator, rows, evaluator.weight[rows] / unit), place, problem.loss_scale / unit,
-        steps=steps, at_once=at_once, is_late=is_late,
-    )  # fmt: skip
+        ScoredSamples(evaluator, rows, evaluator.weight[rows] / unit),
+        place,
+        problem.loss_scale / unit,
+        steps=steps,
+        at_once=at_once,
+        is_late=is_late,
+    )
     theta, reached = _snap_to_bounds(evaluator, solved.place)
     if reached > rms:
         theta, reached = start, rms

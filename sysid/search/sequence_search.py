@@ -38,8 +38,9 @@ def _draw_signs(plan: IslandPlan, generation: int, proposal: int, signs: IntArra
 
 
 @jit_compile
-def _propose_neighbours(evaluator: Evaluator, plan: IslandPlan, champion: FloatArray, n: int,
-               generation: int) -> FloatArray:  # fmt: skip
+def _propose_neighbours(
+    evaluator: Evaluator, plan: IslandPlan, champion: FloatArray, n: int, generation: int
+) -> FloatArray:
     """Physical values of `n` neighbours of the champion."""
     theta = np.empty((n, champion.size))
     signs = np.zeros(champion.size, np.int64)

@@ -45,9 +45,14 @@ class FreeRunSelection(NamedTuple):
 
 
 def select_by_free_run(
-    model: Model, rule: TermRule, records: Sequence[Record], changes: ParameterChanges, skip: int,
-    first: Sequence[int], lags: Mapping[str, float],
-) -> FreeRunSelection | None:  # fmt: skip
+    model: Model,
+    rule: TermRule,
+    records: Sequence[Record],
+    changes: ParameterChanges,
+    skip: int,
+    first: Sequence[int],
+    lags: Mapping[str, float],
+) -> FreeRunSelection | None:
     """The terms that explain most of the free run, beginning with those in `first` and `lags`.
 
     None if no free run with these stays finite.
@@ -104,11 +109,15 @@ def _fit_free_run(
     """Values of all parameters, those of terms not chosen zero, and the RMS of the free run."""
     names = {candidates.terms[i].coefficient_name for i in chosen}
     absent = {
-        one.name: {"lower": min(one.lower, -1.0), "upper": max(one.upper, 1.0),
-                   "scale": "linear", "fixed": 0.0}
+        one.name: {
+            "lower": min(one.lower, -1.0),
+            "upper": max(one.upper, 1.0),
+            "scale": "linear",
+            "fixed": 0.0,
+        }
         for one in candidates.parameters
         if one.name.startswith("a[") and one.name not in names
-    }  # fmt: skip
+    }
     part = whole.rebuild(parameters={**changes, **absent})
     starts = find_equation_error_starts(part, GeneticAlgorithm()).values
     if not starts:
@@ -154,9 +163,12 @@ def _factor_slopes(whole: Problem, values: Mapping[str, float]) -> FloatArray:
 
 
 def _order_terms(
-    whole: Problem, triangle: FloatArray, chosen: Sequence[int], values: Mapping[str, float],
+    whole: Problem,
+    triangle: FloatArray,
+    chosen: Sequence[int],
+    values: Mapping[str, float],
     rms: float,
-) -> FreeRunSelection:  # fmt: skip
+) -> FreeRunSelection:
     """The chosen terms in the order in which they explain most."""
     terms = whole.model.terms
     found = select_forward(triangle, len(chosen), among=chosen)

@@ -79,9 +79,12 @@ class Regression:
 
     @classmethod
     def from_experiments(
-        cls, model: Model, records: Sequence[Record], experiments: Sequence[GridExperiment],
+        cls,
+        model: Model,
+        records: Sequence[Record],
+        experiments: Sequence[GridExperiment],
         parameters: Sequence[Parameter],
-    ) -> "Regression":  # fmt: skip
+    ) -> "Regression":
         """The regression on records that are laid out already."""
         spans = {one.name: get_interval(one) for one in parameters}
         pairs = zip(records, experiments, strict=True)
@@ -105,9 +108,11 @@ class Regression:
         )
 
     def factor_terms(
-        self, terms: Sequence[Term], lags: Mapping[str, float],
+        self,
+        terms: Sequence[Term],
+        lags: Mapping[str, float],
         simulated: Sequence[FloatArray] | None = None,
-    ) -> tuple[FloatArray, int]:  # fmt: skip
+    ) -> tuple[FloatArray, int]:
         """R of the QR decomposition of [terms, y], (M + 1, M + 1), and the number of rows.
 
         With `simulated`, one output at the grid points for each experiment, of [the terms of

@@ -75,9 +75,12 @@ def select_model_terms(
 
 
 def _select_one_step(
-    model: Model, rule: TermRule, records: Sequence[Record],
-    parameters: Sequence[Parameter], skip: int,
-) -> tuple[ForwardSelection, dict[str, float], list[float], int]:  # fmt: skip
+    model: Model,
+    rule: TermRule,
+    records: Sequence[Record],
+    parameters: Sequence[Parameter],
+    skip: int,
+) -> tuple[ForwardSelection, dict[str, float], list[float], int]:
     regression = Regression.from_records(model, records, parameters, skip)
     check_candidate_count(len(model.terms), regression.most_rows)
     values = list_lag_values(model, parameters, regression.experiments[0].period)

@@ -82,8 +82,11 @@ class _StartFinder:
         self._axes = list_lag_values(model, own, self._regression.experiments[0].period)
         fixed = {one.name: one.fixed for one in own if one.fixed is not None}
         self._terms = tuple(t for t in model.terms if fixed.get(t.coefficient_name) != 0.0)
-        self._given = {i: fixed[t.coefficient_name] for i, t in enumerate(self._terms)
-                       if t.coefficient_name in fixed}  # fmt: skip
+        self._given = {
+            i: fixed[t.coefficient_name]
+            for i, t in enumerate(self._terms)
+            if t.coefficient_name in fixed
+        }
         self._sought = [i for i in range(len(self._terms)) if i not in self._given]
         rows = int(_MOST_OPERATIONS / (2 * (2 * len(self._terms) + 1) ** 2))
         self._rows = self._regression.thin_rows(max(rows, 20 * len(self._terms)))
@@ -178,8 +181,11 @@ class _StartFinder:
             target = both[:size, -1:]
             instruments = np.column_stack([both[:size, size:-1], target])
             regressors = np.column_stack([both[:size, :size], target])
-            solutions = [self._solve_coefficients(t, ridge=r) for t in (instruments, regressors)
-                         for r in (0.0, _RIDGES[1])]  # fmt: skip
+            solutions = [
+                self._solve_coefficients(t, ridge=r)
+                for t in (instruments, regressors)
+                for r in (0.0, _RIDGES[1])
+            ]
             tried = self._evaluate_starts([(lags, one) for one in solutions])
             found += tried
             value, start = min(tried, key=lambda one: one[0], default=(np.inf, start))

@@ -91,10 +91,17 @@ def _run_kernels(
     work = np.empty(evaluator.n_work)
     for e in range(evaluator.offsets.shape[0]):
         call_kernel(
-            evaluator.kernel, full,
-            ints, evaluator.offsets[e, 0], evaluator.floats, evaluator.offsets[e, 1],
-            work, predictions, evaluator.offsets[e, 2], loss,
-        )  # fmt: skip
+            evaluator.kernel,
+            full,
+            ints,
+            evaluator.offsets[e, 0],
+            evaluator.floats,
+            evaluator.offsets[e, 1],
+            work,
+            predictions,
+            evaluator.offsets[e, 2],
+            loss,
+        )
     return loss
 
 

@@ -104,10 +104,15 @@ def _compute_reciprocal_deviation(name: str, records: Sequence[Record], skip: in
 
 
 def place_on_grid(
-    model: Model, record: Record, experiment: int, parameters: Sequence[Parameter],
-    weights: Mapping[str, float], skip: int, simulates_only: bool = False,
+    model: Model,
+    record: Record,
+    experiment: int,
+    parameters: Sequence[Parameter],
+    weights: Mapping[str, float],
+    skip: int,
+    simulates_only: bool = False,
     scored_from: float = -np.inf,
-) -> GridExperiment:  # fmt: skip
+) -> GridExperiment:
     """Lay one record out for a model; samples before `scored_from` (s) are not scored.
 
     Raises
@@ -139,9 +144,15 @@ def place_on_grid(
 
 
 def replace_outputs(
-    laid: GridExperiment, model: Model, record: Record, experiment: int,
-    parameters: Sequence[Parameter], weights: Mapping[str, float], skip: int, scored_from: float,
-) -> GridExperiment:  # fmt: skip
+    laid: GridExperiment,
+    model: Model,
+    record: Record,
+    experiment: int,
+    parameters: Sequence[Parameter],
+    weights: Mapping[str, float],
+    skip: int,
+    scored_from: float,
+) -> GridExperiment:
     """What `place_on_grid` makes of a record whose inputs and times are those of one laid out before."""
     outputs, grid = _select_outputs(model, record, (skip, scored_from)), laid.grid
     since = _find_scoring_starts(model, grid, scored_from)
@@ -221,8 +232,9 @@ def _make_samples(
 ) -> OutputSamples:
     weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
     values = np.where(np.isfinite(channel.values), channel.values, 0.0)
-    return OutputSamples(locate_samples(grid, model, channel), values, weights,
-                   _interpolate_to_grid(grid, channel))  # fmt: skip
+    return OutputSamples(
+        locate_samples(grid, model, channel), values, weights, _interpolate_to_grid(grid, channel)
+    )
 
 
 def _interpolate_to_grid(grid: Grid, channel: Channel) -> FloatArray:
@@ -239,9 +251,8 @@ def _interpolate_measurement(times: FloatArray, channel: Channel) -> FloatArray:
 
 
 def _make_starts(
-    model: Model, grid: Grid, outputs: Sequence[Channel], experiment: int,
-    rows: Mapping[str, int],
-) -> list[StateStart]:  # fmt: skip
+    model: Model, grid: Grid, outputs: Sequence[Channel], experiment: int, rows: Mapping[str, int]
+) -> list[StateStart]:
     starts = []
     for i, initial in enumerate(model.initial):
         if isinstance(initial, FixedInitial):

@@ -97,9 +97,15 @@ def interpolate_inputs(
 
 
 def pack_experiment(
-    model: Model, variant: KernelVariant, grid: Grid, inputs: Sequence[FineInput],
-    outputs: Sequence[OutputSamples], starts: Sequence[StateStart], lag: float, scale: float,
-) -> PackedExperiment:  # fmt: skip
+    model: Model,
+    variant: KernelVariant,
+    grid: Grid,
+    inputs: Sequence[FineInput],
+    outputs: Sequence[OutputSamples],
+    starts: Sequence[StateStart],
+    lag: float,
+    scale: float,
+) -> PackedExperiment:
     """Lay out one experiment.
 
     Parameters
@@ -120,8 +126,15 @@ def pack_experiment(
         page.write_entries("state", i, row=start.row, given=page.add_floats(start.first_values))
     for i, signal in enumerate(inputs):
         place = page.add_floats(signal.values)
-        page.write_entries("input", i, zero=place + signal.start_index, points=signal.points_per_step, begin=signal.begin,
-                 end=signal.end, cap=signal.max_delay)  # fmt: skip
+        page.write_entries(
+            "input",
+            i,
+            zero=place + signal.start_index,
+            points=signal.points_per_step,
+            begin=signal.begin,
+            end=signal.end,
+            cap=signal.max_delay,
+        )
     first = 0
     for i, samples in enumerate(outputs):
         add = _pack_grid_samples if variant.on_grid else _pack_scattered_samples
@@ -176,8 +189,13 @@ def _pack_grid_samples(
     rows[points] = first + np.arange(points.size)
     values, weights = np.zeros(grid.points), np.zeros(grid.points)
     values[points], weights[points] = samples.values, samples.weights
-    page.write_entries("output", i, samples=page.add_ints(rows), measured=page.add_floats(values),
-             weight=page.add_floats(weights))  # fmt: skip
+    page.write_entries(
+        "output",
+        i,
+        samples=page.add_ints(rows),
+        measured=page.add_floats(values),
+        weight=page.add_floats(weights),
+    )
 
 
 def _pack_scattered_samples(
@@ -187,9 +205,14 @@ def _pack_scattered_samples(
     interval = np.ceil(samples.places)
     fraction = samples.places - (interval - 1.0)
     bounds_ = np.searchsorted(interval, np.arange(grid.points + 1), side="left")
-    page.write_entries("output", i, samples=page.add_ints(bounds_.astype(np.int64)),
-             fraction=page.add_floats(fraction), measured=page.add_floats(samples.values),
-             weight=page.add_floats(samples.weights))  # fmt: skip
+    page.write_entries(
+        "output",
+        i,
+        samples=page.add_ints(bounds_.astype(np.int64)),
+        fraction=page.add_floats(fraction),
+        measured=page.add_floats(samples.values),
+        weight=page.add_floats(samples.weights),
+    )
 
 
 def are_on_grid(outputs: Sequence[OutputSamples]) -> bool:

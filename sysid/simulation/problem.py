@@ -188,10 +188,18 @@ class Problem:
         skip, since = self.settings.skip, self.settings.scored_from
         per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
         experiments = tuple(
-            replace_outputs(laid, self.model, record, e, self.all_parameters, per_output, skip,
-                          -np.inf if since is None else since[e])
+            replace_outputs(
+                laid,
+                self.model,
+                record,
+                e,
+                self.all_parameters,
+                per_output,
+                skip,
+                -np.inf if since is None else since[e],
+            )
             for e, (laid, record) in enumerate(zip(self.experiments, records, strict=True))
-        )  # fmt: skip
+        )
         evaluator = _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
         return replace(
             self,
@@ -310,19 +318,27 @@ def compute_reference_rms(
 def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
     found = []
     parts = zip(
-        problem.split_by_output(problem.evaluator.measured), problem.split_by_output(simulated),
-        problem.split_by_output(problem.evaluator.weight), strict=True,
-    )  # fmt: skip
+        problem.split_by_output(problem.evaluator.measured),
+        problem.split_by_output(simulated),
+        problem.split_by_output(problem.evaluator.weight),
+        strict=True,
+    )
     for experiment, (measured, model, weight) in enumerate(parts):
         for output in problem.model.outputs:
             scored = weight[output.name] > 0
             if np.any(scored):
                 y, computed = measured[output.name][scored], model[output.name][scored]
                 found.append(
-                    ChannelMetrics(experiment, output.name, output.unit, int(y.size),
-                                   rms(y - computed), compute_fit_percent(y, computed),
-                                   (float(np.min(y)), float(np.max(y))))
-                )  # fmt: skip
+                    ChannelMetrics(
+                        experiment,
+                        output.name,
+                        output.unit,
+                        int(y.size),
+                        rms(y - computed),
+                        compute_fit_percent(y, computed),
+                        (float(np.min(y)), float(np.max(y))),
+                    )
+                )
     return found
 
 
@@ -410,7 +426,10 @@ def _check_population(theta: FloatArray, free: int) -> FloatArray:
 
 def compute_record_progress(problem: Problem) -> FloatArray:
     """Part of its experiment (0 … 1) that has to be simulated for each of the M measured values."""
-    return np.concatenate([
-        np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
-        for experiment in problem.experiments for samples in experiment.outputs
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
+            for experiment in problem.experiments
+            for samples in experiment.outputs
+        ]
+    )

@@ -182,9 +182,13 @@ def _differentiate_kind(
 
 
 def _build_law(
-    kind: LawKind, x: FloatArray, y: FloatArray, stderr: FloatArray, centre: float,
+    kind: LawKind,
+    x: FloatArray,
+    y: FloatArray,
+    stderr: FloatArray,
+    centre: float,
     theta: FloatArray,
-) -> TrendLaw | None:  # fmt: skip
+) -> TrendLaw | None:
     least = float(np.min(stderr))
     slopes = _differentiate_kind(kind, x, centre, theta) * (least / stderr)[:, None]
     size = np.sqrt(np.sum(slopes**2, axis=0))

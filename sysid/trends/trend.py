@@ -156,7 +156,7 @@ def _compute_band(law: TrendLaw, x: FloatArray) -> tuple[TrendPoint, ...]:
 
 def predict_estimates(
     law: TrendLaw, x: FloatArray, stderr: FloatArray, at: FloatArray
-) -> tuple[TrendPoint, ...]:  # fmt: skip
+) -> tuple[TrendPoint, ...]:
     """What estimates at new places would be, with their 95 % intervals.
 
     Their own stated error is interpolated (geometrically) between those of the points; outside
@@ -295,9 +295,13 @@ def compute_drift(new: TrendEstimate, old: TrendEstimate, comparisons: int = 1) 
 
 
 def compute_law_drifts(
-    new: Sequence[TrendEstimate], law: TrendLaw, x: FloatArray, stderr: FloatArray, at: FloatArray,
+    new: Sequence[TrendEstimate],
+    law: TrendLaw,
+    x: FloatArray,
+    stderr: FloatArray,
+    at: FloatArray,
     comparisons: int = 1,
-) -> tuple[Drift, ...]:  # fmt: skip
+) -> tuple[Drift, ...]:
     """Estimates against what the trend of a reference batch predicts at their places.
 
     Parameters

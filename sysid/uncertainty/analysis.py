@@ -135,9 +135,12 @@ def _analyse_without_sensitivities(
 
 
 def _analyse_sensitivities(
-    problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None,
+    problem: Problem,
+    theta: FloatArray,
+    sensitive: Sensitivities,
+    most: int | None,
     white: Whitening | None = None,
-) -> Analysis:  # fmt: skip
+) -> Analysis:
     error, columns, plateau, one_sided, aside, count = sensitive
     n, d = columns.shape
     criteria = compute_criteria(error, d, white)
@@ -187,9 +190,15 @@ def _analyse_sensitivities(
         place, found, pulled, np.array([name in combined for name in names])
     )
     told = LocalStatistics(
-        theta, statuses, physical, stdtrit(_compute_degrees_of_freedom(n, inverse, colour, white), 0.975),
-        directions.is_null_member, uncertainty.groups, rows[~kept], scale,
-    )  # fmt: skip
+        theta,
+        statuses,
+        physical,
+        stdtrit(_compute_degrees_of_freedom(n, inverse, colour, white), 0.975),
+        directions.is_null_member,
+        uncertainty.groups,
+        rows[~kept],
+        scale,
+    )
     estimates = _correct_for_jumps(problem, make_estimates(problem, told), one_sided, aside * scale)
     linear = None
     if problem.loss_scale == 0.0:
@@ -243,8 +252,9 @@ def remove_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Floa
     if not directions.size:
         return columns, 0
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    size, rows = np.linalg.svd(directions / np.where(lengths > 0, lengths, 1.0),
-                               full_matrices=False)[1:]  # fmt: skip
+    size, rows = np.linalg.svd(
+        directions / np.where(lengths > 0, lengths, 1.0), full_matrices=False
+    )[1:]
     rows = rows[size > RANK_TOLERANCE]
     return columns - (columns @ rows.T) @ rows, rows.shape[0]
 
@@ -296,9 +306,12 @@ def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: Fl
 
 
 def _estimate_covariance(
-    error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float,
+    error: FloatArray,
+    columns: FloatArray,
+    inverse: FloatArray,
+    scale: float,
     colour: ColouredCovariance | None,
-) -> tuple[FloatArray, float]:  # fmt: skip
+) -> tuple[FloatArray, float]:
     """Covariance of the places, and the standard deviation of the noise."""
     n, d = columns.shape
     widening = n / (n - d) if colour is None else colour.equivalent_samples / colour.degrees

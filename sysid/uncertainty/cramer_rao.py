@@ -79,7 +79,4 @@ def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
         np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau_width > 0)
     )
     stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
-    return CramerRaoBound(
-        problem.free_names, stderr,
-        float(np.sqrt(np.count_nonzero(kept) / n)), n,
-    )  # fmt: skip
+    return CramerRaoBound(problem.free_names, stderr, float(np.sqrt(np.count_nonzero(kept) / n)), n)

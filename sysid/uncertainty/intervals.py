@@ -123,12 +123,23 @@ def _explain_status(
 
 
 def _make_estimate(
-    parameter: Parameter, value: float, stderr: float | None, quantile: float,
-    status: EstimateStatus, reason: str,
-) -> Estimate:  # fmt: skip
+    parameter: Parameter,
+    value: float,
+    stderr: float | None,
+    quantile: float,
+    status: EstimateStatus,
+    reason: str,
+) -> Estimate:
     half = None if stderr is None else quantile * stderr
     interval = None if half is None else (value - half, value + half)
     return Estimate(
-        parameter.name, parameter.unit, value, parameter.lower, parameter.upper, stderr, interval,
-        status, reason,
-    )  # fmt: skip
+        parameter.name,
+        parameter.unit,
+        value,
+        parameter.lower,
+        parameter.upper,
+        stderr,
+        interval,
+        status,
+        reason,
+    )

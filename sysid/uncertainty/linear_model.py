@@ -66,9 +66,15 @@ def make_move_generator(seed: int) -> np.random.Generator:
 
 
 def linearise_outputs(
-    error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
-    stated: FloatArray, scale: FloatArray, inverse: FloatArray, root: FloatArray,
-) -> LinearOutputModel:  # fmt: skip
+    error: FloatArray,
+    columns: FloatArray,
+    held: BoolArray,
+    place: FloatArray,
+    stated: FloatArray,
+    scale: FloatArray,
+    inverse: FloatArray,
+    root: FloatArray,
+) -> LinearOutputModel:
     """The linear model in the parameters' units.
 
     Parameters

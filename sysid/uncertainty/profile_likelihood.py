@@ -149,9 +149,13 @@ class _ProfileSearch:
     """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
 
     def __init__(
-        self, problem: Problem, theta: FloatArray, d: int, groups: ExchangeGroups,
+        self,
+        problem: Problem,
+        theta: FloatArray,
+        d: int,
+        groups: ExchangeGroups,
         should_stop: Callable[[], bool] | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._problem, self._d, self._should_stop = problem, d, should_stop
         columns = [one for group in groups for one in zip(*group, strict=True) if d in one]
         beside = [(i, theta[i] - theta[d] or d - i) for one in columns for i in one if i != d]
@@ -326,8 +330,11 @@ def _fix_parameter(problem: Problem, d: int, value: float) -> Problem:
     template = old.template.copy()
     template[old.free_rows[d]] = value
     evaluator = old._replace(
-        template=template, free_rows=np.delete(old.free_rows, d), lower=np.delete(old.lower, d),
-        upper=np.delete(old.upper, d), is_log=np.delete(old.is_log, d),
-    )  # fmt: skip
+        template=template,
+        free_rows=np.delete(old.free_rows, d),
+        lower=np.delete(old.lower, d),
+        upper=np.delete(old.upper, d),
+        is_log=np.delete(old.is_log, d),
+    )
     space = (*problem.free_parameters[:d], *problem.free_parameters[d + 1 :])
     return replace(problem, free_parameters=space, evaluator=evaluator)

@@ -206,9 +206,14 @@ class _OutputProbe:
         return far, beyond
 
     def _narrow_jumps(
-        self, which: IntArray, side: float, steps: FloatArray,
-        near: FloatArray, far: FloatArray, beyond: FloatArray,
-    ) -> None:  # fmt: skip
+        self,
+        which: IntArray,
+        side: float,
+        steps: FloatArray,
+        near: FloatArray,
+        far: FloatArray,
+        beyond: FloatArray,
+    ) -> None:
         """Narrow down each jump, in place, by the output at one more step of each parameter."""
         open_ = np.flatnonzero((near < steps) & (steps < far))
         if open_.size == 0:

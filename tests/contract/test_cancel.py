@@ -103,9 +103,11 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
     got, (done, bad, _) = claimed(database, n_runs=3)
     with database.write() as session:
         RunWriter(session, got.lease).record_outcomes(
-            [RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
-             RunOutcome(run_id=bad, state=JobState.FAILED, error="diverged")]
-        )  # fmt: skip
+            [
+                RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
+                RunOutcome(run_id=bad, state=JobState.FAILED, error="diverged"),
+            ]
+        )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "1 run failed")
     with database.write() as session:
         job = JobRepository(session).resume(got.job.id)

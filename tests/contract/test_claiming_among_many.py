@@ -32,12 +32,19 @@ def crowded(database):
     until = utc_now() + timedelta(hours=1)
     spec = JobIn.model_validate({"model": "tube", "datasets": ["ds_1"]}).to_normal_form()
     rows = [
-        {"id": f"job_{number:05d}", "project_id": PROJECTS[number % 3], "name": "j",
-         "spec": spec, "n_runs": 1, "state": state, "priority": 0,
-         "lease_owner": "d1" if state is JobState.RUNNING else None,
-         "lease_until": until if state is JobState.RUNNING else None}
+        {
+            "id": f"job_{number:05d}",
+            "project_id": PROJECTS[number % 3],
+            "name": "j",
+            "spec": spec,
+            "n_runs": 1,
+            "state": state,
+            "priority": 0,
+            "lease_owner": "d1" if state is JobState.RUNNING else None,
+            "lease_until": until if state is JobState.RUNNING else None,
+        }
         for number, state in enumerate(states)
-    ]  # fmt: skip
+    ]
     with database.write() as session:
         session.execute(insert(Project), [{"id": one, "name": one} for one in PROJECTS])
         session.execute(insert(Job), rows)

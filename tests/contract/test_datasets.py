@@ -97,9 +97,11 @@ def test_lineage_leads_from_a_dataset_to_all_it_was_made_from_and_all_made_of_it
         lineage.add_links("job_1", [both], "estimation")  # once more is as once
         up, down = lineage.list_ancestors("job_1"), lineage.list_descendants(raw)
     assert set(up) == {
-        LineageLink("job_1", both, "estimation"), LineageLink(both, cut, "derived"),
-        LineageLink(both, other, "derived"), LineageLink(cut, raw, "derived"),
-    }  # fmt: skip
+        LineageLink("job_1", both, "estimation"),
+        LineageLink(both, cut, "derived"),
+        LineageLink(both, other, "derived"),
+        LineageLink(cut, raw, "derived"),
+    }
     assert set(down) == {one for one in up if one.parent != other}
     with database.read() as session:
         assert LineageRepository(session, "proj_other").list_ancestors("job_1") == []

@@ -113,13 +113,16 @@ def test_jobs_are_listed_and_counted_by_state(database):
     with database.read() as session:
         jobs = JobRepository(session)
         assert [job.id for job in jobs.list_page(states=[JobState.RUNNING]).items] == [first]
-        assert [job.id for job in jobs.list_page(states=[JobState.QUEUED, JobState.RUNNING]).items] == [
-            second, first,
-        ]  # fmt: skip
+        assert [
+            job.id for job in jobs.list_page(states=[JobState.QUEUED, JobState.RUNNING]).items
+        ] == [second, first]
         assert jobs.count_states() == {
-            JobState.QUEUED: 1, JobState.RUNNING: 1, JobState.SUCCEEDED: 0, JobState.FAILED: 0,
+            JobState.QUEUED: 1,
+            JobState.RUNNING: 1,
+            JobState.SUCCEEDED: 0,
+            JobState.FAILED: 0,
             JobState.CANCELLED: 0,
-        }  # fmt: skip
+        }
 
 
 def test_a_deleted_job_is_no_longer_there(database):
@@ -168,9 +171,13 @@ def test_a_job_tells_its_whole_story(database):
         )
         queue.finish_job(got.lease, JobState.SUCCEEDED)
     assert kinds(database, got.job.id) == [
-        ("state", "queued"), ("state", "running"), ("log", None), ("progress", None),
-        ("state", "succeeded"), ("end", "succeeded"),
-    ]  # fmt: skip
+        ("state", "queued"),
+        ("state", "running"),
+        ("log", None),
+        ("progress", None),
+        ("state", "succeeded"),
+        ("end", "succeeded"),
+    ]
 
 
 def test_a_resumed_job_tells_on_after_its_end(database):

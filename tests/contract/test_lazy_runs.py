@@ -53,8 +53,10 @@ def source(place, claim):
 
 
 def cells(place, job):
-    return [(run.number, run.cell, run.labels, run.seed, run.sigma, run.method)
-            for run in place.runs(job)]  # fmt: skip
+    return [
+        (run.number, run.cell, run.labels, run.seed, run.sigma, run.method)
+        for run in place.runs(job)
+    ]
 
 
 def submit_whole(place, monkeypatch, **body):
@@ -185,9 +187,9 @@ def test_a_clone_has_the_same_cells(place):
     assert cells(place, other) == cells(place, job)
 
 
-@pytest.mark.parametrize("by", [
-    [], ["/noise/sigma"], ["/seed"], ["x"], ["x", "/seed"], ["/seed", "/noise/sigma"],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "by", [[], ["/noise/sigma"], ["/seed"], ["x"], ["x", "/seed"], ["/seed", "/noise/sigma"]]
+)
 def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, by):
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     keys = [GroupKey("label" if one == "x" else "axis", one) for one in by]

@@ -92,8 +92,9 @@ def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
     clock.advance(31)
     leases.renew_leases()
     assert (state_of(database, lease.job_id), job_of(database, lease.job_id).lost_leases) == (
-        JobState.QUEUED, 2,
-    )  # fmt: skip
+        JobState.QUEUED,
+        2,
+    )
 
 
 class Stand:
@@ -104,9 +105,7 @@ class Stand:
         self.crew = ScriptedCrew(fails)
         self.crew.is_slow = True
         self.leases = leases_of(self.place.database, clock)
-        self.dispatcher = Dispatcher(
-            self.place.database, self.place.store, self.crew, self.leases
-        )  # fmt: skip
+        self.dispatcher = Dispatcher(self.place.database, self.place.store, self.crew, self.leases)
 
     def turn_until(self, job: str, state: JobState, attempt: int) -> None:
         for _ in range(200_000):

@@ -34,9 +34,11 @@ def bucket(s3_endpoint):
     client.create_bucket(Bucket=name)
     client.close()
     options = {
-        "endpoint": s3_endpoint, "region": "us-east-1", **CREDENTIALS,
+        "endpoint": s3_endpoint,
+        "region": "us-east-1",
+        **CREDENTIALS,
         "client_options": {"allow_http": True},
-    }  # fmt: skip
+    }
     return f"s3://{name}/lagid", options
 
 

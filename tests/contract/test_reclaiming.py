@@ -57,10 +57,14 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write() as session:
         ledger = RunWriter(session, first.lease)
-        ledger.record_outcomes([
-            RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED, evaluations=700, generations=40),
-            RunOutcome(run_id=runs[1], state=JobState.FAILED, error="as told", evaluations=30),
-        ])  # fmt: skip
+        ledger.record_outcomes(
+            [
+                RunOutcome(
+                    run_id=runs[0], state=JobState.SUCCEEDED, evaluations=700, generations=40
+                ),
+                RunOutcome(run_id=runs[1], state=JobState.FAILED, error="as told", evaluations=30),
+            ]
+        )
         ledger.save_checkpoints([(runs[2], 200, pack_state(state))])
     again = recorder(place, claim_again(place, first.lease))
     again.failure(runs[3], RunFailure("otherwise"))
@@ -93,8 +97,10 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     source = JobRuns(place.database, claim_again(place, first.lease), place.store)
     queued = [one for one in source.iterate_runs() if isinstance(one, QueuedRun)]
     assert [(one.run, one.state is None) for one in queued] == [
-        (runs[1], False), (runs[2], True), (runs[3], True),
-    ]  # fmt: skip
+        (runs[1], False),
+        (runs[2], True),
+        (runs[3], True),
+    ]
     with place.database.read() as session:
         lengths = [len(RunRepository(session).read_history(run)) for run in runs]
         kept = [(one.run_id, unpack_state(one.state) is None) for one in session.query(Checkpoint)]

@@ -39,8 +39,9 @@ def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
         assert [one.accepted_by for one in history] == [None, "me", "me"]
         page = repository.list_page()
         assert [(one.accepted.name, one.accepted.run_id) for one in page.items] == [
-            ("other", runs[2]), ("tube", runs[0]),
-        ]  # fmt: skip
+            ("other", runs[2]),
+            ("tube", runs[0]),
+        ]
         with pytest.raises(RowNotFound, match="reference nobody"):
             repository.list_history("nobody")
 

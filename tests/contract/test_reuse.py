@@ -57,8 +57,10 @@ def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
         assert new.result == old.result
         assert place.history(new.id) == place.history(old.id) != []
         assert (new.best_rms, new.evaluations, new.signals_sha256) == (
-            old.best_rms, old.evaluations, old.signals_sha256,
-        )  # fmt: skip
+            old.best_rms,
+            old.evaluations,
+            old.signals_sha256,
+        )
     with place.database.read() as session:
         told = [one.data.get("message") for one in EventRepository(session).list_latest(job, 20)]
     assert "3 of 5 runs had been computed before: reused" in told
@@ -105,10 +107,13 @@ def test_reuse_can_be_declined(place):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"noise": {"sigma": 0.1}}, {"skip": 1}, {"parameters": {"T": {"upper": 9.0}}},
-        {"algorithm": {**SMALL, "bits": 20}}, {"loss": {"kind": "soft-l1", "scale": 0.5}},
+        {"noise": {"sigma": 0.1}},
+        {"skip": 1},
+        {"parameters": {"T": {"upper": 9.0}}},
+        {"algorithm": {**SMALL, "bits": 20}},
+        {"loss": {"kind": "soft-l1", "scale": 0.5}},
     ],
-)  # fmt: skip
+)
 def test_another_specification_is_computed(place, changes):
     carried_out(place, **sweep(1))
     _, _, computed = carried_out(place, **{**sweep(1), **changes})

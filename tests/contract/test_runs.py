@@ -12,10 +12,12 @@ from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
 from tests.stored import claimed, job_of, runs_of, submit
 
 RESULT = {
-    "parameters": [{"name": "L", "unit": "s", "value": 0.12, "stderr": 0.01},
-                   {"name": "m", "unit": "1", "value": 1.0, "stderr": None}],
+    "parameters": [
+        {"name": "L", "unit": "s", "value": 0.12, "stderr": 0.01},
+        {"name": "m", "unit": "1", "value": 1.0, "stderr": None},
+    ],
     "rms": 0.01,
-}  # fmt: skip
+}
 
 
 def record(database, lease, *outcomes, **evidence):
@@ -25,9 +27,17 @@ def record(database, lease, *outcomes, **evidence):
 
 def good(run_id, rms=0.01):
     return RunOutcome(
-        run_id=run_id, state=JobState.SUCCEEDED, result=RESULT, valid=True, best_rms=rms,
-        fit_estimation=98.0, evaluations=200, generations=4, seconds=0.5, signals_sha256="b" * 64,
-    )  # fmt: skip
+        run_id=run_id,
+        state=JobState.SUCCEEDED,
+        result=RESULT,
+        valid=True,
+        best_rms=rms,
+        fit_estimation=98.0,
+        evaluations=200,
+        generations=4,
+        seconds=0.5,
+        signals_sha256="b" * 64,
+    )
 
 
 def sweep(database, cells):
@@ -63,8 +73,11 @@ def test_runs_can_be_made_with_their_job(database):
         insert_runs(session, job, [NewRun(number=0, cell={"/seed": 3}, seed=3, method="simple")])
     (run,) = runs_of(database, job_id)
     assert (run.job_id, run.project_id, run.seed, run.method) == (
-        job_id, "proj_default", 3, "simple",
-    )  # fmt: skip
+        job_id,
+        "proj_default",
+        3,
+        "simple",
+    )
     assert run.state is JobState.QUEUED
 
 
@@ -122,8 +135,12 @@ def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(datab
     with database.read() as session:
         counts = RunRepository(session).count_states(got.job.id)
     assert counts == {
-        JobState.QUEUED: 1, JobState.RUNNING: 0, JobState.SUCCEEDED: 2, JobState.FAILED: 1, JobState.CANCELLED: 0,
-    }  # fmt: skip
+        JobState.QUEUED: 1,
+        JobState.RUNNING: 0,
+        JobState.SUCCEEDED: 2,
+        JobState.FAILED: 1,
+        JobState.CANCELLED: 0,
+    }
 
 
 def test_a_run_of_another_job_is_not_written(database):
@@ -271,9 +288,15 @@ def test_text_that_only_looks_like_an_escape_is_kept(database):
     got, (run_id,) = claimed(database)
     text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
     record(
-        database, got.lease,
-        RunOutcome(run_id=run_id, state=JobState.FAILED, result={"parameters": [], "note": text}, error=text),
-    )  # fmt: skip
+        database,
+        got.lease,
+        RunOutcome(
+            run_id=run_id,
+            state=JobState.FAILED,
+            result={"parameters": [], "note": text},
+            error=text,
+        ),
+    )
     (run,) = runs_of(database, got.job.id)
     assert run.result == {"parameters": [], "note": text}
     assert run.error == text

@@ -32,9 +32,9 @@ def ended(
     with database.write_session() as session:
         insert_runs(session, got.job, cells)
         runs = RunRepository(session).list_page(job, limit=10_000).items
-        RunWriter(session, got.lease).record_outcomes([
-            _outcome(run.id, outcomes[run.number]) for run in runs if run.number in outcomes
-        ])  # fmt: skip
+        RunWriter(session, got.lease).record_outcomes(
+            [_outcome(run.id, outcomes[run.number]) for run in runs if run.number in outcomes]
+        )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "stopped")
     return job
 
@@ -86,15 +86,27 @@ def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]
     with database.write_session() as session:
         insert_runs(session, got.job, [NewRun(number=number) for number in range(len(told))])
         runs = RunRepository(session).list_page(job).items
-        RunWriter(session, got.lease).record_outcomes([
-            RunOutcome(
-                run_id=run.id, state=JobState.SUCCEEDED, best_rms=1.0 + run.number,
-                result={"parameters": [
-                    {"name": name, "unit": unit, "value": 0.5, "stderr": 0.25, "status": status}
-                ]},
-            )
-            for run, (name, unit, status) in zip(runs, told, strict=True)
-        ])  # fmt: skip
+        RunWriter(session, got.lease).record_outcomes(
+            [
+                RunOutcome(
+                    run_id=run.id,
+                    state=JobState.SUCCEEDED,
+                    best_rms=1.0 + run.number,
+                    result={
+                        "parameters": [
+                            {
+                                "name": name,
+                                "unit": unit,
+                                "value": 0.5,
+                                "stderr": 0.25,
+                                "status": status,
+                            }
+                        ]
+                    },
+                )
+                for run, (name, unit, status) in zip(runs, told, strict=True)
+            ]
+        )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "stopped")
 
 

@@ -106,8 +106,11 @@ def test_sqlite_runs_as_agreed(sqlite_database):
             for name in ("journal_mode", "synchronous", "busy_timeout", "foreign_keys")
         }
     assert pragmas == {
-        "journal_mode": "wal", "synchronous": 1, "busy_timeout": 30_000, "foreign_keys": 1,
-    }  # fmt: skip
+        "journal_mode": "wal",
+        "synchronous": 1,
+        "busy_timeout": 30_000,
+        "foreign_keys": 1,
+    }
 
 
 def test_every_table_a_user_owns_names_its_project():

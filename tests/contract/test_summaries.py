@@ -29,11 +29,13 @@ def filled(database, cells, values):
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(
             NewRun(
-                number=i, cell=cell, labels={"length_m": 5.0 * (i % 2)},
+                number=i,
+                cell=cell,
+                labels={"length_m": 5.0 * (i % 2)},
                 sigma=cell.get("/noise/sigma"),
             )
             for i, cell in enumerate(cells)
-        )  # fmt: skip
+        )
     outcomes = [
         RunOutcome(run_id=run.id, state=JobState.FAILED, error="diverged")
         if value is None
@@ -82,9 +84,13 @@ def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
     job = filled(database, cells, values)
     found = summary(database, job, [SIGMA, METHOD], SummaryQuantity("rms"))
     assert [one.key for one in found] == [
-        (0.2, "simple"), (0.2, "improved"), (0, "simple"), (0, "improved"), (0.1, "simple"),
+        (0.2, "simple"),
+        (0.2, "improved"),
+        (0, "simple"),
+        (0, "improved"),
+        (0.1, "simple"),
         (0.1, "improved"),
-    ]  # fmt: skip
+    ]
     medians = [one.quantiles[SummaryQuantity("rms")][2] for one in found]
     assert medians == [1.0, 4.0, 7.0, 10.0, 13.0, 16.0]
 
@@ -161,8 +167,10 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
     values = [0.1, 0.1, 0.1, 4.0, 2.0, None, 0.1, 0.1, 0.1, 5.0, 6.0, 5.0]
     job = filled(database, cells, values)
     with database.read() as session:
-        found = [find_quietest_run(session, job, cell).number
-                 for cell in ({}, {"/model": "tube"}, {"/model": {"name": "own"}})]  # fmt: skip
+        found = [
+            find_quietest_run(session, job, cell).number
+            for cell in ({}, {"/model": "tube"}, {"/model": {"name": "own"}})
+        ]
         assert find_quietest_run(session, job, {"/model": "absent"}) is None
     assert found == [4, 4, 9]
 

@@ -80,9 +80,11 @@ def test_a_broken_connection_is_replaced(postgres_database):
         settle(waker)
         with postgres_database.write() as session:
             session.execute(
-                text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
-                     "WHERE query LIKE 'LISTEN%' AND datname = current_database()")
-            )  # fmt: skip
+                text(
+                    "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                    "WHERE query LIKE 'LISTEN%' AND datname = current_database()"
+                )
+            )
         assert not waker.wait_for_change(0.1)  # it notices
         settle(waker)  # it listens again
         thread = later(lambda: submit(postgres_database))

@@ -129,10 +129,11 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
 @pytest.mark.parametrize(
     ("warm", "said"),
     [
-        ("previous", "needs a sweep"), ("run_unknown", "there is no run run_unknown"),
+        ("previous", "needs a sweep"),
+        ("run_unknown", "there is no run run_unknown"),
         ("reference:tupe", "there is no reference 'tupe'; did you mean 'tube'"),
     ],
-)  # fmt: skip
+)
 def test_a_warm_start_that_is_not_there_is_told(place, warm, said):
     (first,), _ = carried_out(place)
     with place.database.write() as session:

@@ -20,9 +20,14 @@ from tests.e2e.filled import Filled, fill
 CHROMIUM = Path("/usr/bin/chromium")
 REQUIRED = "LAGID_REQUIRE_BROWSER"
 ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 
 LIMIT_SECONDS = 180.0
 """How long an answer may take: compiling what it needs takes minutes beside other work."""

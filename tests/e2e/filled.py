@@ -26,15 +26,20 @@ from service.storage.sessions import Database
 from sysid.data.records import Channel, Recording
 
 MODEL = {
-    "name": "lagged-tube", "title": "First-order lag behind a dead time", "form": "differential",
-    "inputs": {"u": "kPa"}, "states": {"y": "kPa"},
+    "name": "lagged-tube",
+    "title": "First-order lag behind a dead time",
+    "form": "differential",
+    "inputs": {"u": "kPa"},
+    "states": {"y": "kPa"},
     "parameters": {
         "K": {"lower": 0, "upper": 2, "unit": "1"},
         "T": {"lower": 0.01, "upper": 2, "unit": "s", "scale": "log"},
         "L": {"lower": 0, "upper": 0.5, "unit": "s"},
     },
-    "equations": {"y": "(K*u(t - L) - y)/T"}, "outputs": {"p": "y"}, "initial": {"y": 0},
-}  # fmt: skip
+    "equations": {"y": "(K*u(t - L) - y)/T"},
+    "outputs": {"p": "y"},
+    "initial": {"y": 0},
+}
 TRUE = {"K": 1.0153, "T": 0.3489, "L": 0.1127}
 SIGMA = 0.42
 STEP = 0.01
@@ -75,8 +80,9 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     with database.write_session() as session:
         reason = "the model diverges everywhere: no individual of 50 gave a finite output"
         ledger = RunWriter(session, failed.lease)
-        ledger.record_outcomes([RunOutcome(run_id=_first(session, failed), state=JobState.FAILED,
-                                  error=reason)])  # fmt: skip
+        ledger.record_outcomes(
+            [RunOutcome(run_id=_first(session, failed), state=JobState.FAILED, error=reason)]
+        )
         LeaseQueue(session).finish_job(failed.lease, JobState.FAILED, reason)
     running = _claimed(database, settings, _body(dataset, "tube 80 m <b>live</b>"))
     with database.write_session() as session:
@@ -85,9 +91,16 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     progress(database, running, running_run, 60)
     queued = jobs.submit_job(database, _body(dataset, "tube 5 m, waits"), settings).id
     return Filled(
-        dataset, finished.job.id, run, running.job.id, running_run, failed.job.id, queued,
-        sweep.job.id, running,
-    )  # fmt: skip
+        dataset,
+        finished.job.id,
+        run,
+        running.job.id,
+        running_run,
+        failed.job.id,
+        queued,
+        sweep.job.id,
+        running,
+    )
 
 
 def progress(database: Database, claim: Claim, run: str, generation: int) -> None:
@@ -109,11 +122,16 @@ def _body(dataset: str, name: str, *, sweep: bool = False) -> JobIn:
         {"path": "/algorithm/method", "values": ["simple", "improved-paper", "improved"]},
         {"path": "/seed", "range": [1, 5]},
     ]
-    return JobIn.model_validate({
-        "name": name, "model": MODEL, "datasets": [dataset],
-        "channels": {"u": "P1", "p": "P2"}, "validation": {"fraction": 0.3},
-        "sweep": {"axes": axes if sweep else []},
-    })  # fmt: skip
+    return JobIn.model_validate(
+        {
+            "name": name,
+            "model": MODEL,
+            "datasets": [dataset],
+            "channels": {"u": "P1", "p": "P2"},
+            "validation": {"fraction": 0.3},
+            "sweep": {"axes": axes if sweep else []},
+        }
+    )
 
 
 def _recording() -> Recording:
@@ -121,10 +139,9 @@ def _recording() -> Recording:
     levels = np.array([100, 300, 480, 200, 400, 50, 350, 250, 450, 150.0])
     u = np.repeat(levels, 300)
     noise = SIGMA * np.random.default_rng(7).standard_normal(times.size)
-    return Recording((
-        Channel("P1", times, u, "kPa", "zero"),
-        Channel("P2", times, _simulated(u) + noise, "kPa"),
-    ))  # fmt: skip
+    return Recording(
+        (Channel("P1", times, u, "kPa", "zero"), Channel("P2", times, _simulated(u) + noise, "kPa"))
+    )
 
 
 def _simulated(u: np.ndarray) -> np.ndarray:
@@ -161,12 +178,23 @@ def _history(run: str, islands: int = 4, floor: float = SIGMA) -> list[HistoryPo
             phase = ("genetic", "sequence", "migration")[0 if number < 12 else number % 3]
             if number == 39:
                 phase = "refinement"
-            values = [TRUE["K"] * (1 + 0.4 * off), TRUE["T"] * (1 + 1.5 * off * (-1) ** island),
-                      TRUE["L"] * (1 + 2 * off)]  # fmt: skip
-            found.append(HistoryPoint(
-                run, island, number, min(generation, 400), 13 * min(generation, 400), rms, phase,
-                values,
-            ))  # fmt: skip
+            values = [
+                TRUE["K"] * (1 + 0.4 * off),
+                TRUE["T"] * (1 + 1.5 * off * (-1) ** island),
+                TRUE["L"] * (1 + 2 * off),
+            ]
+            found.append(
+                HistoryPoint(
+                    run,
+                    island,
+                    number,
+                    min(generation, 400),
+                    13 * min(generation, 400),
+                    rms,
+                    phase,
+                    values,
+                )
+            )
     return found
 
 
@@ -175,39 +203,86 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
     bounds = MODEL["parameters"]
     assert isinstance(bounds, dict)
     return {
-        "valid": True, "rms": rms,
+        "valid": True,
+        "rms": rms,
         "parameters": [
-            {"name": name, "unit": bounds[name]["unit"], "value": value, "stderr": stderr[name],
-             "lower": float(bounds[name]["lower"]), "upper": float(bounds[name]["upper"]),
-             "interval95": [value - 1.96 * stderr[name], value + 1.96 * stderr[name]],
-             "status": "identified", "reason": ""}
+            {
+                "name": name,
+                "unit": bounds[name]["unit"],
+                "value": value,
+                "stderr": stderr[name],
+                "lower": float(bounds[name]["lower"]),
+                "upper": float(bounds[name]["upper"]),
+                "interval95": [value - 1.96 * stderr[name], value + 1.96 * stderr[name]],
+                "status": "identified",
+                "reason": "",
+            }
             for name, value in TRUE.items()
         ],
-        "islands": [{"champion_rms": rms * (1 + 0.2 * i), "refined_rms": rms * (1 + 0.02 * i**3)}
-                    for i in range(4)],
-        "correlation": {"names": ["K", "T", "L"],
-                        "matrix": [[1, 0.31, -0.05], [0.31, 1, -0.78], [-0.05, -0.78, 1]]},
-        "criteria": {"aic": 2336.4, "aicc": 2336.5, "bic": 2359.0, "samples": 2100,
-                     "parameters": 3},
-        "identifiability": {"condition": 41.0, "singular_values": [8.1, 2.2, 0.2], "groups": [
-            {"members": ["T", "L"], "expression": "T + L", "value": 0.4616, "stderr": 0.00014},
-        ]},
-        "residual_tests": {"data": "validation", "level": 0.05, "passed": True, "tests": [
-            _tested("whiteness", None, 0.96, 0.412), _tested("independence", "u", 1.0, 0.077),
-        ]},
-        "onset_delays": [{"experiment": 0, "input": "u", "output": "p", "delay": 0.1197,
-                          "unit": "s", "spread": 0.0006, "events": 9, "threshold": 0.02,
-                          "reason": ""}],
+        "islands": [
+            {"champion_rms": rms * (1 + 0.2 * i), "refined_rms": rms * (1 + 0.02 * i**3)}
+            for i in range(4)
+        ],
+        "correlation": {
+            "names": ["K", "T", "L"],
+            "matrix": [[1, 0.31, -0.05], [0.31, 1, -0.78], [-0.05, -0.78, 1]],
+        },
+        "criteria": {
+            "aic": 2336.4,
+            "aicc": 2336.5,
+            "bic": 2359.0,
+            "samples": 2100,
+            "parameters": 3,
+        },
+        "identifiability": {
+            "condition": 41.0,
+            "singular_values": [8.1, 2.2, 0.2],
+            "groups": [
+                {"members": ["T", "L"], "expression": "T + L", "value": 0.4616, "stderr": 0.00014}
+            ],
+        },
+        "residual_tests": {
+            "data": "validation",
+            "level": 0.05,
+            "passed": True,
+            "tests": [
+                _tested("whiteness", None, 0.96, 0.412),
+                _tested("independence", "u", 1.0, 0.077),
+            ],
+        },
+        "onset_delays": [
+            {
+                "experiment": 0,
+                "input": "u",
+                "output": "p",
+                "delay": 0.1197,
+                "unit": "s",
+                "spread": 0.0006,
+                "events": 9,
+                "threshold": 0.02,
+                "reason": "",
+            }
+        ],
         "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
-    }  # fmt: skip
+    }
 
 
 def _tested(kind: str, signal: str | None, inside: float, p: float) -> dict[str, Any]:
     return {
-        "experiment": 0, "output": "p", "test": kind, "input": signal, "outcome": "passed",
-        "reason": "", "samples": 900, "lags_tested": 25, "inside95": inside, "inside99": 1.0,
-        "statistic": 26.1, "degrees": 25.0, "p": p,
-    }  # fmt: skip
+        "experiment": 0,
+        "output": "p",
+        "test": kind,
+        "input": signal,
+        "outcome": "passed",
+        "reason": "",
+        "samples": 900,
+        "lags_tested": 25,
+        "inside95": inside,
+        "inside99": 1.0,
+        "statistic": 26.1,
+        "degrees": 25.0,
+        "p": p,
+    }
 
 
 def _end(database: Database, store: ObjectStore, claim: Claim, recording: Recording) -> str:
@@ -226,10 +301,18 @@ def _end(database: Database, store: ObjectStore, claim: Claim, recording: Record
         write_fitted_outputs(run, fits, target)
         migrants = [MigrantPoint(run, n, 1 + n // 4, n % 4, (n + 1) % 4, 5.0) for n in range(60)]
         outcome = RunOutcome(
-            run_id=run, state=JobState.SUCCEEDED, result=_result(), valid=True, best_rms=SIGMA,
-            fit_estimation=99.71, fit_validation=99.68, evaluations=20_000, generations=400,
-            seconds=0.184, signals_sha256=store.put_stream([target.getvalue()]).sha256,
-        )  # fmt: skip
+            run_id=run,
+            state=JobState.SUCCEEDED,
+            result=_result(),
+            valid=True,
+            best_rms=SIGMA,
+            fit_estimation=99.71,
+            fit_validation=99.68,
+            evaluations=20_000,
+            generations=400,
+            seconds=0.184,
+            signals_sha256=store.put_stream([target.getvalue()]).sha256,
+        )
         ledger = RunWriter(session, claim.lease)
         ledger.record_outcomes([outcome], _history(run), migrants)
         queue = LeaseQueue(session)
@@ -244,12 +327,19 @@ def _end_sweep(database: Database, claim: Claim) -> None:
         runs = RunRepository(session).list_page(claim.job.id, limit=100).items
         outcomes = [
             RunOutcome(
-                run_id=run.id, state=JobState.SUCCEEDED, result=_result(SIGMA * (1 + (7 * n) % 12)),
-                valid=True, best_rms=SIGMA * (1 + (7 * n) % 12), fit_estimation=99.0 - n,
-                fit_validation=98.0 - n, evaluations=20_000, generations=400, seconds=0.2,
+                run_id=run.id,
+                state=JobState.SUCCEEDED,
+                result=_result(SIGMA * (1 + (7 * n) % 12)),
+                valid=True,
+                best_rms=SIGMA * (1 + (7 * n) % 12),
+                fit_estimation=99.0 - n,
+                fit_validation=98.0 - n,
+                evaluations=20_000,
+                generations=400,
+                seconds=0.2,
             )
             for n, run in enumerate(runs)
-        ]  # fmt: skip
+        ]
         RunWriter(session, claim.lease).record_outcomes(
             outcomes, [p for r in runs for p in _history(r.id)]
         )

@@ -125,15 +125,22 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
 def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> None:
     model = yaml.safe_load(EQUATIONS) | {"initial": {"y": {"lower": 0, "upper": 1}}}
     asked: dict[str, Any] = {
-        "K": {"tied": "2*L"}, "T": {"scale": "log", "lower": 0.02},
-        "y(0)": {"upper": 900.0}, "y(0)[2]": {"fixed": 0.5},
-    }  # fmt: skip
+        "K": {"tied": "2*L"},
+        "T": {"scale": "log", "lower": 0.02},
+        "y(0)": {"upper": 900.0},
+        "y(0)[2]": {"fixed": 0.5},
+    }
     data = own_site.filled.dataset
     steps = {"steps": [{"offset": {"P2": 1}}]}
     url = f"{own_site.url}/v1/datasets/{data}:derive"
     other = httpx.post(url, json=steps, timeout=LIMIT_SECONDS).json()["id"]
-    body = {"model": model, "datasets": [data, other], "channels": {"u": "P1", "y": "P2"},
-            "parameters": asked, "algorithm": {"generations": 2}}  # fmt: skip
+    body = {
+        "model": model,
+        "datasets": [data, other],
+        "channels": {"u": "P1", "y": "P2"},
+        "parameters": asked,
+        "algorithm": {"generations": 2},
+    }
     answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS)
     assert answer.status_code == 202, answer.text
     opened(own_site, page, f"?clone={answer.json()['id']}")

@@ -127,9 +127,11 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
     own_site: Site, page: Page
 ) -> None:
     body = {
-        "model": MODEL, "datasets": [own_site.filled.dataset],
-        "channels": {"u": "P1", "p": "P2"}, "parameters": {"L": {"upper": 0.3}},
-    }  # fmt: skip
+        "model": MODEL,
+        "datasets": [own_site.filled.dataset],
+        "channels": {"u": "P1", "p": "P2"},
+        "parameters": {"L": {"upper": 0.3}},
+    }
     job = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()["id"]
     check = Held(page, r"/v1/models:check$")
     page.goto(f"{own_site.url}/?clone={job}#new")

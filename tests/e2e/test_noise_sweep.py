@@ -12,14 +12,19 @@ from tests.identified import carried_out
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 BODY = {
-    "name": "under noise", "model": "fopdt", "sigma": [0, 0.25], "replicates": 13,
+    "name": "under noise",
+    "model": "fopdt",
+    "sigma": [0, 0.25],
+    "replicates": 13,
     "truth": {
         "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
-        "inputs": {"u": {"kind": "binary", "period": 2}}, "samples": 100, "sample_time": 0.1,
+        "inputs": {"u": {"kind": "binary", "period": 2}},
+        "samples": 100,
+        "sample_time": 0.1,
     },
     "parameters": {"T": {"upper": 5.0}, "L": {"upper": 1.0}},
     "algorithm": {"population": 10, "generations": 8, "islands": 1},
-}  # fmt: skip
+}
 PLOT = '[data-figure="summary"]'
 
 

@@ -54,9 +54,11 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     broken = folder / "broken"
     broken.touch()
     environment = {
-        "BREAK_SEEDS": str(DEADLY), "BREAK_MEMORY": str(GREEDY), "LAGID_WORKER_MEMORY_MB": "512",
+        "BREAK_SEEDS": str(DEADLY),
+        "BREAK_MEMORY": str(GREEDY),
+        "LAGID_WORKER_MEMORY_MB": "512",
         "BREAK_RAY": str(broken),
-    }  # fmt: skip
+    }
     with standing_service(Stand(folder / "data", environment=environment), wait=False) as stand:
         until(lambda: stand.answers() == 200, "the web answered", LIMIT_SECONDS)
         path = paper_example.write_csv(folder / "record.csv", seed=1)

@@ -74,8 +74,12 @@ def test_a_full_disk_stops_nothing_for_good(disk: Path, tmp_path: Path) -> None:
         log = disk / "data" / "logs" / "dispatcher.log"
         (dispatcher,) = stand.family.dispatchers()
         with filled(disk):
-            upload = httpx.post(f"{stand.url}/v1/datasets", content=record.read_bytes() + b" ",
-                                headers=CSV, timeout=60.0)  # fmt: skip
+            upload = httpx.post(
+                f"{stand.url}/v1/datasets",
+                content=record.read_bytes() + b" ",
+                headers=CSV,
+                timeout=60.0,
+            )
             assert upload.status_code == 503
             assert upload.headers["content-type"] == PROBLEM
             os.sync()

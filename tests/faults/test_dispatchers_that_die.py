@@ -32,9 +32,11 @@ def _work_on(database, claim, trouble):
         if trouble == "stalls":
             _fall_silent(database, claim.lease)
         outcome = RunOutcome(
-            run_id=run.id, state=JobState.SUCCEEDED, best_rms=float(run.number + 1),
+            run_id=run.id,
+            state=JobState.SUCCEEDED,
+            best_rms=float(run.number + 1),
             result={"by": claim.lease.owner, "attempt": claim.lease.attempt},
-        )  # fmt: skip
+        )
         with database.write() as session:
             RunWriter(session, claim.lease).record_outcomes([outcome])
     with database.write() as session:

@@ -185,7 +185,7 @@ def test_many_small_chunks_are_counted_together() -> None:
         ((Metadata("lagid.dataset", {"format": "9"}), CHANNEL, MESSAGE), "cannot be used"),
         ((Metadata("lagid.dataset", {}), CHANNEL, MESSAGE), "cannot be used"),
     ],
-)  # fmt: skip
+)
 def test_a_record_that_cannot_be_right_is_refused(
     records: tuple[McapRecord, ...], words: str
 ) -> None:
@@ -245,7 +245,7 @@ def test_bytes_after_the_end_and_a_wrong_end_are_refused() -> None:
         {"history": '{"v": {"topic": "/a", "field": "x"}}'},
         {"history": '{"u": {"topic": "/a", "field": "x"}}'},  # not before the first sample
     ],
-)  # fmt: skip
+)
 def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> None:
     manifest = {
         "format": "1",

@@ -13,9 +13,12 @@ from benchmarks.breaking.stand import Stand, standing_service
 from benchmarks.breaking.work import Stream
 
 pytestmark = [
-    pytest.mark.ray, pytest.mark.slow, pytest.mark.postgres, pytest.mark.timeout(400),
+    pytest.mark.ray,
+    pytest.mark.slow,
+    pytest.mark.postgres,
+    pytest.mark.timeout(400),
     pytest.mark.filterwarnings("ignore"),  # the wheel finds no runtime folder for the user
-]  # fmt: skip
+]
 
 
 @pytest.fixture

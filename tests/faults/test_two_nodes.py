@@ -55,9 +55,12 @@ def told_on_joining(address: str, **environment: str) -> str:
     inherited = {name: text for name, text in os.environ.items() if not name.startswith("RAY_")}
     done = subprocess.run(
         [sys.executable, "-c", JOIN, address],
-        env={**inherited, "HOME": "/nonexistent", **environment}, capture_output=True, text=True,
-        timeout=90, check=True,
-    )  # fmt: skip
+        env={**inherited, "HOME": "/nonexistent", **environment},
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=True,
+    )
     return done.stdout
 
 
@@ -89,8 +92,11 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
         none = told_on_joining(cluster.address)
         assert none.startswith(f"there is no token for the Ray cluster at {cluster.address}: set")
     assert (ended.state, ended.attempt, ended.n_done, ended.n_failed) == (
-        JobState.SUCCEEDED, 1, 24, 0,
-    )  # fmt: skip
+        JobState.SUCCEEDED,
+        1,
+        24,
+        0,
+    )
     assert results(place.runs(shaken)) == results(place.runs(quiet))
     alone = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
     assert results(place.runs(quiet)) == plain(place, alone)
@@ -121,8 +127,11 @@ def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
     settings = place.settings.model_copy(update={"ray_address": address})
     done = subprocess.run(
         [sys.executable, "-m", *command],
-        env={**os.environ, **to_environment(settings)}, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        env={**os.environ, **to_environment(settings)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if "ERROR" in line]
     assert told in line

@@ -62,8 +62,17 @@ def url(tmp_path: Path) -> Iterator[str]:
 
 
 def test_the_page_shows_every_recipe_and_what_follows_it() -> None:
-    for name in ("noise_sweep", "reidentify", "wait", "summary", "trend", "accept_reference",
-                 "validate_run", "simulate_run", "ProblemError"):  # fmt: skip
+    for name in (
+        "noise_sweep",
+        "reidentify",
+        "wait",
+        "summary",
+        "trend",
+        "accept_reference",
+        "validate_run",
+        "simulate_run",
+        "ProblemError",
+    ):
         assert any(name in snippet for snippet in SNIPPETS), name
 
 

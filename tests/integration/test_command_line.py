@@ -37,9 +37,12 @@ LIMIT_SECONDS = 240.0  # beside other work what a command compiles takes minutes
 def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [sys.executable, "-m", "service.cli.main", *map(str, words)],
-        capture_output=True, text=True, timeout=LIMIT_SECONDS, check=False,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_SECONDS,
+        check=False,
         env={**os.environ, "LAGID_URL": "http://127.0.0.1:1", **environment},
-    )  # fmt: skip
+    )
 
 
 def refused(done: "subprocess.CompletedProcess[str]", code: int = 1) -> str:
@@ -57,10 +60,21 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("served")
     port = find_free_port()
     child = subprocess.Popen(
-        [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
-         "--port", str(port), "--data-dir", str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "service.cli.main",
+            "serve",
+            "--no-dispatcher",
+            "--port",
+            str(port),
+            "--data-dir",
+            str(folder),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     url = f"http://127.0.0.1:{port}"
     assert child.stdout is not None
     assert url in child.stdout.readline()
@@ -91,9 +105,23 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_help_names_every_command() -> None:
     text = lagid("--help").stdout
-    for command in ("serve", "identify", "submit", "watch", "jobs", "runs", "datasets", "models",
-                    "dataset", "cancel", "export", "db", "doctor", "demo",
-                    "dispatcher"):  # fmt: skip
+    for command in (
+        "serve",
+        "identify",
+        "submit",
+        "watch",
+        "jobs",
+        "runs",
+        "datasets",
+        "models",
+        "dataset",
+        "cancel",
+        "export",
+        "db",
+        "doctor",
+        "demo",
+        "dispatcher",
+    ):
         assert command in text
 
 
@@ -115,12 +143,16 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
         (["identify", "a.csv"], "missing option '--model' (lagid identify --help)"),
         (["jobs", "--stat", "queued"], "no such option: --stat (Possible options: --state)"),
         (["jobs", "--state", "late"], "invalid value for '--state': 'late' is not one of"),
-        (["runs", "profile", "run_1", "--points", "2"],
-         "invalid value for '--points': found '2'; need 3 or more (lagid runs profile --help)"),
-        (["identify", "a.csv", "--model", "m", "--sample-time", "x"],
-         "invalid value for '--sample-time': found 'x'; need a number (lagid identify --help)"),
+        (
+            ["runs", "profile", "run_1", "--points", "2"],
+            "invalid value for '--points': found '2'; need 3 or more (lagid runs profile --help)",
+        ),
+        (
+            ["identify", "a.csv", "--model", "m", "--sample-time", "x"],
+            "invalid value for '--sample-time': found 'x'; need a number (lagid identify --help)",
+        ),
     ],
-)  # fmt: skip
+)
 def test_words_that_a_command_does_not_have_are_one_line_of_ours(
     words: list[str], expected: str
 ) -> None:
@@ -225,8 +257,18 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     model = tmp_path / "own.yaml"
     model.write_text(OWN)
     result = tmp_path / "out.json"
-    done = lagid("identify", data, "--model", model, "--set", "algorithm.generations=150",
-                 "--set", "validation.fraction=0.4", "--json", result)  # fmt: skip
+    done = lagid(
+        "identify",
+        data,
+        "--model",
+        model,
+        "--set",
+        "algorithm.generations=150",
+        "--set",
+        "validation.fraction=0.4",
+        "--json",
+        result,
+    )
     assert done.returncode == 0, done.stderr
     assert "±" in done.stdout
     assert "if it was held, use --set hold.u=zero" in " ".join(done.stderr.split())
@@ -324,10 +366,20 @@ def test_an_open_event_stream_does_not_hold_up_the_end(tmp_path: Path) -> None:
     port = find_free_port()
     url = f"http://127.0.0.1:{port}"
     child = subprocess.Popen(
-        [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
-         "--port", str(port), "--data-dir", str(tmp_path)],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "service.cli.main",
+            "serve",
+            "--no-dispatcher",
+            "--port",
+            str(port),
+            "--data-dir",
+            str(tmp_path),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     _wait_until_answering(url)
     with httpx.Client(base_url=url, timeout=60) as http:
         csv = {"content-type": "text/csv"}
@@ -363,14 +415,41 @@ def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> Non
 
 
 NOISE = (
-    "sweep", "noise", "--model", "fopdt", "--true", "K=2", "--true", "T=1", "--true", "L=0.5",
-    "--true", "y0=0", "--input", "u=sin(t)", "--samples", 100, "--sample-time", 0.1,
-)  # fmt: skip
+    "sweep",
+    "noise",
+    "--model",
+    "fopdt",
+    "--true",
+    "K=2",
+    "--true",
+    "T=1",
+    "--true",
+    "L=0.5",
+    "--true",
+    "y0=0",
+    "--input",
+    "u=sin(t)",
+    "--samples",
+    100,
+    "--sample-time",
+    0.1,
+)
 
 
 def test_a_noise_sweep_is_submitted_with_the_settings_that_were_given(server: str) -> None:
-    words = (*NOISE, "--sigma", "0:0.2:0.1", "--replicates", 2, "--methods", "improved",
-             "--set", "algorithm.population=12", "--set", "parameters.L.upper=1")  # fmt: skip
+    words = (
+        *NOISE,
+        "--sigma",
+        "0:0.2:0.1",
+        "--replicates",
+        2,
+        "--methods",
+        "improved",
+        "--set",
+        "algorithm.population=12",
+        "--set",
+        "parameters.L.upper=1",
+    )
     done = lagid(*words, "--json", LAGID_URL=server)
     assert done.returncode == 0, done.stderr
     job = json.loads(done.stdout)

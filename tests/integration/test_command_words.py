@@ -16,9 +16,13 @@ def test_a_word_that_is_no_text_is_one_line(words: list[str], tmp_path: Path) ->
     (tmp_path / "d.csv").write_bytes(recording())
     done = subprocess.run(
         [sys.executable, "-m", "service.cli.main", *words, b"\xf6sse"],
-        capture_output=True, text=True, timeout=90, check=False, cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+        cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )  # fmt: skip
+    )
     told = refused(done)
     assert r"\udcf6" in told
     assert told.endswith("is not UTF-8 text; write it in UTF-8")

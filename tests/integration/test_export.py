@@ -33,13 +33,28 @@ class Case(NamedTuple):
 
 NARX = {p.name: 0.02 for p in load_model("narx").parameters} | {"dh": 2.4, "dk": 1.7}
 CASES = {
-    "actuator": Case({"J": 6e-4, "F_c": 0.01, "F_max": 0.03, "k_a": 60, "k_b": 60, "k_c": 8e5,
-                      "A_m": 5e-6, "B": 1e-3, "theta_s": 2.36, "theta(0)": 0.3}, 0.01, 3e4),
+    "actuator": Case(
+        {
+            "J": 6e-4,
+            "F_c": 0.01,
+            "F_max": 0.03,
+            "k_a": 60,
+            "k_b": 60,
+            "k_c": 8e5,
+            "A_m": 5e-6,
+            "B": 1e-3,
+            "theta_s": 2.36,
+            "theta(0)": 0.3,
+        },
+        0.01,
+        3e4,
+    ),
     "coulomb-delay": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
     "coulomb-eq16": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
     "delayed-logistic": Case({"r": 1.2, "K": 2, "L": 1.237, "x(0)": 0.3}, 0.1),
-    "delayed-van-der-pol": Case({"mu": 0.7, "w": 2, "g": -0.5, "L": 0.4337, "x(0)": 0.3,
-                                 "v(0)": -0.2}),
+    "delayed-van-der-pol": Case(
+        {"mu": 0.7, "w": 2, "g": -0.5, "L": 0.4337, "x(0)": 0.3, "v(0)": -0.2}
+    ),
     "duffing-delay": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
     "duffing-eq16": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
     "emps": Case({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
@@ -47,14 +62,43 @@ CASES = {
     "fopdt": Case({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
     "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
     "narx": Case({**NARX, "y(0)": 0.3}),
-    "silverbox": Case({"b": 1e5, "d": 50, "k1": 2e5, "k2": 1e4, "k3": 5e5, "c": 10, "L": 0.0013,
-                       "y(0)": 0.02, "v(0)": 1.0}, 0.001, 0.1),
-    "silverbox-9": Case({"b": 1e5, "d": 50, "d1": 5, "d2": 20, "k1": 2e5, "k2": 1e4, "k3": 5e5,
-                         "k5": 1e4, "c": 10, "L": 0.0013, "y(0)": 0.02, "v(0)": 1.0}, 0.001, 0.1),
+    "silverbox": Case(
+        {
+            "b": 1e5,
+            "d": 50,
+            "k1": 2e5,
+            "k2": 1e4,
+            "k3": 5e5,
+            "c": 10,
+            "L": 0.0013,
+            "y(0)": 0.02,
+            "v(0)": 1.0,
+        },
+        0.001,
+        0.1,
+    ),
+    "silverbox-9": Case(
+        {
+            "b": 1e5,
+            "d": 50,
+            "d1": 5,
+            "d2": 20,
+            "k1": 2e5,
+            "k2": 1e4,
+            "k3": 5e5,
+            "k5": 1e4,
+            "c": 10,
+            "L": 0.0013,
+            "y(0)": 0.02,
+            "v(0)": 1.0,
+        },
+        0.001,
+        0.1,
+    ),
     "sopdt": Case({"K": 2, "T1": 0.8, "r": 0.4, "L": 0.4337, "y0": 0.3, "x(0)": 0.3, "w(0)": 0}),
     "tube": Case({"K": 1, "T": 0.3, "L": 0.2137, "y(0)": 0.3}),
     "tube-second-order": Case({"K": 1, "w": 5, "z": 0.5, "L": 0.4337, "y(0)": 0.3}),
-}  # fmt: skip
+}
 
 # What the catalogue does not have: methods, grids, interpolation, names that a program needs
 # itself, two inputs and outputs, states before they are updated, time itself.
@@ -89,10 +133,16 @@ outputs: {y: x(k - 1.6), z: w}
 initial: {x: 0.2, w: 0.1}
 """
 LINEAR_NARX = {
-    "name": "chosen", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 2,
-    "lags": {"y": [1, 2], "u": [1, "1 + d"]}, "parameters": {"d": {"lower": 0, "upper": 4}},
-    "coefficients": {"lower": -2, "upper": 2}, "terms": {"select": "frols", "keep": 3},
-}  # fmt: skip
+    "name": "chosen",
+    "form": "polynomial",
+    "output": "y",
+    "inputs": {"u": "1"},
+    "degree": 2,
+    "lags": {"y": [1, 2], "u": [1, "1 + d"]},
+    "parameters": {"d": {"lower": 0, "upper": 4}},
+    "coefficients": {"lower": -2, "upper": 2},
+    "terms": {"select": "frols", "keep": 3},
+}
 
 
 def written(text: str, **solver: Any) -> Model:
@@ -191,8 +241,9 @@ def test_the_document_has_all_that_is_needed_to_simulate_again() -> None:
     times, inputs = excitation(model, case)
     for one, other in zip(
         simulated(again, values, times, inputs, "first"),
-        simulated(model, case.values, times, inputs, "first"), strict=True,
-    ):  # fmt: skip
+        simulated(model, case.values, times, inputs, "first"),
+        strict=True,
+    ):
         np.testing.assert_array_equal(one, other)
 
 
@@ -220,9 +271,12 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     assert f"standard error {stderr['T']:.3g}" in text
     # The tube starts where it was measured, so that is to be given.
     expected = simulated(
-        model, {one.name: one.value for one in found.estimates} | {"y(0)": y[0]}, times,
-        {"u": u}, "zero",
-    )  # fmt: skip
+        model,
+        {one.name: one.value for one in found.estimates} | {"y(0)": y[0]},
+        times,
+        {"u": u},
+        "zero",
+    )
     np.testing.assert_allclose(in_python(text, times, [u], y_0=y[0]), expected, rtol=1e-9)
     with pytest.raises(TypeError, match="y_0"):
         in_python(text, times, [u])
@@ -247,9 +301,12 @@ def test_an_option_that_cannot_be_used_is_named(change: dict[str, Any], pointer:
 
 @pytest.mark.parametrize(
     ("values", "name"),
-    [({"K": 1.0, "T": 0.3}, "L"), ({"K": 1.0, "T": 0.3, "L": 0.1, "W": 1.0}, "W"),
-     ({"K": 1.0, "T": float("inf"), "L": 0.1}, "T")],
-)  # fmt: skip
+    [
+        ({"K": 1.0, "T": 0.3}, "L"),
+        ({"K": 1.0, "T": 0.3, "L": 0.1, "W": 1.0}, "W"),
+        ({"K": 1.0, "T": float("inf"), "L": 0.1}, "T"),
+    ],
+)
 def test_a_value_that_is_missing_unknown_or_not_finite_is_named(
     values: dict[str, float], name: str
 ) -> None:
@@ -265,10 +322,17 @@ def test_a_model_whose_terms_are_not_selected_yet_is_refused() -> None:
 
 
 HOSTILE = (
-    '"""\nimport os\nos.abort()\n"""', "*/ int main(void) { abort(); } /*", "\\", 'end\\"""', "'''",
-    "// \\\nint x;", "??/\n#error", "\u202e\u2028\u0085#error", "%s {x} @PAIRS@ @ORDER@",
+    '"""\nimport os\nos.abort()\n"""',
+    "*/ int main(void) { abort(); } /*",
+    "\\",
+    'end\\"""',
+    "'''",
+    "// \\\nint x;",
+    "??/\n#error",
+    "\u202e\u2028\u0085#error",
+    "%s {x} @PAIRS@ @ORDER@",
     "\\N{x}\\u",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("text", HOSTILE)

@@ -26,12 +26,15 @@ VALUES: dict[str, dict[str, float]] = {
 OMEGA = np.array([0.02, 0.3, 1.0, 3.0, 11.0])
 S = 1j * OMEGA
 DELAYED_DAMPER = {
-    "name": "damper", "form": "differential", "inputs": {"q": "N", "r": "N"},
+    "name": "damper",
+    "form": "differential",
+    "inputs": {"q": "N", "r": "N"},
     "states": {"x": "m", "v": "m/s"},
     "parameters": {"L": {"lower": 0, "upper": 1, "unit": "s"}, "c": {"lower": 0, "upper": 9}},
     "equations": {"x": "v", "v": "q(t - 2*L) - 0.5*r - c*v(t - L) - 4*x + 0.1"},
-    "outputs": {"y": "x + 1", "z": "v(t - L) + 0.3*q"}, "initial": {"x": 0, "v": 0},
-}  # fmt: skip
+    "outputs": {"y": "x + 1", "z": "v(t - L) + 0.3*q"},
+    "initial": {"x": 0, "v": 0},
+}
 DAMPER = 1 / (S**2 + 0.4 * S * np.exp(-0.3 * S) + 4)
 EXPECTED = {
     "fopdt": {("u", "y"): 2 * np.exp(-0.4337 * S) / (0.8 * S + 1)},
@@ -44,7 +47,7 @@ EXPECTED = {
         ("q", "z"): DAMPER * S * np.exp(-0.9 * S) + 0.3,
         ("r", "z"): -0.5 * DAMPER * S * np.exp(-0.3 * S),
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", EXPECTED)

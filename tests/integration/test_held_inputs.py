@@ -46,9 +46,11 @@ def test_the_response_is_that_of_the_plant(lag: float, substeps: int) -> None:
         {**copy_catalogue_document("tube"), "solver": {"method": "rk4", "substeps": substeps}}
     )
     found = simulate(
-        model, [Channel("u", np.arange(300.0), u, hold="zero")],
-        {"K": K, "T": T, "L": lag, "y(0)": K * u[0]}, times=np.arange(300.0),
-    )  # fmt: skip
+        model,
+        [Channel("u", np.arange(300.0), u, hold="zero")],
+        {"K": K, "T": T, "L": lag, "y(0)": K * u[0]},
+        times=np.arange(300.0),
+    )
     np.testing.assert_allclose(found.channel("y").values, exact(u, lag), atol=0.05 / substeps * K)
 
 
@@ -58,9 +60,10 @@ def test_the_response_moves_with_the_lag_without_stairs() -> None:
     lags = np.linspace(2.0, 3.0, 41)
     curves = [
         simulate(model, inputs, {"K": K, "T": T, "L": lag, "y(0)": 0.0}, times=np.arange(300.0))
-        .channel("y").values
+        .channel("y")
+        .values
         for lag in lags
-    ]  # fmt: skip
+    ]
     moves = [float(np.max(np.abs(b - a))) for a, b in pairwise(curves)]
     assert min(moves) > 0.3 * max(moves)  # a staircase has moves of 0
 

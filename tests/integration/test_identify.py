@@ -135,10 +135,15 @@ def test_progress_is_told_and_ends_at_the_result() -> None:
 
 def test_a_model_that_diverges_everywhere_fails_with_that_message() -> None:
     document = {
-        "name": "wild", "form": "difference", "inputs": {"q": "N"}, "states": {"x": "m"},
+        "name": "wild",
+        "form": "difference",
+        "inputs": {"q": "N"},
+        "states": {"x": "m"},
         "parameters": {"g": {"lower": 10.0, "upper": 20.0}},
-        "equations": {"x": "exp(g*(x(k-1)**2 + 1))"}, "outputs": {"y": "x"}, "initial": {"x": 1},
-    }  # fmt: skip
+        "equations": {"x": "exp(g*(x(k-1)**2 + 1))"},
+        "outputs": {"y": "x"},
+        "initial": {"x": 1},
+    }
     with pytest.raises(DivergedEverywhere, match="diverged for every one of"):
         identify(load_model(document), record(clean()))
 

@@ -39,17 +39,24 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
     settings = settings_of(tmp_path_factory.mktemp("large"))
     with TestClient(create_app(settings)) as client:
         parts = client.app.state.parts  # type: ignore[attr-defined]
-        stored = client.post("/v1/datasets?name=step", content=recording(),
-                             headers={"content-type": "text/csv"}).json()["id"]  # fmt: skip
-        body = JobIn.model_validate({
-            "name": "large", "model": "fopdt", "datasets": [stored],
-            "parameters": {"L": {"upper": 2}},
-            "sweep": {"axes": [
-                {"path": "/noise/sigma", "values": [0.01 * n for n in range(N_SIGMA)]},
-                {"path": "/algorithm/method", "values": ["simple", "improved"]},
-                {"path": "/seed", "range": [0, N_SEEDS]},
-            ]},
-        })  # fmt: skip
+        stored = client.post(
+            "/v1/datasets?name=step", content=recording(), headers={"content-type": "text/csv"}
+        ).json()["id"]
+        body = JobIn.model_validate(
+            {
+                "name": "large",
+                "model": "fopdt",
+                "datasets": [stored],
+                "parameters": {"L": {"upper": 2}},
+                "sweep": {
+                    "axes": [
+                        {"path": "/noise/sigma", "values": [0.01 * n for n in range(N_SIGMA)]},
+                        {"path": "/algorithm/method", "values": ["simple", "improved"]},
+                        {"path": "/seed", "range": [0, N_SEEDS]},
+                    ]
+                },
+            }
+        )
         job = jobs.submit_job(parts.database, body, settings).id
         with parts.database.write() as session:
             claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
@@ -72,15 +79,31 @@ def _outcome(run: str, number: int) -> RunOutcome:
         return RunOutcome(run_id=run, state=JobState.FAILED, error=WHY)
     rms = 99.0 if number == 7 else 1.0 + number / 1000
     values: list[dict[str, Any]] = [
-        {"name": name, "unit": "1", "value": 2.0 + number, "stderr": 0.1, "lower": 0.01,
-         "upper": 9e3, "interval95": [1.8, 2.2], "status": "identified", "reason": ""}
+        {
+            "name": name,
+            "unit": "1",
+            "value": 2.0 + number,
+            "stderr": 0.1,
+            "lower": 0.01,
+            "upper": 9e3,
+            "interval95": [1.8, 2.2],
+            "status": "identified",
+            "reason": "",
+        }
         for name in ("K", "T")
-    ]  # fmt: skip
+    ]
     return RunOutcome(
-        run_id=run, state=JobState.SUCCEEDED, valid=True, best_rms=rms, rms_noise_free=rms,
-        fit_estimation=100 - rms, evaluations=100, generations=4, seconds=0.01,
+        run_id=run,
+        state=JobState.SUCCEEDED,
+        valid=True,
+        best_rms=rms,
+        rms_noise_free=rms,
+        fit_estimation=100 - rms,
+        evaluations=100,
+        generations=4,
+        seconds=0.01,
         result={"valid": True, "rms": rms, "parameters": values},
-    )  # fmt: skip
+    )
 
 
 def test_the_report_of_thousands_of_runs_is_small(large: Large) -> None:

@@ -24,12 +24,12 @@ pytestmark = [
 def tube(remainder: int) -> Recording:
     recording, _ = read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)
     chosen = {
-        "length_m": 8, "p_nom_bar": 5, "phase": "fill",
+        "length_m": 8,
+        "p_nom_bar": 5,
+        "phase": "fill",
         "repeat": {"modulus": 2, "remainder": remainder},
-    }  # fmt: skip
-    pooled = {
-        "input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1,
-    }  # fmt: skip
+    }
+    pooled = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
     return derive_recording(recording, [{"select": chosen}, {"pool": pooled}])
 
 

@@ -21,10 +21,15 @@ from sysid.simulation.simulate import simulate
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
 
 NARX = {
-    "a[y(k-1)]": 0.5, "a[y(k-1-dh)]": -0.2, "a[u(k-1)]": 0.6, "a[u(k-1-dk)]": 0.3,
-    "a[y(k-1)**2]": -0.1, "a[y(k-1)*u(k-1)]": 0.15, "a[y(k-1-dh)*u(k-1-dk)]": -0.1,
+    "a[y(k-1)]": 0.5,
+    "a[y(k-1-dh)]": -0.2,
+    "a[u(k-1)]": 0.6,
+    "a[u(k-1-dk)]": 0.3,
+    "a[y(k-1)**2]": -0.1,
+    "a[y(k-1)*u(k-1)]": 0.15,
+    "a[y(k-1-dh)*u(k-1-dk)]": -0.1,
     "a[u(k-1-dk)**2]": 0.2,
-}  # fmt: skip
+}
 SMALL = GeneticAlgorithm(generations=40)
 
 
@@ -199,10 +204,14 @@ def test_a_start_that_is_the_optimum_already_is_found_and_told(seed: int, island
     times = np.arange(200.0)
     model = load_model(
         {
-            "name": "arx", "form": "polynomial", "output": "y", "inputs": {"u": "1"},
-            "coefficients": {"lower": -2, "upper": 2}, "terms": ["y(k-1)", "y(k-2)", "u(k-1)"],
+            "name": "arx",
+            "form": "polynomial",
+            "output": "y",
+            "inputs": {"u": "1"},
+            "coefficients": {"lower": -2, "upper": 2},
+            "terms": ["y(k-1)", "y(k-2)", "u(k-1)"],
         }
-    )  # fmt: skip
+    )
     record = Record((Channel("u", times, u, "1"),), (Channel("y", times, y, "1"),))
     algorithm = GeneticAlgorithm(islands=islands, generations=30)
     found = identify(model, [record], algorithm, seed=seed, prediction="one-step")

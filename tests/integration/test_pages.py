@@ -60,9 +60,16 @@ def test_what_a_user_writes_is_escaped(client: TestClient, filled: Filled) -> No
 
 @pytest.mark.parametrize(
     "path",
-    ["/jobs/job_x", "/runs/run_x", "/datasets/ds_x", "/static/x.js", "/static/..%2fpages.py",
-     "/v1/runs/run_x/figures/history", "/pages/models/nothing.yaml"],
-)  # fmt: skip
+    [
+        "/jobs/job_x",
+        "/runs/run_x",
+        "/datasets/ds_x",
+        "/static/x.js",
+        "/static/..%2fpages.py",
+        "/v1/runs/run_x/figures/history",
+        "/pages/models/nothing.yaml",
+    ],
+)
 def test_what_is_not_there_is_not_found(client: TestClient, path: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 404
@@ -105,9 +112,14 @@ def test_every_figure_comes_as_plotly_json_and_as_csv(
 
 @pytest.mark.parametrize(
     ("name", "query"),
-    [("history", "abscissa=years"), ("response", "start=nan"), ("history", "theme=pink"),
-     ("history", "nonsense=1"), ("spectrum", "")],
-)  # fmt: skip
+    [
+        ("history", "abscissa=years"),
+        ("response", "start=nan"),
+        ("history", "theme=pink"),
+        ("history", "nonsense=1"),
+        ("spectrum", ""),
+    ],
+)
 def test_a_figure_that_cannot_be_made_is_a_fault_of_the_request(
     client: TestClient, filled: Filled, name: str, query: str
 ) -> None:
@@ -178,9 +190,14 @@ def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: 
         for number in range(52):
             channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, number]), "V")
             add_recording(
-                parts.database, parts.store, Recording((channel,)), name=f"record {number}",
-                kind="upload", key=f"record {number}", details={"warnings": []},
-            )  # fmt: skip
+                parts.database,
+                parts.store,
+                Recording((channel,)),
+                name=f"record {number}",
+                kind="upload",
+                key=f"record {number}",
+                details={"warnings": []},
+            )
         first = client.get("/datasets").text
         [following] = re.findall(r'rel="next" href="([^"]*)"', first)
         rest = client.get(following).text
@@ -194,10 +211,11 @@ def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: 
 @pytest.mark.parametrize(
     ("path", "status", "told"),
     [
-        ("/jobs/job_x", 404, "there is no job"), ("/nothing", 404, "/nothing"),
+        ("/jobs/job_x", 404, "there is no job"),
+        ("/nothing", 404, "/nothing"),
         ("/compare?run=%3Cb%3E", 422, "run"),
     ],
-)  # fmt: skip
+)
 def test_a_browser_is_told_an_error_on_a_page(
     client: TestClient, path: str, status: int, told: str
 ) -> None:

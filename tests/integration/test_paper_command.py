@@ -25,9 +25,12 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [sys.executable, "-m", "service.cli.main", "paper", *map(str, words)],
-        capture_output=True, text=True, timeout=240, check=False,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
         env={**os.environ, **environment},
-    )  # fmt: skip
+    )
 
 
 def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> None:

@@ -57,12 +57,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
         other = made("other", {**TRUE, "y0": 0, "x(0)": 1}, **seeds)
         faster = made("faster", {**TRUE, "T": 0.3, "y0": 0}, **seeds)
         answer = client.post(
-            "/v1/datasets?name=lonely", content=b"t,u\n0,1\n1,2\n2,3\n",
+            "/v1/datasets?name=lonely",
+            content=b"t,u\n0,1\n1,2\n2,3\n",
             headers={"content-type": "text/csv"},
-        )  # fmt: skip
-        body = {"model": "fopdt", "datasets": [fitted], "name": "found",
-                "parameters": {"L": {"upper": 2}},
-                "algorithm": {"stop": {"evaluations": 6000}}}  # fmt: skip
+        )
+        body = {
+            "model": "fopdt",
+            "datasets": [fitted],
+            "name": "found",
+            "parameters": {"L": {"upper": 2}},
+            "algorithm": {"stop": {"evaluations": 6000}},
+        }
         _, [run] = identified(client.app.state.parts, body)  # type: ignore[attr-defined]
         yield Place(client, run, other, faster, answer.json()["id"], f"/runs/{run}/simulate")
 
@@ -90,9 +95,10 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
     rows = ["series,t,u,y"]
     rows += [f"{n},{0.1 * k:.1f},{(k // 9) % 2},{n * 0.9**k}" for n in range(5) for k in range(60)]
     answer = place.client.post(
-        "/v1/datasets?name=five&segments=series", content="\n".join(rows).encode(),
+        "/v1/datasets?name=five&segments=series",
+        content="\n".join(rows).encode(),
         headers={"content-type": "text/csv"},
-    )  # fmt: skip
+    )
     searched = []
 
     def noted(problem: Problem, *arguments: Any) -> Any:
@@ -260,9 +266,16 @@ def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> No
     text = place.client.get(f"{place.page}?{LOOP}&{query}").text
     body = curl_of(text)
     assert body["control"] | {"reference": None} == {
-        "input": "u", "output": "y", "gain": 0.6, "integral_time": 1.1, "lower": 0.0,
-        "upper": 0.65, "setpoint_weight": 0.8, "derivative_on": "error", "reference": None,
-    }  # fmt: skip
+        "input": "u",
+        "output": "y",
+        "gain": 0.6,
+        "integral_time": 1.1,
+        "lower": 0.0,
+        "upper": 0.65,
+        "setpoint_weight": 0.8,
+        "derivative_on": "error",
+        "reference": None,
+    }
     told = place.client.post(f"/v1/runs/{place.run}:simulate", json=body).json()
     margins, used = told["margins"], told["controller"]
     shown = {

@@ -36,9 +36,13 @@ print(hashlib.sha256(text.encode()).hexdigest())
 def concluded(threads: int) -> str:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": str(threads)}
     done = subprocess.run(
-        [sys.executable, "-c", CONCLUDED], env=environment, capture_output=True, text=True,
-        check=True, cwd=Path(__file__).parents[2],
-    )  # fmt: skip
+        [sys.executable, "-c", CONCLUDED],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[2],
+    )
     return done.stdout
 
 
@@ -86,7 +90,11 @@ def test_a_process_of_the_command_line_has_one_thread_unless_told_otherwise() ->
 
 def threads_of_a_command(environment: dict[str, str]) -> set[int]:
     done = subprocess.run(
-        [sys.executable, "-c", STARTED], env=environment, capture_output=True, text=True,
-        check=True, cwd=Path(__file__).parents[2],
-    )  # fmt: skip
+        [sys.executable, "-c", STARTED],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[2],
+    )
     return set(json.loads(done.stderr))

@@ -31,9 +31,12 @@ def test_a_warm_batch_finds_the_known_time_constants_and_lags(tmp_path: Path) ->
             stored = server.post(f"/v1/datasets?name={name}", content=content, headers=CSV)
             batch.append({"x": length, "datasets": [stored.json()["id"]]})
         body = {
-            "model": "tube", "label": "length_m", "batch": batch, "predict": [30],
+            "model": "tube",
+            "label": "length_m",
+            "batch": batch,
+            "predict": [30],
             "channels": {"u": "P1_meas_Pa", "y": "P2_meas_Pa"},
-        }  # fmt: skip
+        }
         job = server.post("/v1/recipes/reidentify", json=body).json()["id"]
         carried_out(app.state.parts, job)
         trend = server.get(f"/v1/jobs/{job}/trend").json()

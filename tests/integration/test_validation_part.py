@@ -79,9 +79,11 @@ def test_the_rms_of_both_parts_are_in_the_same_measure() -> None:
     found = identify(parse_model(DECAY), record, BRIEF, validation_fraction=FRACTION)
     split = split_record(record, FRACTION)
     for part, simulated, value in zip(
-        split, (found.simulated, found.simulated_validation),
-        (found.rms, found.rms_validation), strict=True,
-    ):  # fmt: skip
+        split,
+        (found.simulated, found.simulated_validation),
+        (found.rms, found.rms_validation),
+        strict=True,
+    ):
         weighted = [
             (channel.values - model) / deviation
             for channel, model, deviation in zip(
@@ -108,9 +110,12 @@ def test_other_records_are_judged_with_the_weights_of_the_estimate() -> None:
 def test_a_worker_builds_the_part_kept_on_the_whole_record_without_noise() -> None:
     record = free_run("duffing-eq16", DUFFING)
     spec = ProblemSpec(
-        model=dict(load_model("duffing-eq16").document), records="r", validation=None,
-        validation_fraction=FRACTION, noise=Noise(0.05, 1),
-    )  # fmt: skip
+        model=dict(load_model("duffing-eq16").document),
+        records="r",
+        validation=None,
+        validation_fraction=FRACTION,
+        noise=Noise(0.05, 1),
+    )
     posed, judged = build_pack_problems(spec, {"r": (record,)})
     estimation, kept, *_ = prepare_run_records(spec, {"r": (record,)})
     assert judged is not None

@@ -19,18 +19,30 @@ from sysid.simulation.simulate import simulate
 QUICK = GeneticAlgorithm(population=30, generations=120)
 STEP, N = 0.02, 300
 FIRST = {
-    "name": "one", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "one",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {
-        "K": {"lower": -5, "upper": 5}, "T": {"lower": 0.02, "upper": 2},
-        "L": {"lower": 0, "upper": 1}, "y0": {"lower": -5, "upper": 5},
+        "K": {"lower": -5, "upper": 5},
+        "T": {"lower": 0.02, "upper": 2},
+        "L": {"lower": 0, "upper": 1},
+        "y0": {"lower": -5, "upper": 5},
     },
-    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x + y0"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "(K*u(t - L) - x)/T"},
+    "outputs": {"y": "x + y0"},
+    "initial": {"x": 0},
+}
 SECOND = {
-    "name": "two", "form": "differential", "inputs": {"u": "1"}, "states": {"a": "1", "b": "1"},
-    "parameters": {"L": {"lower": 0, "upper": 1}}, "outputs": {"y": "b"},
-    "equations": {"a": "(u(t - L) - a)/0.3", "b": "(a - b)/0.3"}, "initial": {"a": 0, "b": 0},
-}  # fmt: skip
+    "name": "two",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"a": "1", "b": "1"},
+    "parameters": {"L": {"lower": 0, "upper": 1}},
+    "outputs": {"y": "b"},
+    "equations": {"a": "(u(t - L) - a)/0.3", "b": "(a - b)/0.3"},
+    "initial": {"a": 0, "b": 0},
+}
 
 
 def steps(seed: int = 0) -> FloatArray:

@@ -27,14 +27,22 @@ QUICK = GeneticAlgorithm(generations=40)
 def lag_model(initial: Any = 0.0, **bounds: Mapping[str, Any]) -> Model:
     """K e^(-Ls)/(Ts + 1)."""
     parameters = {
-        "K": {"lower": -5, "upper": 5}, "T": {"lower": 0.05, "upper": 5},
+        "K": {"lower": -5, "upper": 5},
+        "T": {"lower": 0.05, "upper": 5},
         "L": {"lower": 0, "upper": 2},
-    }  # fmt: skip
-    return parse_model({
-        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "parameters": parameters | bounds, "equations": {"x": "(K*u(t - L) - x)/T"},
-        "outputs": {"y": "x"}, "initial": {"x": initial},
-    })  # fmt: skip
+    }
+    return parse_model(
+        {
+            "name": "lag",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m"},
+            "parameters": parameters | bounds,
+            "equations": {"x": "(K*u(t - L) - x)/T"},
+            "outputs": {"y": "x"},
+            "initial": {"x": initial},
+        }
+    )
 
 
 def source(seed: int = 1, samples: int = 400, period: float = 0.05) -> Channel:
@@ -172,12 +180,18 @@ def test_a_drift_that_is_taken_away_does_no_harm() -> None:
 
 def test_one_step_prediction_uses_the_measured_past_and_a_free_run_does_not() -> None:
     """With noise inside the loop one step ahead is right, and the free run is far off."""
-    model = parse_model({
-        "name": "arx", "form": "difference", "inputs": {"u": "V"}, "states": {"y": "m"},
-        "parameters": {"a": {"lower": -1, "upper": 1}, "b": {"lower": -5, "upper": 5}},
-        "equations": {"y": "a*y(k-1) + b*u(k-1)"}, "outputs": {"y": "y"},
-        "initial": {"y": "measured"},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "arx",
+            "form": "difference",
+            "inputs": {"u": "V"},
+            "states": {"y": "m"},
+            "parameters": {"a": {"lower": -1, "upper": 1}, "b": {"lower": -5, "upper": 5}},
+            "equations": {"y": "a*y(k-1) + b*u(k-1)"},
+            "outputs": {"y": "y"},
+            "initial": {"y": "measured"},
+        }
+    )
     given, rng = source(), np.random.default_rng(4)
     y = np.zeros(given.times.size)
     for k in range(1, y.size):

@@ -20,11 +20,18 @@ BOUNDS = {"L": {"upper": 2.0}}
 
 def polynomial() -> Model:
     """A recursion whose starts are sought by least squares, which counts too."""
-    return parse_model({
-        "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 2,
-        "lags": {"y": [1], "u": ["1 + d"]}, "coefficients": {"lower": -2, "upper": 2},
-        "parameters": {"d": {"lower": 0, "upper": 6}},
-    })  # fmt: skip
+    return parse_model(
+        {
+            "name": "n",
+            "form": "polynomial",
+            "output": "y",
+            "inputs": {"u": "1"},
+            "degree": 2,
+            "lags": {"y": [1], "u": ["1 + d"]},
+            "coefficients": {"lower": -2, "upper": 2},
+            "parameters": {"d": {"lower": 0, "upper": 6}},
+        }
+    )
 
 
 def record() -> Record:
@@ -37,16 +44,24 @@ def record() -> Record:
 @pytest.mark.parametrize("model", [LAG, polynomial()], ids=["lag", "polynomial"])
 @settings(max_examples=25)
 @given(
-    budget=st.integers(24, 900), method=st.sampled_from(SEARCH_METHODS), refine=st.booleans(),
-    population=st.sampled_from([24, 50, 130]), islands=st.sampled_from([None, 1, 6]),
-)  # fmt: skip
+    budget=st.integers(24, 900),
+    method=st.sampled_from(SEARCH_METHODS),
+    refine=st.booleans(),
+    population=st.sampled_from([24, 50, 130]),
+    islands=st.sampled_from([None, 1, 6]),
+)
 def test_a_budget_is_never_exceeded_or_refused_where_one_population_does(
-    model: Model, budget: int, method: SearchMethod, refine: bool, population: int,
+    model: Model,
+    budget: int,
+    method: SearchMethod,
+    refine: bool,
+    population: int,
     islands: int | None,
-) -> None:  # fmt: skip
+) -> None:
     def algorithm() -> GeneticAlgorithm:
-        return GeneticAlgorithm(method, population, islands=islands, refine=refine,
-                                stop=Stop(evaluations=budget))  # fmt: skip
+        return GeneticAlgorithm(
+            method, population, islands=islands, refine=refine, stop=Stop(evaluations=budget)
+        )
 
     if budget < population:
         with pytest.raises(InvalidSettings, match="simulations of one population") as caught:

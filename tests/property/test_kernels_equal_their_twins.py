@@ -95,9 +95,11 @@ def test_a_measured_start_gives_the_first_samples_of_a_recursion() -> None:
 
 def test_several_experiments_and_outputs_equal_their_twin() -> None:
     model = differential(
-        LAGGED, "x", outputs={"y": "x", "z": "v - u(t-L)"},
+        LAGGED,
+        "x",
+        outputs={"y": "x", "z": "v - u(t-L)"},
         initial={"x": {"lower": -1, "upper": 1}, "v": 0.1},
-    )  # fmt: skip
+    )
     records = [record(20, outputs=("y", "z")), record(25, 0.04, seed=5, outputs=("z", "y"))]
     problem = Problem.build(model, records, skip=3)
     assert [p.name for p in problem.free_parameters] == ["c", "L", "b", "x(0)", "x(0)[2]"]

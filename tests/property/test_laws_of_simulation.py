@@ -78,8 +78,12 @@ def test_fitness_is_continuous_in_the_lag_down_to_none() -> None:
 
 
 def test_without_lag_the_integration_agrees_with_scipy() -> None:
-    model = differential({"x": "v", "v": "u(t) - c*v - b*x - 0.5*x**3"}, "x", initial={"x": 0.3,
-                         "v": -0.2}, solver={"substeps": 4})  # fmt: skip
+    model = differential(
+        {"x": "v", "v": "u(t) - c*v - b*x - 0.5*x**3"},
+        "x",
+        initial={"x": 0.3, "v": -0.2},
+        solver={"substeps": 4},
+    )
     times = 0.05 * np.arange(101)
     u = np.interp(times, [0.0, 1.0, 2.5, 5.0], [0.0, 1.0, -1.0, 0.5])
     found = simulate(model, [Channel("u", times, u)], {"c": 0.3, "L": 0, "b": 4}, times=times)
@@ -87,8 +91,9 @@ def test_without_lag_the_integration_agrees_with_scipy() -> None:
     def slope(t: float, x: np.ndarray) -> list[float]:
         return [x[1], np.interp(t, times, u) - 0.3 * x[1] - 4 * x[0] - 0.5 * x[0] ** 3]
 
-    expected = solve_ivp(slope, (0, 5), [0.3, -0.2], t_eval=times, rtol=1e-10, atol=1e-12,
-                         max_step=0.05)  # fmt: skip
+    expected = solve_ivp(
+        slope, (0, 5), [0.3, -0.2], t_eval=times, rtol=1e-10, atol=1e-12, max_step=0.05
+    )
     np.testing.assert_allclose(found.channels[0].values, expected.y[0], atol=2e-8)
 
 

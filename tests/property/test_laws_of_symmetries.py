@@ -111,13 +111,16 @@ def test_scalings_of_an_equation_of_a_hidden_state(equation: str, count: int) ->
     names = [one for one in "abcd" if one == "d" or re.search(rf"\b{one}\b", equation)]
     model = parse_model(
         {
-            "name": "test", "form": "differential", "inputs": {"u": "V"},
+            "name": "test",
+            "form": "differential",
+            "inputs": {"u": "V"},
             "states": {"z": "m", "y": "m"},
             "parameters": {one: {"lower": 0.1, "upper": 4} for one in names},
-            "equations": {"z": equation, "y": "d*z - y"}, "outputs": {"y": "y"},
+            "equations": {"z": equation, "y": "d*z - y"},
+            "outputs": {"y": "y"},
             "initial": {"z": {"lower": 0, "upper": 2}, "y": 0},
         }
-    )  # fmt: skip
+    )
     times: FloatArray = 0.05 * np.arange(60, dtype=np.float64)
     u = Channel("u", times, 1.5 + np.sin(times), "V", "first")
     truth = {"a": 0.7, "b": 1.3, "c": 0.4, "d": 1.1}
@@ -128,14 +131,17 @@ def test_scalings_of_an_equation_of_a_hidden_state(equation: str, count: int) ->
 def test_a_fixed_exponent_hides_the_scaling_no_more_than_a_number_does() -> None:
     model = parse_model(
         {
-            "name": "test", "form": "differential", "inputs": {"u": "V"},
+            "name": "test",
+            "form": "differential",
+            "inputs": {"u": "V"},
             "states": {"z": "m", "y": "m"},
             "parameters": {one: {"lower": 0.1, "upper": 4} for one in "abd"}
             | {"n": {"lower": 0.1, "upper": 4, "fixed": 0.37}},
-            "equations": {"z": "a*u - b*abs(z)**n", "y": "d*z - y"}, "outputs": {"y": "y"},
+            "equations": {"z": "a*u - b*abs(z)**n", "y": "d*z - y"},
+            "outputs": {"y": "y"},
             "initial": {"z": {"lower": 0, "upper": 2}, "y": 0},
         }
-    )  # fmt: skip
+    )
     times: FloatArray = 0.05 * np.arange(60, dtype=np.float64)
     u = Channel("u", times, 1.5 + np.sin(times), "V", "first")
     values = {"a": 0.7, "b": 1.3, "d": 1.1, "n": 0.37, "z(0)": 0.5}

@@ -40,9 +40,11 @@ def quiet_first(seed: int) -> FloatArray:
 
 @settings(max_examples=12)
 @given(
-    st.sampled_from(sorted(SYSTEMS)), st.sampled_from(["zero", "first"]),
-    st.integers(1, 30), st.integers(0, 1000),
-)  # fmt: skip
+    st.sampled_from(sorted(SYSTEMS)),
+    st.sampled_from(["zero", "first"]),
+    st.integers(1, 30),
+    st.integers(0, 1000),
+)
 def test_a_delayed_input_delays_the_output(name: str, hold: Any, by: int, seed: int) -> None:
     values = quiet_first(seed)
     late = np.concatenate([np.zeros(by), values[:-by]])

@@ -16,8 +16,9 @@ def test_cells_before_a_number_are_counted_as_if_they_were_made(
     end = data.draw(st.integers(0, prod(lengths)))
     fixed = {
         place: data.draw(st.integers(0, length - 1))
-        for place, length in enumerate(lengths) if data.draw(st.booleans())
-    }  # fmt: skip
+        for place, length in enumerate(lengths)
+        if data.draw(st.booleans())
+    }
     cells = [locate_cell(number, lengths) for number in range(end)]
     expected = sum(all(cell[place] == at for place, at in fixed.items()) for cell in cells)
     assert count_cells_below(end, lengths, fixed) == expected

@@ -12,7 +12,11 @@ from sysid.models.parse import parse_model
 
 junk = st.recursive(
     st.one_of(
-        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8),
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(max_size=8),
         st.sampled_from(["x", "k", "y(k-1)", "measured", "log", "all", 1e308, -1, 10**400]),
     ),
     lambda inner: st.one_of(
@@ -20,7 +24,7 @@ junk = st.recursive(
         st.dictionaries(st.one_of(st.text(max_size=4), st.integers()), inner, max_size=3),
     ),
     max_leaves=4,
-)  # fmt: skip
+)
 
 
 @given(st.sampled_from(catalogue()), st.data())

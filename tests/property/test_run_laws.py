@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sysid.core.settings import (  # fmt: skip
+from sysid.core.settings import (
     SEARCH_METHODS,
     GeneticAlgorithm,
     IslandChange,
@@ -17,7 +17,7 @@ from sysid.core.settings import (  # fmt: skip
     Stop,
 )
 from sysid.identification import run
-from sysid.identification.run import (  # fmt: skip
+from sysid.identification.run import (
     advance_island,
     advance_run,
     begin_run,
@@ -40,9 +40,13 @@ METHOD = st.sampled_from(SEARCH_METHODS)
 
 def small(method: SearchMethod = "improved", **changes: object) -> GeneticAlgorithm:
     values: dict[str, object] = {
-        "method": method, "population": 24, "generations": 40, "islands": 3, "stagnation": 5,
+        "method": method,
+        "population": 24,
+        "generations": 40,
+        "islands": 3,
+        "stagnation": 5,
         "migration": Migration(every=10),
-    }  # fmt: skip
+    }
     return GeneticAlgorithm(**(values | changes))  # type: ignore[arg-type]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sysid.trends.laws import TrendLaw, fit_line, fit_power
-from sysid.trends.trend import (  # fmt: skip
+from sysid.trends.trend import (
     Drift,
     TrendEstimate,
     TrendPoint,
@@ -277,8 +277,9 @@ def test_of_five_points_a_gross_change_is_seen_whether_their_errors_are_right_or
 
 
 def test_the_limit_is_three_and_moderately_more_for_many_comparisons_and_few_points() -> None:
-    right, wrong = (fit_line(X, 0.3 * X + np.array([0, 1, -1, 1, 0]), np.full(5, s))
-                    for s in (1.0, 0.2))  # fmt: skip
+    right, wrong = (
+        fit_line(X, 0.3 * X + np.array([0, 1, -1, 1, 0]), np.full(5, s)) for s in (1.0, 0.2)
+    )
     assert compute_drift_limit() == pytest.approx(3.0)
     assert compute_drift_limit(right) == pytest.approx(3.0)
     assert compute_drift_limit(None, 15) == pytest.approx(-stats.norm.ppf(stats.norm.sf(3) / 15))

@@ -14,9 +14,15 @@ from sysid.plants.actuator import Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
 
 PUBLISHED = {
-    "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,
-    "A_m": 5.0e-6, "B": 1.0e-3, "theta_s": 0.75 * pi,
-}  # fmt: skip
+    "J": 3.6e-4,
+    "F_c": 1.2317e-2,
+    "F_max": 3.3333e-2,
+    "k_a": 83.089,
+    "k_c": 456.99e3,
+    "A_m": 5.0e-6,
+    "B": 1.0e-3,
+    "theta_s": 0.75 * pi,
+}
 KNOWN_SPREAD = {"J": 3e-3, "F_c": 1.5e-3, "F_max": 1.5e-3, "k_a": 5e-3, "k_c": 6e-3}
 TIMES = 0.01 * np.arange(800)
 
@@ -121,8 +127,10 @@ def test_both_exact_symmetries_leave_the_angle_unchanged() -> None:
     forces = {name: 1.7 * PUBLISHED[name] for name in ("J", "B", "F_c", "F_max", "A_m")}
     np.testing.assert_allclose(angle(given, **forces), before, rtol=0, atol=1e-9)
     pressures = {
-        "A_m": PUBLISHED["A_m"] / 1.7, "k_b": 1.7 * PUBLISHED["k_a"], "k_c": 1.7 * PUBLISHED["k_c"],
-    }  # fmt: skip
+        "A_m": PUBLISHED["A_m"] / 1.7,
+        "k_b": 1.7 * PUBLISHED["k_a"],
+        "k_c": 1.7 * PUBLISHED["k_c"],
+    }
     np.testing.assert_allclose(angle(given, **pressures), before, rtol=0, atol=1e-9)
 
 

@@ -81,9 +81,11 @@ def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
     """Modules that compiled functions come from or take values from, however indirectly."""
     known = {path: Names(path) for path in modules}
     waiting = [
-        (path, name) for path, names in known.items() for name, node in names.made.items()
+        (path, name)
+        for path, names in known.items()
+        for name, node in names.made.items()
         if isinstance(node, ast.FunctionDef) and is_compiled(node)
-    ]  # fmt: skip
+    ]
     seen: set[tuple[Path, str]] = set()
     while waiting:
         path, name = one = waiting.pop()
@@ -124,9 +126,12 @@ def test_another_fingerprint_compiles_anew(tmp_path: Path) -> None:
     def run(fingerprint: str) -> str:
         command = [sys.executable, "-c", PROGRAM, str(tmp_path), fingerprint]
         return subprocess.run(
-            command, check=True, capture_output=True, text=True,
+            command,
+            check=True,
+            capture_output=True,
+            text=True,
             env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-        ).stdout.strip()  # fmt: skip
+        ).stdout.strip()
 
     assert run("a") == "4.0 0"
     assert run("a") == "4.0 1"
@@ -149,9 +154,12 @@ def test_code_compiled_while_an_update_replaces_sources_is_not_kept(tmp_path: Pa
     shutil.copytree(ROOT / "sysid", tmp_path / "sysid")
     (tmp_path / "module.py").write_text(MODULE)
     done = subprocess.run(
-        [sys.executable, "-c", UPDATED, str(tmp_path)], check=True, capture_output=True, text=True,
+        [sys.executable, "-c", UPDATED, str(tmp_path)],
+        check=True,
+        capture_output=True,
+        text=True,
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-    )  # fmt: skip
+    )
     assert done.stdout.strip() == "4.0"
     assert "sources have changed since this process began" in done.stderr
     assert not (tmp_path / "cache").exists()
@@ -243,9 +251,11 @@ def no_home() -> Path:
     ids=lambda one: one[1],
 )
 def test_without_an_inside_of_numba_functions_are_compiled_as_without_a_cache(
-    folder: Path, absent: tuple[Any, str], monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    absent: tuple[Any, str],
+    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.delattr(*absent)
     assert [hits(), hits()] == [0, 0]
     assert len(caplog.records) == 1

@@ -20,10 +20,12 @@ def test_without_axes_there_is_no_chain() -> None:
 @pytest.mark.parametrize(
     ("axes", "along"),
     [
-        ([SEEDS, DATA], "/datasets"), ([DATA, SEEDS], "/datasets"),
-        ([DATA, SEEDS, LABELLED], "/noise/sigma"), ([SEEDS], "/seed"),
+        ([SEEDS, DATA], "/datasets"),
+        ([DATA, SEEDS], "/datasets"),
+        ([DATA, SEEDS, LABELLED], "/noise/sigma"),
+        ([SEEDS], "/seed"),
     ],
-)  # fmt: skip
+)
 def test_the_run_before_differs_in_that_axis_only_by_one_step(
     axes: list[SweepAxis], along: str
 ) -> None:

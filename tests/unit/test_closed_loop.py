@@ -20,9 +20,16 @@ from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
 
 ACTUATOR = {
-    "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,
-    "A_m": 5.0e-6, "B": 1.0e-3, "theta_s": 0.75 * pi, "theta(0)": 0.0,
-}  # fmt: skip
+    "J": 3.6e-4,
+    "F_c": 1.2317e-2,
+    "F_max": 3.3333e-2,
+    "k_a": 83.089,
+    "k_c": 456.99e3,
+    "A_m": 5.0e-6,
+    "B": 1.0e-3,
+    "theta_s": 0.75 * pi,
+    "theta(0)": 0.0,
+}
 TUBE = Transport(1.0, 0.35, 0.127)
 TIMES: FloatArray = 0.01 * np.arange(601.0)
 
@@ -44,10 +51,15 @@ def arm(gain: float, transport: Transport | None = TUBE) -> tuple[FloatArray, St
 def lag(output: str = "y", **fields: Any) -> Model:
     """First-order lag behind a dead time."""
     document = {
-        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"y": "m"},
+        "name": "lag",
+        "form": "differential",
+        "inputs": {"u": "V"},
+        "states": {"y": "m"},
         "parameters": {"T": {"lower": 0.1, "upper": 2}, "L": {"lower": 0, "upper": 1}},
-        "equations": {"y": "(u(t-L) - y)/T"}, "outputs": {"y": output}, "initial": {"y": 0},
-    }  # fmt: skip
+        "equations": {"y": "(u(t-L) - y)/T"},
+        "outputs": {"y": output},
+        "initial": {"y": 0},
+    }
     return parse_model(document | fields)
 
 
@@ -97,8 +109,15 @@ def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
         late = f"t - L - {element.delay}"
         drive = with_limit.format(f"r({late}) - y({late})")
         equations["y"] = f"({element.gain}*{drive} - y)/T"
-    twin = parse_model({**lag().document, "inputs": {"r": "m"}, "states": states,
-                        "equations": equations, "initial": {}})  # fmt: skip
+    twin = parse_model(
+        {
+            **lag().document,
+            "inputs": {"r": "m"},
+            "states": states,
+            "equations": equations,
+            "initial": {},
+        }
+    )
     values = {"T": 0.7, "L": 0.15}
     found = simulate(loop.model, [stepped(2.0, "m")], values, times=TIMES)
     reference = stepped(2.0)
@@ -107,13 +126,20 @@ def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
     np.testing.assert_allclose(found.channel("y").values, expected, rtol=1e-9, atol=1e-12)
     command = found.channel(loop.command).values
     wanted = 3.0 * (2.0 - expected)
-    np.testing.assert_allclose(command, wanted if limit is None else np.clip(wanted, -1.5, 1.5),
-                               rtol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(
+        command, wanted if limit is None else np.clip(wanted, -1.5, 1.5), rtol=1e-9
+    )
 
 
 def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> None:
-    direct = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
-              "equations": {"x": "0.5*x(k-1) + 0.4*u"}, "outputs": {"y": "x"}}  # fmt: skip
+    direct = {
+        "name": "d",
+        "form": "difference",
+        "inputs": {"u": "V"},
+        "states": {"x": "m"},
+        "equations": {"x": "0.5*x(k-1) + 0.4*u"},
+        "outputs": {"y": "x"},
+    }
     late = direct | {"equations": {"x": "0.5*x(k-1) + 0.4*u(k-1)"}}
     control = PidControl("u", "y", 1.1)
     loops = [close_loop(parse_model(one), control) for one in (direct, late)]
@@ -127,8 +153,14 @@ def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> No
     np.testing.assert_allclose(first.channel("y").values[1:], expected[1:], rtol=1e-12)
 
 
-DIRECT = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
-          "equations": {"x": "0.5*x(k-1) + 0.4*u"}, "outputs": {"y": "x"}}  # fmt: skip
+DIRECT = {
+    "name": "d",
+    "form": "difference",
+    "inputs": {"u": "V"},
+    "states": {"x": "m"},
+    "equations": {"x": "0.5*x(k-1) + 0.4*u"},
+    "outputs": {"y": "x"},
+}
 
 
 @pytest.mark.parametrize(
@@ -151,8 +183,9 @@ def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, b
 
 def test_during_a_dead_time_of_whole_steps_the_plant_goes_on() -> None:
     """Ten steps of delay are no ten samples that a recursion is given."""
-    plant = parse_model({**DIRECT, "inputs": {"u": "V", "v": "V"},
-                         "equations": {"x": "0.5*x(k-1) + 0.4*u + v"}})  # fmt: skip
+    plant = parse_model(
+        {**DIRECT, "inputs": {"u": "V", "v": "V"}, "equations": {"x": "0.5*x(k-1) + 0.4*u + v"}}
+    )
     control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.1))
     loop = close_loop(plant, control, 0.01)
     steady = Channel("v", TIMES, np.ones(TIMES.size), "V")
@@ -180,11 +213,18 @@ def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:
 
 
 def test_a_polynomial_can_be_controlled() -> None:
-    narx = parse_model({
-        "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "V"}, "degree": 1,
-        "lags": {"y": [1], "u": [1]}, "coefficients": {"lower": -2, "upper": 2},
-        "initial": {"y": 0},
-    })  # fmt: skip
+    narx = parse_model(
+        {
+            "name": "n",
+            "form": "polynomial",
+            "output": "y",
+            "inputs": {"u": "V"},
+            "degree": 1,
+            "lags": {"y": [1], "u": [1]},
+            "coefficients": {"lower": -2, "upper": 2},
+            "initial": {"y": 0},
+        }
+    )
     loop = close_loop(narx, PidControl("u", "y", 2.0))
     names = [parameter.name for parameter in narx.parameters]
     values = loop.rename_values(dict(zip(names, (0.8, 0.1), strict=True)))
@@ -203,8 +243,13 @@ def test_an_output_with_the_input_in_it_needs_a_transport_that_takes_time() -> N
 
 
 def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> None:
-    taken = lag(parameters={"T": {"lower": 0.1, "upper": 2}, "L": {"lower": 0, "upper": 1},
-                            "reference": {"lower": 0, "upper": 1}})  # fmt: skip
+    taken = lag(
+        parameters={
+            "T": {"lower": 0.1, "upper": 2},
+            "L": {"lower": 0, "upper": 1},
+            "reference": {"lower": 0, "upper": 1},
+        }
+    )
     loop = close_loop(taken, PidControl("u", "y", 1.0))
     assert [one.name for one in loop.model.inputs] == [loop.reference] == ["reference_"]
     assert [one.name for one in loop.model.outputs] == ["y", "u", "command"]
@@ -313,10 +358,12 @@ def test_a_swing_that_grows_slowly_runs_away(rate: float) -> None:
         (np.where(SINCE < 13.5, 0.0, 1.5 * (1 - np.exp(13.5 - SINCE)) - 0.1), False),
         (-(1 - np.exp(-SINCE / 6)), True),
         (1 - np.cos(3 * SINCE), False),
-        (1 - np.exp(-SINCE) * np.cos(3 * SINCE) + 1e-15 * np.cos(40 * SINCE) * np.exp(SINCE / 9),
-         True),
+        (
+            1 - np.exp(-SINCE) * np.cos(3 * SINCE) + 1e-15 * np.cos(40 * SINCE) * np.exp(SINCE / 9),
+            True,
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_response_that_is_far_off_late_or_slow_does_not_run_away(
     values: FloatArray, is_settled: bool
 ) -> None:

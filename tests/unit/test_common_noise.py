@@ -15,12 +15,23 @@ from sysid.uncertainty.analysis import Analysis, analyse_estimate
 
 TIMES = 0.05 * np.arange(300.0)
 TRUTH = {"a": 2.0, "b": 1.5, "T": 0.6, "L": 0.3}
-MODEL = parse_model({
-    "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-    "parameters": {"a": {"lower": 0.1, "upper": 5}, "b": {"lower": 0.1, "upper": 5},
-                   "T": {"lower": 0.1, "upper": 3}, "L": {"lower": 0, "upper": 1}},
-    "equations": {"x": "(u(t-L) - x)/T"}, "outputs": {"y": "a*x", "z": "b*x"}, "initial": {"x": 0},
-})  # fmt: skip
+MODEL = parse_model(
+    {
+        "name": "two",
+        "form": "differential",
+        "inputs": {"u": "V"},
+        "states": {"x": "m"},
+        "parameters": {
+            "a": {"lower": 0.1, "upper": 5},
+            "b": {"lower": 0.1, "upper": 5},
+            "T": {"lower": 0.1, "upper": 3},
+            "L": {"lower": 0, "upper": 1},
+        },
+        "equations": {"x": "(u(t-L) - x)/T"},
+        "outputs": {"y": "a*x", "z": "b*x"},
+        "initial": {"x": 0},
+    }
+)
 U = Channel("u", TIMES, np.repeat(np.random.default_rng(7).normal(size=30), 10), hold="zero")
 CLEAN = simulate(MODEL, [U], TRUTH, times=TIMES).channels
 

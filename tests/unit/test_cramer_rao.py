@@ -13,10 +13,15 @@ from sysid.uncertainty.cramer_rao import cramer_rao_bound
 TIMES = np.arange(200) * 0.1
 INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES
 LINE = {
-    "name": "line", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "line",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {"a": {"lower": 0.1, "upper": 10}, "b": {"lower": -5, "upper": 5}},
-    "equations": {"x": "-x"}, "outputs": {"y": "a*u(t) + b + x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "-x"},
+    "outputs": {"y": "a*u(t) + b + x"},
+    "initial": {"x": 0},
+}
 
 
 def problem(document=LINE, skip=0, **options):
@@ -47,8 +52,11 @@ def test_bounds_and_scale_of_the_search_do_not_change_the_floor():
 
 
 def test_a_product_of_which_the_data_tell_no_factor_has_none_but_the_others_keep_theirs():
-    document = {**LINE, "outputs": {"y": "a*c*u(t) + b + x"},
-                "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}}}  # fmt: skip
+    document = {
+        **LINE,
+        "outputs": {"y": "a*c*u(t) + b + x"},
+        "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}},
+    }
     found = cramer_rao_bound(problem(document), np.array([1.0, 1.0, 2.0]))
     known = dict(zip(found.names, found.stderr.tolist(), strict=True))
     assert np.isinf(known["a"])
@@ -78,14 +86,20 @@ def test_weights_that_are_not_one_are_refused():
 
 
 LAGGED = {
-    "name": "lagged", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "lagged",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {
-        "K": {"lower": 0.1, "upper": 10}, "T": {"lower": 0.1, "upper": 10, "unit": "s"},
-        "L": {"lower": 0, "upper": 1, "unit": "s"}, "y0": {"lower": -1, "upper": 1},
+        "K": {"lower": 0.1, "upper": 10},
+        "T": {"lower": 0.1, "upper": 10, "unit": "s"},
+        "L": {"lower": 0, "upper": 1, "unit": "s"},
+        "y0": {"lower": -1, "upper": 1},
     },
-    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x + y0"},
+    "equations": {"x": "(K*u(t - L) - x)/T"},
+    "outputs": {"y": "x + y0"},
     "initial": {"x": {"lower": -1, "upper": 1}},
-}  # fmt: skip
+}
 
 
 def few(samples: int, document=LAGGED) -> Problem:
@@ -105,8 +119,12 @@ def test_fewer_samples_than_parameters_tell_none_of_those_they_mix(samples):
 
 
 def test_what_few_samples_tell_by_itself_keeps_its_floor():
-    document = {**LINE, "inputs": {}, "outputs": {"y": "a + b*c*0 + x"},
-                "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}}}  # fmt: skip
+    document = {
+        **LINE,
+        "inputs": {},
+        "outputs": {"y": "a + b*c*0 + x"},
+        "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}},
+    }
     times = np.array([0.0, 1.0])
     record = Record((), (Channel("y", times, np.ones(2)),))
     posed = Problem.build(parse_model(document), [record], weights={"y": 1.0})

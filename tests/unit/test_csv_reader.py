@@ -33,9 +33,9 @@ def test_the_time_column_goes_by_several_names(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unit", "row", "seconds"), [("min", 0.1, 6.0), ("ms", 3.0, 0.003), ("h", 0.5, 1800.0),
-                                 ("Sec", 3.0, 3.0)],
-)  # fmt: skip
+    ("unit", "row", "seconds"),
+    [("min", 0.1, 6.0), ("ms", 3.0, 0.003), ("h", 0.5, 1800.0), ("Sec", 3.0, 3.0)],
+)
 def test_times_in_another_unit_become_seconds(unit: str, row: float, seconds: float) -> None:
     recording, notes = read_csv(f"t [{unit}],u\n0,1\n{row},2\n{2 * row},3\n".encode())
     assert recording.channel("u").times.tolist() == [0.0, seconds, 2 * seconds]

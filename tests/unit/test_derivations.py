@@ -232,9 +232,11 @@ def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some()
 def test_pooled_outputs_are_of_segments_that_exist() -> None:
     pooling = {"input": "u", "outputs": ["y"], "bin": 0.3}
     for wrong, pointer in (
-        ({"m": 1}, "/steps/0/pool/outputs_from/m"), (3, "/steps/0/pool/outputs_from"),
-        ({"n": 99}, "/steps/0/pool/outputs_from"), ({}, "/steps/0/pool/outputs_from"),
-    ):  # fmt: skip
+        ({"m": 1}, "/steps/0/pool/outputs_from/m"),
+        (3, "/steps/0/pool/outputs_from"),
+        ({"n": 99}, "/steps/0/pool/outputs_from"),
+        ({}, "/steps/0/pool/outputs_from"),
+    ):
         with pytest.raises(InvalidSettings) as caught:
             derive_recording(repeats(), [{"pool": pooling | {"outputs_from": wrong}}])
         assert caught.value.pointer == pointer
@@ -279,7 +281,7 @@ def test_pooled_outputs_are_of_segments_that_exist() -> None:
         ([{"pool": {"input": "u", "outputs": ["y"], "bin": 1, "stop": 0}}], "/steps/0/pool/stop"),
         ([{"pool": {"input": "u", "outputs": ["y"], "bin": 1, "start": 50}}], "/steps/0/pool/stop"),
     ],
-)  # fmt: skip
+)
 def test_a_bad_step_is_told_with_its_pointer(steps: Any, pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
         derive_recording(recording(), steps)

@@ -22,8 +22,10 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def figure(*traces: dict[str, Any], **more: Any) -> dict[str, Any]:
     shared = {"xaxis": {"title": {"text": "time [s]"}}, "yaxis": {"title": {"text": "y [m]"}}}
-    return {"data": [{"type": "scatter", **one} for one in traces],
-            "layout": base_layout(300, **{**shared, **more})}  # fmt: skip
+    return {
+        "data": [{"type": "scatter", **one} for one in traces],
+        "layout": base_layout(300, **{**shared, **more}),
+    }
 
 
 def parsed(found: str) -> ElementTree.Element:
@@ -45,8 +47,9 @@ def path_of(found: str, colour: str = "#123456") -> str:
 
 
 def test_an_axis_puts_its_ends_at_its_edges_and_y_goes_up() -> None:
-    axes = build_axes(figure(line([0, 10], [0, 1]), xaxis={"range": [0, 10]},
-                          yaxis={"range": [-1, 1]}), BOX)  # fmt: skip
+    axes = build_axes(
+        figure(line([0, 10], [0, 1]), xaxis={"range": [0, 10]}, yaxis={"range": [-1, 1]}), BOX
+    )
     assert (axes["x"].to_pixel(0), axes["x"].to_pixel(10)) == (100, 500)
     assert (axes["y"].to_pixel(-1), axes["y"].to_pixel(1)) == (220, 20)
 
@@ -64,8 +67,12 @@ def test_a_logarithmic_axis_gives_every_decade_the_same_room() -> None:
 
 
 def test_axes_that_match_have_one_range() -> None:
-    made = figure(line([0, 1], [0, 1]), line([5, 9], [0, 1], xaxis="x2", yaxis="y2"),
-                  xaxis2={"matches": "x"}, yaxis2={"anchor": "x2"})  # fmt: skip
+    made = figure(
+        line([0, 1], [0, 1]),
+        line([5, 9], [0, 1], xaxis="x2", yaxis="y2"),
+        xaxis2={"matches": "x"},
+        yaxis2={"anchor": "x2"},
+    )
     axes = build_axes(made, BOX)
     assert (axes["x"].low, axes["x"].high) == (axes["x2"].low, axes["x2"].high)
 
@@ -80,9 +87,18 @@ def test_all_points_lie_inside_and_errors_too() -> None:
 
 @pytest.mark.parametrize(
     ("value", "label"),
-    [(0, "0"), (0.05, "0.05"), (-2, "−2"), (9000, "9000"), (20000, "20k"), (-1.5e6, "−1.5M"),
-     (1e-6, "1·10⁻⁶"), (1e15, "1·10¹⁵"), (0.1 + 0.2, "0.3")],
-)  # fmt: skip
+    [
+        (0, "0"),
+        (0.05, "0.05"),
+        (-2, "−2"),
+        (9000, "9000"),
+        (20000, "20k"),
+        (-1.5e6, "−1.5M"),
+        (1e-6, "1·10⁻⁶"),
+        (1e15, "1·10¹⁵"),
+        (0.1 + 0.2, "0.3"),
+    ],
+)
 def test_ticks_are_written_shortly(value: float, label: str) -> None:
     assert format_tick(value) == label
 

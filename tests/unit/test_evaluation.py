@@ -15,21 +15,35 @@ TIMES = np.arange(400) / 16  # exact, so that comparisons with them are
 @pytest.mark.parametrize(
     "expression",
     [
-        "12e3*(0.55*sin(2.2*t) + 0.6*cos(5.65*t + 1))", "3", "-t**2 + pi", "k*h",
+        "12e3*(0.55*sin(2.2*t) + 0.6*cos(5.65*t + 1))",
+        "3",
+        "-t**2 + pi",
+        "k*h",
         "exp(-t/2)*log(t + 1)",
-        "where(t < 2 or not (t <= 4 and t != 3), 1, min(t, 5, k/7))", "sqrt(t - 3)", "1/(t - 3)",
-        "abs(tan(t)) + sign(t - 4)*tanh(t) - atan(t)", "max(log(t - 1), 0)", "t**0.5 + 2**(-t)",
+        "where(t < 2 or not (t <= 4 and t != 3), 1, min(t, 5, k/7))",
+        "sqrt(t - 3)",
+        "1/(t - 3)",
+        "abs(tan(t)) + sign(t - 4)*tanh(t) - atan(t)",
+        "max(log(t - 1), 0)",
+        "t**0.5 + 2**(-t)",
         "log(t - 3)",
-        "where(t > 5, sqrt(t - 5), -1)", "(t - 3)**3",
+        "where(t > 5, sqrt(t - 5), -1)",
+        "(t - 3)**3",
     ],
-)  # fmt: skip
+)
 def test_values_are_those_of_a_kernel(expression: str) -> None:
     tree = check_expression(expression, Scope("difference")).tree
     assert tree is not None
-    model = parse_model({
-        "name": "wave", "form": "difference", "states": {"unused": "1"},
-        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"y": expression},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "wave",
+            "form": "difference",
+            "states": {"unused": "1"},
+            "equations": {"unused": "0"},
+            "initial": {"unused": 0},
+            "outputs": {"y": expression},
+        }
+    )
     expected = simulate(model, [], {}, times=TIMES).channel("y").values
     small = 1e-12 * np.max(np.abs(expected[np.isfinite(expected)]))
     np.testing.assert_allclose(evaluate_signal(tree, TIMES), expected, rtol=1e-12, atol=small)

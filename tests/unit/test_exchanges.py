@@ -27,26 +27,46 @@ TIMES = 0.1 * np.arange(300.0)
 U = Channel("u", TIMES, np.repeat(np.random.default_rng(3).normal(size=30), 10), hold="zero")
 SPAN = {"lower": 0.1, "upper": 5, "unit": "s"}
 FORMS: dict[str, dict[str, Any]] = {
-    "in series": {"states": {"x": "m", "y": "m"},
-                  "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x - y)/T2"},
-                  "outputs": {"z": "y"}, "initial": {"x": 0, "y": 0}},
-    "symmetric": {"states": {"x": "m", "v": "m/s"},
-                  "equations": {"x": "v", "v": "(K*u(t-L) - x - (T1 + T2)*v)/(T1*T2)"},
-                  "outputs": {"z": "x"}, "initial": {"x": 0, "v": 0}},
-    "unlike": {"states": {"x": "m", "y": "m"},
-               "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x + y*0.2 - y)/T2"},
-               "outputs": {"z": "y + 0.1*x"}, "initial": {"x": 0, "y": 0}},
-}  # fmt: skip
+    "in series": {
+        "states": {"x": "m", "y": "m"},
+        "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x - y)/T2"},
+        "outputs": {"z": "y"},
+        "initial": {"x": 0, "y": 0},
+    },
+    "symmetric": {
+        "states": {"x": "m", "v": "m/s"},
+        "equations": {"x": "v", "v": "(K*u(t-L) - x - (T1 + T2)*v)/(T1*T2)"},
+        "outputs": {"z": "x"},
+        "initial": {"x": 0, "v": 0},
+    },
+    "unlike": {
+        "states": {"x": "m", "y": "m"},
+        "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x + y*0.2 - y)/T2"},
+        "outputs": {"z": "y + 0.1*x"},
+        "initial": {"x": 0, "y": 0},
+    },
+}
 TRUTH = {"K": 2.0, "L": 0.3, "T1": 1.5, "T2": 0.5}
 THETA = np.array(list(TRUTH.values()))
 
 
 def model(form: str, **bounds: dict[str, float]) -> Model:
-    parameters = {"K": {"lower": 0.1, "upper": 5, "unit": "m"}, "L": {**SPAN, "upper": 1},
-                  "T1": SPAN, "T2": SPAN}  # fmt: skip
+    parameters = {
+        "K": {"lower": 0.1, "upper": 5, "unit": "m"},
+        "L": {**SPAN, "upper": 1},
+        "T1": SPAN,
+        "T2": SPAN,
+    }
     changed = {name: {**one, **bounds.get(name, {})} for name, one in parameters.items()}
-    return parse_model({"name": "two", "form": "differential", "inputs": {"u": "V"},
-                        "parameters": changed, **FORMS[form]})  # fmt: skip
+    return parse_model(
+        {
+            "name": "two",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "parameters": changed,
+            **FORMS[form],
+        }
+    )
 
 
 def recorded(form: str) -> Record:
@@ -59,9 +79,10 @@ def problem(form: str, **bounds: dict[str, float]) -> Problem:
     return Problem.build(model(form, **bounds), [recorded(form)])
 
 
-@pytest.mark.parametrize(("form", "expected"), [
-    ("in series", (((2,), (3,)),)), ("symmetric", (((2,), (3,)),)), ("unlike", ()),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("form", "expected"),
+    [("in series", (((2,), (3,)),)), ("symmetric", (((2,), (3,)),)), ("unlike", ())],
+)
 def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
     form: str, expected: ExchangeGroups
 ) -> None:
@@ -73,10 +94,15 @@ def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
 
 @pytest.mark.parametrize("form", ["(K*u(t-L) - x)/(T1*T2)", "(K*u(t-L) - x)/(T1 + T2)"])
 def test_what_is_known_as_a_product_or_a_sum_only_is_no_exchange(form: str) -> None:
-    made = parse_model({
-        **(model("symmetric").document or {}), "states": {"x": "m"}, "equations": {"x": form},
-        "outputs": {"z": "x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            **(model("symmetric").document or {}),
+            "states": {"x": "m"},
+            "equations": {"x": form},
+            "outputs": {"z": "x"},
+            "initial": {"x": 0},
+        }
+    )
     assert find_exchanges(Problem.build(made, [recorded("symmetric")]), THETA)[0] == ()
 
 
@@ -90,19 +116,25 @@ PARALLEL = {"equations": {"x": "(K*u - x)/T1", "y": "(M*u - y)/T2"}, "outputs": 
 BESIDE = {"equations": {"x": "(K*u - x)/T1", "y": "(x - y)/T2"}, "outputs": {"z": "y + M*x"}}
 
 
-@pytest.mark.parametrize(("form", "theta", "expected"), [
-    # Both gains at their bound: not the time constants alone, but with the gains.
-    (PARALLEL, [5.0, 5.0, 1.5, 0.5], (((0, 2), (1, 3)),)),
-    (BESIDE, [2.0, 0.0, 1.5, 0.5], ()),  # the way past the second one is closed
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("form", "theta", "expected"),
+    [
+        # Both gains at their bound: not the time constants alone, but with the gains.
+        (PARALLEL, [5.0, 5.0, 1.5, 0.5], (((0, 2), (1, 3)),)),
+        (BESIDE, [2.0, 0.0, 1.5, 0.5], ()),  # the way past the second one is closed
+    ],
+)
 def test_what_can_be_exchanged_at_this_estimate_only_is_none(
     form: dict[str, Any], theta: list[float], expected: ExchangeGroups
 ) -> None:
     gain = {"lower": -5, "upper": 5, "unit": "m"}
-    made = parse_model({
-        **(model("in series").document or {}), **form,
-        "parameters": {"K": gain, "M": gain, "T1": SPAN, "T2": SPAN},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            **(model("in series").document or {}),
+            **form,
+            "parameters": {"K": gain, "M": gain, "T1": SPAN, "T2": SPAN},
+        }
+    )
     found = find_exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0]
     assert found == expected
 
@@ -127,13 +159,18 @@ def test_a_budget_is_kept() -> None:
 
 
 def test_three_in_a_row_are_one_group() -> None:
-    made = parse_model({
-        "name": "three", "form": "differential", "inputs": {"u": "V"},
-        "states": {"x": "V", "y": "V", "w": "V"},
-        "parameters": dict.fromkeys(("T1", "T2", "T3"), SPAN),
-        "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
-        "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            "name": "three",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "V", "y": "V", "w": "V"},
+            "parameters": dict.fromkeys(("T1", "T2", "T3"), SPAN),
+            "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
+            "outputs": {"z": "w"},
+            "initial": {"x": 0, "y": 0, "w": 0},
+        }
+    )
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     groups, _ = find_exchanges(posed, np.array([0.4, 1.0, 2.0]))
     assert groups == (((0,), (1,), (2,)),)
@@ -154,13 +191,15 @@ def beside(
 ) -> Problem:
     """First orders side by side, each with its own gain, time constant and start."""
     document = {
-        "name": "beside", "form": "differential", "inputs": {"u": "V"},
+        "name": "beside",
+        "form": "differential",
+        "inputs": {"u": "V"},
         "states": dict.fromkeys(sections, "m"),
         "parameters": {f"K{s}": GAIN for s in sections} | {f"T{s}": SPAN for s in sections},
         "equations": {s: f"(K{s}*u - {s})/T{s}" for s in sections} | (written or {}),
         "outputs": {"z": "0 + " + " + ".join(sections)},
         "initial": dict.fromkeys(sections, START),
-    }  # fmt: skip
+    }
     document["parameters"] |= changed
     return Problem.build(parse_model(document), [recorded("in series")] * records)
 
@@ -177,11 +216,14 @@ def drawn(posed: Problem, seed: int = 1) -> FloatArray:
     return np.asarray(lower + place * (upper - lower))
 
 
-@pytest.mark.parametrize("written", [
-    {},
-    {"x": "(-x + Kx*u)/Tx", "y": "(u*Ky + -y)/Ty"},
-    {"x": "(Kx*u - x)/Tx*cos(x)", "y": "cos(y)*((Ky*u - y)/Ty)"},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "written",
+    [
+        {},
+        {"x": "(-x + Kx*u)/Tx", "y": "(u*Ky + -y)/Ty"},
+        {"x": "(Kx*u - x)/Tx*cos(x)", "y": "cos(y)*((Ky*u - y)/Ty)"},
+    ],
+)
 def test_sections_side_by_side_change_places_with_gains_and_starts(written: dict[str, str]) -> None:
     posed = beside(written=written)
     found, spent = find_exchanges(posed, drawn(posed))
@@ -192,15 +234,21 @@ def test_sections_side_by_side_change_places_with_gains_and_starts(written: dict
     assert describe_exchanges(posed, found, {"Tx", "Ky"}) == ()
 
 
-@pytest.mark.parametrize(("written", "changed"), [
-    ({"y": "(Ky*u - y*1.01)/Ty"}, {}),  # another form
-    ({"y": "(Ky*u(t - 0.1) - y)/Ty"}, {}),
-    ({"y": "(Ky*u - y - 0.1*x)/Ty"}, {}),  # the same, with what the other does not read
-    ({}, {"Ty": SPAN | {"unit": "min"}}),
-    ({}, {"Ty": SPAN | {"lower": 2}, "Tx": SPAN | {"upper": 1.9}}),  # bounds tell which is which
-    ({}, {"Ty": SPAN | {"fixed": 1.0}}),
-    ({"y": "(Ky*u - y)/Tx"}, {}),  # the sum of the gains is all that shows
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("written", "changed"),
+    [
+        ({"y": "(Ky*u - y*1.01)/Ty"}, {}),  # another form
+        ({"y": "(Ky*u(t - 0.1) - y)/Ty"}, {}),
+        ({"y": "(Ky*u - y - 0.1*x)/Ty"}, {}),  # the same, with what the other does not read
+        ({}, {"Ty": SPAN | {"unit": "min"}}),
+        (
+            {},
+            {"Ty": SPAN | {"lower": 2}, "Tx": SPAN | {"upper": 1.9}},
+        ),  # bounds tell which is which
+        ({}, {"Ty": SPAN | {"fixed": 1.0}}),
+        ({"y": "(Ky*u - y)/Tx"}, {}),  # the sum of the gains is all that shows
+    ],
+)
 def test_sections_that_are_not_alike_are_not_exchanged(
     written: dict[str, str], changed: dict[str, Any]
 ) -> None:
@@ -255,13 +303,18 @@ def test_each_experiment_has_starts_of_its_own() -> None:
 
 
 def test_sections_of_two_states_change_places_with_all_their_parameters() -> None:
-    made = parse_model({
-        "name": "modes", "form": "differential", "inputs": {"u": "V"},
-        "states": {"a": "m", "v": "m/s", "b": "m", "w": "m/s"},
-        "parameters": {name: {"lower": 0.1, "upper": 5} for name in ("ka", "ca", "kb", "cb")},
-        "equations": {"a": "v", "v": "u - ka*a - ca*v", "b": "w", "w": "u - kb*b - cb*w"},
-        "outputs": {"z": "a + b"}, "initial": {"a": 0, "v": START, "b": 0, "w": START},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            "name": "modes",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"a": "m", "v": "m/s", "b": "m", "w": "m/s"},
+            "parameters": {name: {"lower": 0.1, "upper": 5} for name in ("ka", "ca", "kb", "cb")},
+            "equations": {"a": "v", "v": "u - ka*a - ca*v", "b": "w", "w": "u - kb*b - cb*w"},
+            "outputs": {"z": "a + b"},
+            "initial": {"a": 0, "v": START, "b": 0, "w": START},
+        }
+    )
     posed = Problem.build(made, [recorded("in series")])
     found, _ = find_exchanges(posed, np.array([3.0, 0.5, 1.0, 0.2, 0.4, -0.3]))
     assert named(posed, found) == [["ka ca v(0)", "kb cb w(0)"]]
@@ -309,14 +362,20 @@ def test_a_profile_stays_with_one_order_of_sections(name: str) -> None:
 
 def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
     spans = {"T1": (0.1, 1.2), "T2": (0.1, 5.0), "T3": (0.9, 5.0)}
-    made = parse_model({
-        "name": "three", "form": "differential", "inputs": {"u": "V"},
-        "states": {"x": "V", "y": "V", "w": "V"},
-        "parameters": {k: {"lower": low, "upper": up, "unit": "s"}
-                       for k, (low, up) in spans.items()},
-        "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
-        "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            "name": "three",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "V", "y": "V", "w": "V"},
+            "parameters": {
+                k: {"lower": low, "upper": up, "unit": "s"} for k, (low, up) in spans.items()
+            },
+            "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
+            "outputs": {"z": "w"},
+            "initial": {"x": 0, "y": 0, "w": 0},
+        }
+    )
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     assert find_exchanges(posed, np.array([1.0, 1.1, 3.0]))[0] == ()  # T1 cannot be 3
     assert find_exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == (((0,), (1,), (2,)),)
@@ -324,17 +383,22 @@ def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
 
 def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each() -> None:
     gains = [f"g{i}" for i in range(12)]
-    made = parse_model({
-        "name": "many", "form": "differential", "inputs": {"u": "V"},
-        "states": {"x": "V", "y": "V"},
-        "parameters": dict.fromkeys(("T1", "T2"), SPAN)
-        | {name: {"lower": -1, "upper": 1} for name in gains},
-        "equations": {
-            "x": f"({' + '.join(f'g{i}*tanh({i + 1}*u)' for i in range(12))} - x)/T1",
-            "y": "(x - y)/T2",
-        },
-        "outputs": {"z": "y"}, "initial": {"x": 0, "y": 0},
-    })  # fmt: skip
+    made = parse_model(
+        {
+            "name": "many",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "V", "y": "V"},
+            "parameters": dict.fromkeys(("T1", "T2"), SPAN)
+            | {name: {"lower": -1, "upper": 1} for name in gains},
+            "equations": {
+                "x": f"({' + '.join(f'g{i}*tanh({i + 1}*u)' for i in range(12))} - x)/T1",
+                "y": "(x - y)/T2",
+            },
+            "outputs": {"z": "y"},
+            "initial": {"x": 0, "y": 0},
+        }
+    )
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     values = {"T1": 1.5, "T2": 0.5} | dict(zip(gains, np.linspace(-0.5, 0.6, 12), strict=True))
     theta = np.array([values[one.name] for one in posed.free_parameters])
@@ -345,12 +409,23 @@ def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each()
 
 def test_four_in_a_row_are_one_group_though_looked_at_together_first() -> None:
     names = ["T1", "T2", "T3", "T4"]
-    made = parse_model({
-        "name": "four", "form": "differential", "inputs": {"u": "V"},
-        "states": dict.fromkeys("abcd", "V"), "parameters": dict.fromkeys(names, SPAN),
-        "equations": {"a": "(u - a)/T1", "b": "(a - b)/T2", "c": "(b - c)/T3", "d": "(c - d)/T4"},
-        "outputs": {"z": "d"}, "initial": dict.fromkeys("abcd", 0),
-    })  # fmt: skip
+    made = parse_model(
+        {
+            "name": "four",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": dict.fromkeys("abcd", "V"),
+            "parameters": dict.fromkeys(names, SPAN),
+            "equations": {
+                "a": "(u - a)/T1",
+                "b": "(a - b)/T2",
+                "c": "(b - c)/T3",
+                "d": "(c - d)/T4",
+            },
+            "outputs": {"z": "d"},
+            "initial": dict.fromkeys("abcd", 0),
+        }
+    )
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     found, spent = find_exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]))
     assert found == (((0,), (1,), (2,), (3,)),)

@@ -12,7 +12,7 @@ from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailab
 from workers.inline_executor import InlineExecutor
 from workers.job_queue import JobQueue
 from workers.packing import PACKS_PER_CPU
-from workers.protocol import (  # fmt: skip
+from workers.protocol import (
     AdvanceRun,
     EvolveIsland,
     InvalidRun,

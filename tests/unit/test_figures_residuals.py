@@ -90,8 +90,15 @@ def test_a_run_without_a_result_or_a_test_has_no_findings() -> None:
 
 
 def test_a_test_that_was_not_made_says_why() -> None:
-    one = {"experiment": 0, "output": "y", "test": "independence", "input": "u",
-           "outcome": "not tested", "reason": "the input is constant", "p": None}  # fmt: skip
+    one = {
+        "experiment": 0,
+        "output": "y",
+        "test": "independence",
+        "input": "u",
+        "outcome": "not tested",
+        "reason": "the input is constant",
+        "p": None,
+    }
     found = to_diagnostics(
         {"residual_tests": {"data": "estimation", "passed": None, "tests": [one]}}
     )
@@ -102,8 +109,17 @@ def test_a_test_that_was_not_made_says_why() -> None:
 
 
 def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
-    clear = {"experiment": 0, "input": "u", "output": "y", "delay": 0.129, "unit": "s",
-             "spread": 0.005, "events": 9, "threshold": 0.02, "reason": ""}  # fmt: skip
+    clear = {
+        "experiment": 0,
+        "input": "u",
+        "output": "y",
+        "delay": 0.129,
+        "unit": "s",
+        "spread": 0.005,
+        "events": 9,
+        "threshold": 0.02,
+        "reason": "",
+    }
     vague = {**clear, "delay": None, "spread": None, "events": 0, "reason": "it does not rest"}
     known, unknown = to_diagnostics({"onset_delays": [clear, vague]}).onsets
     assert re.fullmatch(r"0\.1290\s*s", known.text)

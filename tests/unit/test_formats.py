@@ -15,19 +15,33 @@ from service.core.text import (
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.42, "0.4200"), (10.4912, "10.49"), (12345.6, "12346"), (0.0, "0"), (-0.5, "−0.5000"),
-     (None, "–"), (float("inf"), "–"), (1.5e-7, "1.500·10⁻⁷"), (2.5e9, "2.500·10⁹")],
-)  # fmt: skip
+    [
+        (0.42, "0.4200"),
+        (10.4912, "10.49"),
+        (12345.6, "12346"),
+        (0.0, "0"),
+        (-0.5, "−0.5000"),
+        (None, "–"),
+        (float("inf"), "–"),
+        (1.5e-7, "1.500·10⁻⁷"),
+        (2.5e9, "2.500·10⁹"),
+    ],
+)
 def test_a_number_has_four_significant_digits(value: float | None, text: str) -> None:
     assert format_number(value) == text
 
 
 @pytest.mark.parametrize(
     ("value", "stderr", "texts"),
-    [(0.119324, 0.00041, ("0.11932", "0.00041")), (12.3456, 1.5, ("12.3", "1.5")),
-     (0.5, 0.0996, ("0.50", "0.10")), (1234.6, 77.0, ("1235", "77")),
-     (0.5, None, ("0.500000", "")), (1.0, 0.0, ("1.00000", ""))],
-)  # fmt: skip
+    [
+        (0.119324, 0.00041, ("0.11932", "0.00041")),
+        (12.3456, 1.5, ("12.3", "1.5")),
+        (0.5, 0.0996, ("0.50", "0.10")),
+        (1234.6, 77.0, ("1235", "77")),
+        (0.5, None, ("0.500000", "")),
+        (1.0, 0.0, ("1.00000", "")),
+    ],
+)
 def test_an_estimate_ends_where_its_error_does(
     value: float, stderr: float | None, texts: tuple[str, str]
 ) -> None:
@@ -49,9 +63,13 @@ def test_a_duration_has_the_unit_that_suits_it(seconds: float | None, text: str)
 
 @pytest.mark.parametrize(
     ("ago", "text"),
-    [(timedelta(seconds=5), "5 s"), (timedelta(minutes=3, seconds=50), "3 min"),
-     (timedelta(hours=30), "1 d"), (timedelta(seconds=-4), "0 s")],
-)  # fmt: skip
+    [
+        (timedelta(seconds=5), "5 s"),
+        (timedelta(minutes=3, seconds=50), "3 min"),
+        (timedelta(hours=30), "1 d"),
+        (timedelta(seconds=-4), "0 s"),
+    ],
+)
 def test_an_age_is_told_in_its_largest_unit(ago: timedelta, text: str) -> None:
     now = datetime(2026, 1, 1, tzinfo=UTC)
     assert format_age(now - ago, now).replace("\u202f", " ") == text

@@ -18,21 +18,27 @@ STEP = 0.05
 
 
 def document(
-    equations: dict[str, str], parameters: tuple[str, ...], form: str = "differential",
+    equations: dict[str, str],
+    parameters: tuple[str, ...],
+    form: str = "differential",
     **fields: Any,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     written = {
-        "name": "test", "form": form, "inputs": {"u": "V"},
+        "name": "test",
+        "form": form,
+        "inputs": {"u": "V"},
         "states": dict.fromkeys(equations, "m"),
         "parameters": {name: {"lower": 0.01, "upper": 20} for name in parameters},
-        "equations": equations, "outputs": {"y": next(iter(equations))},
+        "equations": equations,
+        "outputs": {"y": next(iter(equations))},
         "initial": dict.fromkeys(equations, 0),
-    }  # fmt: skip
+    }
     return written | fields
 
 
-def posed(written: dict[str, Any], truth: dict[str, float], sd: float = 0.01, n: int = 200,
-          **options: Any) -> tuple[Problem, FloatArray]:  # fmt: skip
+def posed(
+    written: dict[str, Any], truth: dict[str, float], sd: float = 0.01, n: int = 200, **options: Any
+) -> tuple[Problem, FloatArray]:
     """A problem whose data are the model's at the truth, with noise."""
     times = STEP * np.arange(n)
     rng = np.random.default_rng(3)
@@ -201,11 +207,22 @@ def test_a_fixed_parameter_is_no_part_of_a_scaling() -> None:
     assert find_scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
 
 
-ACTUATOR = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_b": 83.089,
-            "k_c": 456.99e3, "A_m": 5.0e-6, "B": 1.0e-3}  # fmt: skip
-FREE = {"k_b": {"lower": 5, "upper": 500}, "A_m": {"lower": 1e-7, "upper": 1e-3},
-        "B": {"lower": 1e-5, "upper": 0.1, "scale": "log"},
-        "theta(0)": {"fixed": 0.0}}  # fmt: skip
+ACTUATOR = {
+    "J": 3.6e-4,
+    "F_c": 1.2317e-2,
+    "F_max": 3.3333e-2,
+    "k_a": 83.089,
+    "k_b": 83.089,
+    "k_c": 456.99e3,
+    "A_m": 5.0e-6,
+    "B": 1.0e-3,
+}
+FREE = {
+    "k_b": {"lower": 5, "upper": 500},
+    "A_m": {"lower": 1e-7, "upper": 1e-3},
+    "B": {"lower": 1e-5, "upper": 0.1, "scale": "log"},
+    "theta(0)": {"fixed": 0.0},
+}
 
 
 @pytest.mark.slow

@@ -283,14 +283,21 @@ def test_a_gap_in_the_history_leaves_a_band_limited_record_usable() -> None:
 @pytest.mark.parametrize(
     ("times", "values"),
     [
-        ([0.5, 2.0], [1.0, 1.0]), ([0.5, 0.4], [1.0, 1.0]), ([np.nan], [1.0]),
-        ([0.5, 0.6], [1.0]), ([], []),
+        ([0.5, 2.0], [1.0, 1.0]),
+        ([0.5, 0.4], [1.0, 1.0]),
+        ([np.nan], [1.0]),
+        ([0.5, 0.6], [1.0]),
+        ([], []),
     ],
-)  # fmt: skip
+)
 def test_a_history_that_is_none_is_refused(times: list[float], values: list[float]) -> None:
     with pytest.raises(InvalidRecord, match="history of channel 'u'"):
-        Channel("u", np.array([1.0]), np.array([0.0]),
-                history=History(np.array(times), np.array(values)))  # fmt: skip
+        Channel(
+            "u",
+            np.array([1.0]),
+            np.array([0.0]),
+            history=History(np.array(times), np.array(values)),
+        )
 
 
 def test_whether_a_history_is_kept_is_true_or_false() -> None:

@@ -71,5 +71,6 @@ def test_half_steps_and_samples_are_points_of_the_fine_grid(hold: Hold) -> None:
 def test_an_input_sampled_faster_than_the_grid_keeps_its_samples() -> None:
     fine = interpolate_input(channel("first"), 0.0, 0.3, 100, lag=0.0)
     assert fine.points_per_step == 6
-    np.testing.assert_allclose(fine.values[fine.start_index :: 2][:300], np.sin(3 * TIMES)[:300],
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        fine.values[fine.start_index :: 2][:300], np.sin(3 * TIMES)[:300], atol=1e-12
+    )

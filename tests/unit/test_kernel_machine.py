@@ -83,9 +83,13 @@ def test_without_a_writable_folder_kernels_still_work(
 
 def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
     model = duffing()
-    keys = {compiler.compute_kernel_key(model, KernelVariant(one, soft, grid, weight))
-            for one in (True, False) for soft in (True, False)
-            for grid in (True, False) for weight in (True, False)}  # fmt: skip
+    keys = {
+        compiler.compute_kernel_key(model, KernelVariant(one, soft, grid, weight))
+        for one in (True, False)
+        for soft in (True, False)
+        for grid in (True, False)
+        for weight in (True, False)
+    }
     assert len(keys) == 16
     narrow = Problem.build(model, [record()], parameters={"c": {"lower": 0.1}}).model
     assert compiler.compute_kernel_key(narrow, KernelVariant()) in keys

@@ -22,10 +22,14 @@ DECAY = "2*a*exp(-4*p*t) + 2*b*exp(-0.5*q*t)"
 def scored(text: str, names: str, measured: FloatArray, times: FloatArray = TIMES) -> ScoredSamples:
     """Residuals of an expression of time, whose parameters are places in [0, 1]."""
     document = {
-        "name": "test", "form": "differential", "states": {"x": "1"},
+        "name": "test",
+        "form": "differential",
+        "states": {"x": "1"},
         "parameters": {name: {"lower": 0, "upper": 1} for name in names},
-        "equations": {"x": "0"}, "initial": {"x": 0}, "outputs": {"y": f"x + {text}"},
-    }  # fmt: skip
+        "equations": {"x": "0"},
+        "initial": {"x": 0},
+        "outputs": {"y": f"x + {text}"},
+    }
     problem = Problem.build(load_model(document), [Record((), (Channel("y", times, measured),))])
     return ScoredSamples(problem.evaluator, problem.scored_rows, np.ones(measured.size))
 
@@ -47,10 +51,19 @@ def found(
 
 
 def library(measured: FloatArray, start: list[float], scale: float = 0.0) -> FloatArray:
-    return np.asarray(least_squares(
-        lambda place: decay(place) - measured, start, bounds=(0, 1), xtol=1e-14, ftol=1e-14,
-        gtol=1e-14, loss="soft_l1" if scale else "linear", f_scale=scale or 1.0, max_nfev=2000,
-    ).x)  # fmt: skip
+    return np.asarray(
+        least_squares(
+            lambda place: decay(place) - measured,
+            start,
+            bounds=(0, 1),
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+            loss="soft_l1" if scale else "linear",
+            f_scale=scale or 1.0,
+            max_nfev=2000,
+        ).x
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,21 +11,31 @@ from sysid.models.parse import parse_model
 
 def resonant(delay: float) -> IdentifiedModel:
     """A lag and a weakly damped mode beside it: the loop gain passes 1 three times."""
-    model = parse_model({
-        "name": "m", "form": "differential", "inputs": {"u": "V"},
-        "states": {"x": "m", "a": "m", "b": "m"},
-        "parameters": {"L": {"lower": 0, "upper": 10}},
-        "equations": {"x": "u(t - L) - x", "a": "b", "b": "100*(x - a) - 0.2*b"},
-        "outputs": {"y": {"expression": "0.9*x + 0.1*a", "unit": "m"}},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "m",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m", "a": "m", "b": "m"},
+            "parameters": {"L": {"lower": 0, "upper": 10}},
+            "equations": {"x": "u(t - L) - x", "a": "b", "b": "100*(x - a) - 0.2*b"},
+            "outputs": {"y": {"expression": "0.9*x + 0.1*a", "unit": "m"}},
+        }
+    )
     return IdentifiedModel(model, (IdentifiedValue("L", delay),))
 
 
 def first_order(rate: str) -> IdentifiedModel:
-    model = parse_model({
-        "name": "m", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "equations": {"x": rate}, "outputs": {"y": {"expression": "x", "unit": "m"}},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "m",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m"},
+            "equations": {"x": rate},
+            "outputs": {"y": {"expression": "x", "unit": "m"}},
+        }
+    )
     return IdentifiedModel(model, ())
 
 
@@ -55,12 +65,17 @@ def test_a_border_at_rest_is_one_of_the_gain(rate: str, gain: float, factor: flo
 @pytest.mark.parametrize("delay", [0.01, 0.6])
 def test_a_sharp_resonance_is_not_missed(gain: float, delay: float) -> None:
     """Of an undamped mode at ω the root moves to the right by K ω sin(ω L)/2: it lags or leads."""
-    model = parse_model({
-        "name": "m", "form": "differential", "inputs": {"u": "V"}, "states": {"a": "m", "b": "m"},
-        "parameters": {"L": {"lower": 0, "upper": 10}},
-        "equations": {"a": "b", "b": "100*(u(t - L) - a)"},
-        "outputs": {"y": {"expression": "a", "unit": "m"}},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "m",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"a": "m", "b": "m"},
+            "parameters": {"L": {"lower": 0, "upper": 10}},
+            "equations": {"a": "b", "b": "100*(u(t - L) - a)"},
+            "outputs": {"y": {"expression": "a", "unit": "m"}},
+        }
+    )
     found = compute_margins(
         IdentifiedModel(model, (IdentifiedValue("L", delay),)), PidControl("u", "y", gain)
     )

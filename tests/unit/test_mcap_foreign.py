@@ -15,9 +15,12 @@ from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 
 KINDS = {
-    "value": Kind.TYPE_DOUBLE, "small": Kind.TYPE_FLOAT, "count": Kind.TYPE_INT32,
-    "on": Kind.TYPE_BOOL, "name": Kind.TYPE_STRING,
-}  # fmt: skip
+    "value": Kind.TYPE_DOUBLE,
+    "small": Kind.TYPE_FLOAT,
+    "count": Kind.TYPE_INT32,
+    "on": Kind.TYPE_BOOL,
+    "name": Kind.TYPE_STRING,
+}
 
 
 def read(content: bytes) -> tuple[Recording, tuple[str, ...]]:
@@ -35,9 +38,12 @@ def robot() -> FileDescriptorSet:
         robot.field.add(name=name, number=number, type=kind, label=Kind.LABEL_OPTIONAL)
     robot.field.add(name="list", number=8, type=Kind.TYPE_DOUBLE, label=Kind.LABEL_REPEATED)
     robot.field.add(
-        name="joint", number=9, type=Kind.TYPE_MESSAGE, type_name=".demo.Joint",
+        name="joint",
+        number=9,
+        type=Kind.TYPE_MESSAGE,
+        type_name=".demo.Joint",
         label=Kind.LABEL_OPTIONAL,
-    )  # fmt: skip
+    )
     return files
 
 
@@ -66,8 +72,12 @@ def test_protobuf_that_omits_zeros_is_read_with_its_nested_numbers() -> None:
     assert recording.names == ("value", "small", "count", "on", "joint.angle")
     columns = {one.name: one.values.tolist() for one in recording.channels}
     assert columns == {
-        "value": [1.5, 0], "small": [0, 0.5], "count": [-3, 0], "on": [1, 0], "joint.angle": [0, 2],
-    }  # fmt: skip
+        "value": [1.5, 0],
+        "small": [0, 0.5],
+        "count": [-3, 0],
+        "on": [1, 0],
+        "joint.angle": [0, 2],
+    }
     np.testing.assert_array_equal(recording.channels[0].times, [0, 0.1])
 
 
@@ -117,13 +127,19 @@ def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
         (foreign([("/a", 0, b"[" * 5000 + b"]" * 5000)]), "JSON"),
         (foreign([("/a", 0, b"\x08")], encoding="protobuf"), "no protobuf schema"),
         (
-            foreign([("/a", 0, b"\xff")], encoding="protobuf",
-                    schema=("demo.Robot", "protobuf", robot().SerializeToString())),
+            foreign(
+                [("/a", 0, b"\xff")],
+                encoding="protobuf",
+                schema=("demo.Robot", "protobuf", robot().SerializeToString()),
+            ),
             "does not follow its schema",
         ),
         (
-            foreign([("/a", 0, b"")], encoding="protobuf",
-                    schema=("demo.Missing", "protobuf", robot().SerializeToString())),
+            foreign(
+                [("/a", 0, b"")],
+                encoding="protobuf",
+                schema=("demo.Missing", "protobuf", robot().SerializeToString()),
+            ),
             "its schema cannot be used",
         ),
         (
@@ -131,7 +147,7 @@ def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
             "its schema cannot be used",
         ),
     ],
-)  # fmt: skip
+)
 def test_what_holds_no_signal_is_refused_with_the_reason(content: bytes, words: str) -> None:
     with pytest.raises(InvalidUpload) as caught:
         read(content)

@@ -281,8 +281,10 @@ def test_a_lag_in_minutes_is_not_read_in_seconds(unit: str, index: str, right: s
 def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
     unit: str, index: str, right: str
 ) -> None:
-    changed = {"parameters": {"d": {"lower": 1, "upper": 9, "unit": unit}},
-               "equations": {"x": "0.5*w + w(k-3)", "w": f"x({index})"}}  # fmt: skip
+    changed = {
+        "parameters": {"d": {"lower": 1, "upper": 9, "unit": unit}},
+        "equations": {"x": "0.5*w + w(k-3)", "w": f"x({index})"},
+    }
     told = faults(DISCRETE, **changed)
     assert told == {"/parameters/d/unit": f"found {unit!r}, but this lag counts {right}"}
     fits = {"s": "k-1-d/h", "min": "k-1-60*d/h"}[unit]

@@ -16,10 +16,24 @@ from sysid.models.parse import parse_model
 from tests.meaning import simulate
 
 BUILT_IN = (
-    "actuator", "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol",
-    "duffing-delay", "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx",
-    "silverbox", "silverbox-9", "sopdt", "tube", "tube-second-order",
-)  # fmt: skip
+    "actuator",
+    "coulomb-delay",
+    "coulomb-eq16",
+    "delayed-logistic",
+    "delayed-van-der-pol",
+    "duffing-delay",
+    "duffing-eq16",
+    "emps",
+    "exponential",
+    "fopdt",
+    "mackey-glass",
+    "narx",
+    "silverbox",
+    "silverbox-9",
+    "sopdt",
+    "tube",
+    "tube-second-order",
+)
 
 FOLDER = Path(folder.__path__[0])
 
@@ -96,9 +110,17 @@ def test_yaml_that_cannot_be_read_or_is_dangerous_is_refused_in_one_line(
 def test_yaml_numbers_and_truth_values_are_those_of_version_1_2() -> None:
     text = "{a: 1e-3, b: 1., c: .5, d: 010, on: no, e: true, f: ~, g: 2020-01-01, h: 1:30, i: -2}"
     assert parse_yaml(text) == {
-        "a": 1e-3, "b": 1.0, "c": 0.5, "d": 10, "on": "no", "e": True, "f": None,
-        "g": "2020-01-01", "h": "1:30", "i": -2,
-    }  # fmt: skip
+        "a": 1e-3,
+        "b": 1.0,
+        "c": 0.5,
+        "d": 10,
+        "on": "no",
+        "e": True,
+        "f": None,
+        "g": "2020-01-01",
+        "h": "1:30",
+        "i": -2,
+    }
 
 
 def test_the_recursion_of_the_catalogue_is_the_papers_equation_16() -> None:
@@ -109,9 +131,12 @@ def test_the_recursion_of_the_catalogue_is_the_papers_equation_16() -> None:
     for k in range(n - 2):
         late, later = (x[i] if i > 0 else 0.0 for i in (k + 1 - d, k - d))
         x[k + 2] = (
-            2 * x[k + 1] - c * h * (late - later) - (1 + h * h * b) * x[k]
-            - h * h * a * x[k] ** 3 + h * h * q[k]
-        )  # fmt: skip
+            2 * x[k + 1]
+            - c * h * (late - later)
+            - (1 + h * h * b) * x[k]
+            - h * h * a * x[k] ** 3
+            + h * h * q[k]
+        )
     values = {"c": c, "L": L, "b": b, "a": a}
     found = simulate(load_model("duffing-eq16"), values, {"q": q}, h, n)["x"]
     np.testing.assert_allclose(found, x, rtol=0, atol=1e-10)

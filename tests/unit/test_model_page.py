@@ -11,8 +11,20 @@ from sysid.models.parse import parse_model
 
 PAGE = (Path(__file__).parents[2] / "docs/model.md").read_text(encoding="utf-8")
 SOLVER = ("method", "step", "substeps", "history", "interpolation")
-FIELDS = ("name", "title", "description", "source", "form", "inputs", "states", "parameters",
-          "constants", "equations", "outputs", "initial")  # fmt: skip
+FIELDS = (
+    "name",
+    "title",
+    "description",
+    "source",
+    "form",
+    "inputs",
+    "states",
+    "parameters",
+    "constants",
+    "equations",
+    "outputs",
+    "initial",
+)
 
 
 def test_the_example_of_the_page_is_a_model() -> None:

@@ -24,14 +24,21 @@ SMALL = GeneticAlgorithm(population=24, generations=20)
 K, OFFSET, T = 0.8, 0.3, 2.0
 
 TANK: dict[str, Any] = {
-    "name": "tank", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "tank",
+    "form": "difference",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {"K": {"lower": -10, "upper": 10}, "o": {"lower": -10, "upper": 10}},
-    "equations": {"x": "x(k-1) + h*(K*u(k-1) - o)"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "x(k-1) + h*(K*u(k-1) - o)"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 LAG = {
-    **TANK, "name": "lag", "constants": {"T": T},
+    **TANK,
+    "name": "lag",
+    "constants": {"T": T},
     "equations": {"x": "x(k-1) + h*(K*u(k-1) - o - x(k-1))/T"},
-}  # fmt: skip
+}
 
 
 def signal(seed: int = 1, n: int = N) -> FloatArray:
@@ -87,7 +94,7 @@ STARTS: list[tuple[dict[str, Any], tuple[float, ...], dict[str, Any]]] = [
     ({"x": {"lower": -1, "upper": 1}}, (0.1,), {}),
     ({"x": {"lower": -1, "upper": 1}}, (0.1, 0.2), {"experiments": 2}),
     ({"x": {"lower": -1, "upper": 1}}, (), {"parameters": {"x(0)": {"fixed": 0.1}}}),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("initial", "more", "options"), STARTS)
@@ -198,13 +205,20 @@ def test_a_drift_as_slow_as_the_record_is_left_to_squares() -> None:
 
 def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() -> None:
     stiff = {
-        "name": "stiff", "form": "differential", "inputs": {"u": "1"},
+        "name": "stiff",
+        "form": "differential",
+        "inputs": {"u": "1"},
         "states": {"w": "1", "x": "1"},
-        "parameters": {"K": {"lower": 0.1, "upper": 10}, "o": {"lower": -10, "upper": 10},
-                       "T": {"lower": 0.5, "upper": 3}},
-        "equations": {"w": "(u - w)/(0.05*T)", "x": "K*w**3 - o"}, "outputs": {"y": "x"},
-        "initial": {"w": 0, "x": 0}, "solver": {"method": "rk4", "step": "sample"},
-    }  # fmt: skip
+        "parameters": {
+            "K": {"lower": 0.1, "upper": 10},
+            "o": {"lower": -10, "upper": 10},
+            "T": {"lower": 0.5, "upper": 3},
+        },
+        "equations": {"w": "(u - w)/(0.05*T)", "x": "K*w**3 - o"},
+        "outputs": {"y": "x"},
+        "initial": {"w": 0, "x": 0},
+        "solver": {"method": "rk4", "step": "sample"},
+    }
     fine = {**stiff, "solver": {"method": "rk4", "step": "sample", "substeps": 40}}
     true = Problem.build(load_model(fine), [record(np.zeros(N))])
     y = true.predict(np.array([[K, 3.0, 1.0]]))[0]
@@ -238,9 +252,12 @@ def test_a_time_that_leaves_no_room_for_the_look_leaves_squares(
 
 @pytest.mark.parametrize(
     "options",
-    [{"prediction": "one-step"}, {"settings": replace(SMALL, method="simple")},
-     {"settings": replace(SMALL, refine=False)}],
-)  # fmt: skip
+    [
+        {"prediction": "one-step"},
+        {"settings": replace(SMALL, method="simple")},
+        {"settings": replace(SMALL, refine=False)},
+    ],
+)
 def test_what_has_no_noise_model_is_as_with_white(options: dict[str, Any]) -> None:
     auto, white = (found(TANK, disturbed(2), loss, **options) for loss in (AUTO, WHITE))
     assert same(auto, white)
@@ -269,7 +286,10 @@ def test_an_oscillation_that_goes_on_is_no_drift(damping: float, period: float) 
     swing = f"{2 * pole.write_float}*x(k-1) - {abs(pole) ** 2}*x(k-2) + h**2*(K*u(k-1) - o)"
     assert not remembers({**TANK, "equations": {"x": swing}}, (K, OFFSET))
     both = {
-        **TANK, "states": {"w": "1", "x": "1"}, "initial": {"w": 0, "x": 0},
-        "equations": {"x": swing, "w": "w(k-1) + h*x(k-1)"}, "outputs": {"y": "w"},
-    }  # fmt: skip
+        **TANK,
+        "states": {"w": "1", "x": "1"},
+        "initial": {"w": 0, "x": 0},
+        "equations": {"x": swing, "w": "w(k-1) + h*x(k-1)"},
+        "outputs": {"y": "w"},
+    }
     assert remembers(both, (K, OFFSET))

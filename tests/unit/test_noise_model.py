@@ -26,10 +26,15 @@ from tests import searching
 from tests.unit.test_serial import coloured
 
 GAIN = {
-    "name": "gain", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "gain",
+    "form": "difference",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {"g": {"lower": -10, "upper": 10}, "m": {"lower": -10, "upper": 10}},
-    "equations": {"x": "g*u + m"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "g*u + m"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 STEP, N, POLE = 0.1, 400, 0.95
 AR1 = Loss(noise_model="ar1")
 SMALL = GeneticAlgorithm(population=24, generations=20)
@@ -100,9 +105,7 @@ def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float
     other = replace(data, inputs=(replace(u, values=u.values * unit),))
     bounds = {"g": {"lower": -10.0 / unit, "upper": 10.0 / unit}}
     found = identify(load_model(GAIN), [data], SMALL, seed=1, loss=AR1, skip=1)
-    same = identify(
-        load_model(GAIN), [other], SMALL, seed=1, loss=AR1, skip=1, parameters=bounds
-    )  # fmt: skip
+    same = identify(load_model(GAIN), [other], SMALL, seed=1, loss=AR1, skip=1, parameters=bounds)
     g, m = (one.value for one in found.estimates)
     assert tuple(one.value for one in same.estimates) == (g / unit, m)
     assert same.correlation_times == found.correlation_times
@@ -164,9 +167,7 @@ def test_white_residuals_leave_everything_as_it_is() -> None:
 
 
 def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_out() -> None:
-    data = searching.record(
-        searching.clean("coulomb-eq16") + 0.02 * coloured(300, 0.9, 2)
-    )  # fmt: skip
+    data = searching.record(searching.clean("coulomb-eq16") + 0.02 * coloured(300, 0.9, 2))
     problem = Problem.build(load_model("coulomb-eq16"), [data], loss=AR1)
     settings = GeneticAlgorithm(stop=Stop(evaluations=20_000))
     found = conclude_run(
@@ -206,8 +207,10 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     soon = conclude_run(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
     said = "not estimated to its end"
     assert [any(said in one for one in found.warnings) for found in (whole, soon, late)] == [
-        False, True, True,
-    ]  # fmt: skip
+        False,
+        True,
+        True,
+    ]
     assert late.evaluations <= whole.evaluations - 50
     assert conclude_run(problem, timed, replace(state, seconds=1.0)).estimates == whole.estimates
 

@@ -16,23 +16,39 @@ def group(sigma, method, scale=1.0, **changes):
     quantiles = [scale * sigma * q for q in (0.1, 0.3, 0.5, 0.7, 0.9)]
     error = [q - 0.4 * scale * sigma for q in quantiles]
     parameter = ParameterSummaryOut(
-        name="L", unit="s", value=[2.0 + one for one in error], stderr=0.1, reference=2.0,
-        error=error, floor=0.25 * sigma,
-    )  # fmt: skip
+        name="L",
+        unit="s",
+        value=[2.0 + one for one in error],
+        stderr=0.1,
+        reference=2.0,
+        error=error,
+        floor=0.25 * sigma,
+    )
     known = {
-        "key": {"/noise/sigma": sigma, "/algorithm/method": method}, "runs": 10, "succeeded": 8,
-        "failed": 2, "success_rate": 0.8, "sigma": sigma, "evaluations": 1234.4, "seconds": 0.1,
-        "rms": quantiles, "rms_noise_free": quantiles, "rms_floor": 0.2 * sigma,
-        "fit_percent": {}, "parameters": [parameter],
-    }  # fmt: skip
+        "key": {"/noise/sigma": sigma, "/algorithm/method": method},
+        "runs": 10,
+        "succeeded": 8,
+        "failed": 2,
+        "success_rate": 0.8,
+        "sigma": sigma,
+        "evaluations": 1234.4,
+        "seconds": 0.1,
+        "rms": quantiles,
+        "rms_noise_free": quantiles,
+        "rms_floor": 0.2 * sigma,
+        "fit_percent": {},
+        "parameters": [parameter],
+    }
     return GroupOut(**{**known, **changes})
 
 
 def summary(groups):
     return SummaryOut(
-        job="job_1", by=["/noise/sigma", "/algorithm/method"],
-        quantiles=[0.05, 0.25, 0.5, 0.75, 0.95], groups=groups,
-    )  # fmt: skip
+        job="job_1",
+        by=["/noise/sigma", "/algorithm/method"],
+        quantiles=[0.05, 0.25, 0.5, 0.75, 0.95],
+        groups=groups,
+    )
 
 
 @pytest.mark.parametrize(
@@ -52,9 +68,21 @@ def test_a_grid_has_exactly_the_numbers_that_are_written(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["", ",", "a", "0:1", "0:1:0", "0:1:-0.1", "1:0:0.1", "0:1:0.1:2", "nan", "0:inf:1",
-             "0:1:1e-9"],
-)  # fmt: skip
+    "text",
+    [
+        "",
+        ",",
+        "a",
+        "0:1",
+        "0:1:0",
+        "0:1:-0.1",
+        "1:0:0.1",
+        "0:1:0.1:2",
+        "nan",
+        "0:inf:1",
+        "0:1:1e-9",
+    ],
+)
 def test_a_grid_that_cannot_be_read_is_one_line_and_exit_code_2(text, capsys):
     with pytest.raises(typer.Exit) as ended:
         parse_sigma_grid(text)
@@ -73,17 +101,18 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
     for headings, rows in found:
         assert all(len(row) == len(headings) for row in rows)
     assert [sum("error [" in one for one in headings) for headings, _ in found] == [1, 4, 4, 1]
-    assert found[0][1][0] == [
-        "0.5", "simple", "10", "80 %", "1234", "0.25 [0.05, 0.45]", "0.1",
-    ]  # fmt: skip
+    assert found[0][1][0] == ["0.5", "simple", "10", "80 %", "1234", "0.25 [0.05, 0.45]", "0.1"]
     assert found[1][1][0][2:4] == ["+0.05 [-0.15, +0.25]", "0.12"]
 
 
 @pytest.mark.parametrize(
     ("unit", "sigma", "error"),
-    [("m", ">σ [m]", "RMS error in m [5 %, 95 %]"), ("1", ">σ", "RMS error [5 %, 95 %]"),
-     ("σ", ">σ", "RMS error in σ [5 %, 95 %]")],
-)  # fmt: skip
+    [
+        ("m", ">σ [m]", "RMS error in m [5 %, 95 %]"),
+        ("1", ">σ", "RMS error [5 %, 95 %]"),
+        ("σ", ">σ", "RMS error in σ [5 %, 95 %]"),
+    ],
+)
 def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(unit, sigma, error):
     told = summary([group(0.5, "simple")]).model_copy(update={"rms_unit": unit})
     headings, _ = build_sweep_tables(told.model_dump())[0]
@@ -104,9 +133,13 @@ def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outp
 
 @pytest.mark.parametrize(
     ("reference", "is_told"),
-    [({"kind": "estimate", "sigma": 0.0}, True), ({"kind": "estimate", "sigma": 0.1}, False),
-     ({"kind": "truth"}, False), (None, False)],
-)  # fmt: skip
+    [
+        ({"kind": "estimate", "sigma": 0.0}, True),
+        ({"kind": "estimate", "sigma": 0.1}, False),
+        ({"kind": "truth"}, False),
+        (None, False),
+    ],
+)
 def test_a_row_without_noise_is_explained_where_errors_are_told_against_it(reference, is_told):
     problem = {"cell": {}, "reference": reference, "note": ""}
     notes = list(StoredBounds({"problems": [problem]}).list_notes())
@@ -116,9 +149,15 @@ def test_a_row_without_noise_is_explained_where_errors_are_told_against_it(refer
 def test_what_is_not_known_is_a_dash():
     blank = ParameterSummaryOut(name="L", unit="s", value=[0.0] * 5, stderr=None)
     waiting = group(
-        0.5, "simple", succeeded=0, failed=0, evaluations=None, rms_noise_free=None,
-        rms_floor=None, parameters=[blank],
-    )  # fmt: skip
+        0.5,
+        "simple",
+        succeeded=0,
+        failed=0,
+        evaluations=None,
+        rms_noise_free=None,
+        rms_floor=None,
+        parameters=[blank],
+    )
     first, second = (rows[0] for _, rows in build_sweep_tables(summary([waiting]).model_dump()))
     assert first == ["0.5", "simple", "0/10", "–", "–", "–", "–"]
     assert second == ["0.5", "simple", "–", "–"]
@@ -126,17 +165,19 @@ def test_what_is_not_known_is_a_dash():
 
 def lines(figure, axis, dash=None):
     return [
-        one for one in figure["data"]
+        one
+        for one in figure["data"]
         if one["xaxis"] == axis and one["line"].get("dash") == dash and one["line"]["width"] > 0
-    ]  # fmt: skip
+    ]
 
 
 def test_each_plot_has_a_median_and_a_band_for_each_method():
     groups = [group(s, m, 1 + n) for s in SIGMAS for n, m in enumerate(("simple", "improved"))]
     figure = plot_noise_sweep(summary(groups), "m")
     for axis in ("x", "x2"):
-        medians = [one for one in figure["data"]
-                   if one["xaxis"] == axis and one["mode"] == "lines+markers"]  # fmt: skip
+        medians = [
+            one for one in figure["data"] if one["xaxis"] == axis and one["mode"] == "lines+markers"
+        ]
         bands = [one for one in figure["data"] if one["xaxis"] == axis and "fill" in one]
         assert [one["legendgroup"] for one in medians] == ["simple", "improved"]
         assert [one["legendgroup"] for one in bands] == ["simple", "improved"]

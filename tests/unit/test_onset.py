@@ -37,11 +37,16 @@ EXPECTED = L - T * np.log(1 - 0.02)  # 2 % of a first-order response come so muc
 
 
 def delays(
-    u: FloatArray, y: FloatArray, *, times: FloatArray = TIMES, hold: Hold = "zero",
+    u: FloatArray,
+    y: FloatArray,
+    *,
+    times: FloatArray = TIMES,
+    hold: Hold = "zero",
     others: tuple[Channel, ...] = (),
-) -> OnsetDelay:  # fmt: skip
-    record = Record((Channel("u", TIMES[: u.size], u, hold=hold), *others),
-                    (Channel("y", times, y),))  # fmt: skip
+) -> OnsetDelay:
+    record = Record(
+        (Channel("u", TIMES[: u.size], u, hold=hold), *others), (Channel("y", times, y),)
+    )
     return estimate_onset_delays(load_model("fopdt"), (record,))[0]
 
 

@@ -23,8 +23,10 @@ def test_the_champion_of_an_archipelago_is_the_best_of_its_islands_so_far() -> N
     islands = [[point(0, 3.0, 1), point(4, 1.0, 2)], [point(0, 2.0, 3), point(2, 2.5, 4)]]
     found = champion_history({"names": ["a"], "islands": islands})
     assert [(one.generation, one.rms, one.parameters["a"]) for one in found] == [
-        (0, 3.0, 1), (0, 2.0, 3), (4, 1.0, 2),
-    ]  # fmt: skip
+        (0, 3.0, 1),
+        (0, 2.0, 3),
+        (4, 1.0, 2),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -61,11 +63,17 @@ def test_the_printed_errors_of_the_proposed_search_are_those_of_its_columns() ->
 
 
 def test_the_bound_of_a_mean_is_the_deviation_over_the_root_of_the_samples() -> None:
-    model = load_model({
-        "name": "mean", "form": "difference", "states": {"x": "1"},
-        "parameters": {"p": {"lower": 0, "upper": 5}}, "equations": {"x": "x(k-1)"},
-        "outputs": {"y": "x + p"}, "initial": {"x": 0},
-    })  # fmt: skip
+    model = load_model(
+        {
+            "name": "mean",
+            "form": "difference",
+            "states": {"x": "1"},
+            "parameters": {"p": {"lower": 0, "upper": 5}},
+            "equations": {"x": "x(k-1)"},
+            "outputs": {"y": "x + p"},
+            "initial": {"x": 0},
+        }
+    )
     times = np.arange(100, dtype=np.float64)
     assert cramer_rao_bound(model, [], {"p": 2.0}, 0.5, times)["p"] == pytest.approx(0.05, rel=1e-6)
 
@@ -92,16 +100,20 @@ def test_the_noise_sweep_has_one_cell_for_each_level_draw_and_method() -> None:
     body = JobIn.model_validate(noise.job_body("ds_1", "ds_2", 3))
     lengths = {one.path: len(one.values or range(*(one.range or ()))) for one in body.sweep.axes}
     assert lengths == {
-        "/noise/sigma": len(noise.SIGMAS), "/noise/seed": 3, "/seed": 3, "/algorithm/method": 3,
-    }  # fmt: skip
+        "/noise/sigma": len(noise.SIGMAS),
+        "/noise/seed": 3,
+        "/seed": 3,
+        "/algorithm/method": 3,
+    }
 
 
 def test_the_spread_of_a_sweep_is_taken_for_each_level_and_method_by_itself() -> None:
     runs = [
         {"cell": {"/algorithm/method": method, "/noise/sigma": sigma}, "rms": weight * sigma + draw}
         for weight, method in enumerate(("simple", "improved-paper", "improved"))
-        for sigma in noise.SIGMAS for draw in (0.0, 1.0, 2.0)
-    ]  # fmt: skip
+        for sigma in noise.SIGMAS
+        for draw in (0.0, 1.0, 2.0)
+    ]
     found = noise.group_replicates(runs, "rms")
     medians = [one.quantiles[1] for one in found["improved"]]
     assert medians == pytest.approx([2 * sigma + 1 for sigma in noise.SIGMAS])

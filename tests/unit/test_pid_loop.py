@@ -26,22 +26,34 @@ VALUES = {"K": 1.6, "T": 0.7, "L": 0.2, "y(0)": 0.0}
 def lag(**fields: Any) -> Model:
     """First-order lag behind a dead time, with a load that is added to its input."""
     document = {
-        "name": "lag", "form": "differential", "inputs": {"u": "V", "d": "V"},
+        "name": "lag",
+        "form": "differential",
+        "inputs": {"u": "V", "d": "V"},
         "states": {"y": "m"},
-        "parameters": {"K": {"lower": 0, "upper": 5}, "T": {"lower": 0.1, "upper": 2},
-                       "L": {"lower": 0, "upper": 1}},
-        "equations": {"y": "(K*(u(t-L) + d) - y)/T"}, "outputs": {"y": "y"},
+        "parameters": {
+            "K": {"lower": 0, "upper": 5},
+            "T": {"lower": 0.1, "upper": 2},
+            "L": {"lower": 0, "upper": 1},
+        },
+        "equations": {"y": "(K*(u(t-L) + d) - y)/T"},
+        "outputs": {"y": "y"},
         "initial": {"y": {"lower": -1, "upper": 1}},
-    }  # fmt: skip
+    }
     return parse_model(document | fields)
 
 
-RECURSION = parse_model({
-    "name": "r", "form": "difference", "inputs": {"u": "V", "d": "V"}, "states": {"x": "m"},
-    "parameters": {"a": {"lower": 0, "upper": 1}, "b": {"lower": 0, "upper": 1}},
-    "equations": {"x": "a*x(k-1) + b*(u(k-1) + d(k-1))"}, "outputs": {"y": "x"},
-    "initial": {"x": {"lower": -1, "upper": 1}},
-})  # fmt: skip
+RECURSION = parse_model(
+    {
+        "name": "r",
+        "form": "difference",
+        "inputs": {"u": "V", "d": "V"},
+        "states": {"x": "m"},
+        "parameters": {"a": {"lower": 0, "upper": 1}, "b": {"lower": 0, "upper": 1}},
+        "equations": {"x": "a*x(k-1) + b*(u(k-1) + d(k-1))"},
+        "outputs": {"y": "x"},
+        "initial": {"x": {"lower": -1, "upper": 1}},
+    }
+)
 
 
 def stepped(name: str, height: float, at: float = 0.0, before: float = 0.0) -> Channel:
@@ -51,9 +63,13 @@ def stepped(name: str, height: float, at: float = 0.0, before: float = 0.0) -> C
 
 
 def simulated(
-    model: Model, control: PidControl, values: dict[str, float] = VALUES, *,
-    reference: float = 1.0, load: float = 0.0,
-) -> tuple[ClosedLoop, Recording]:  # fmt: skip
+    model: Model,
+    control: PidControl,
+    values: dict[str, float] = VALUES,
+    *,
+    reference: float = 1.0,
+    load: float = 0.0,
+) -> tuple[ClosedLoop, Recording]:
     """A step of the reference at the start, and one of the load at 4 s."""
     loop = close_loop(model, control, STEP)
     given = [stepped(loop.reference, reference), stepped("d", load, at=4.0)]
@@ -61,15 +77,21 @@ def simulated(
 
 
 def by_hand(
-    control: PidControl, *, reference: float = 1.0, load: float = 0.0, start: float = 0.0,
+    control: PidControl,
+    *,
+    reference: float = 1.0,
+    load: float = 0.0,
+    start: float = 0.0,
     fine: int = 40,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Output and command of the lag under continuous control, by Euler's method in fine steps."""
     h, element = STEP / fine, control.transport or Transport()
     late = round((VALUES["L"] + element.delay) / h) if not element.time_constant else None
     n = (TIMES.size - 1) * fine + 1
-    low, high = (-inf if control.output_limits[0] is None else control.output_limits[0],
-                 inf if control.output_limits[1] is None else control.output_limits[1])  # fmt: skip
+    low, high = (
+        -inf if control.output_limits[0] is None else control.output_limits[0],
+        inf if control.output_limits[1] is None else control.output_limits[1],
+    )
     c = float(control.derivative_on == "error")
     y, integral, entered = start, 0.0, 0.0
     z = -start
@@ -202,9 +224,17 @@ def test_a_recursion_has_the_sampled_controller_of_the_textbook(control: PidCont
 @pytest.mark.parametrize("delay", [0.0, 0.03])
 def test_where_the_output_answers_at_once_the_textbooks_controller_is_late(delay: float) -> None:
     """By one step where nothing else is between them, by the transport's steps where it is."""
-    direct = parse_model({"name": "d", "form": "difference", "inputs": {"u": "V", "d": "V"},
-                          "states": {"x": "m"}, "outputs": {"y": "x"}, "initial": {"x": 0.0},
-                          "equations": {"x": "0.95*x(k-1) + 0.06*(u + d)"}})  # fmt: skip
+    direct = parse_model(
+        {
+            "name": "d",
+            "form": "difference",
+            "inputs": {"u": "V", "d": "V"},
+            "states": {"x": "m"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0.0},
+            "equations": {"x": "0.95*x(k-1) + 0.06*(u + d)"},
+        }
+    )
     control = replace(PID, gain=0.8, upper=0.9, transport=Transport(1.0, 0.0, delay))
     loop, found = simulated(direct, control, {}, load=0.2)
     late = max(round(delay / STEP), 1)
@@ -220,11 +250,19 @@ def test_where_the_output_answers_at_once_the_textbooks_controller_is_late(delay
 
 
 def test_a_polynomial_is_controlled_without_a_steady_error() -> None:
-    narx = parse_model({
-        "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "V"}, "degree": 2,
-        "lags": {"y": [1, 2], "u": [1]}, "coefficients": {"lower": -2, "upper": 2},
-        "terms": ["y(k-1)", "y(k-2)", "u(k-1)", "u(k-1)*y(k-1)"], "initial": {"y": 0},
-    })  # fmt: skip
+    narx = parse_model(
+        {
+            "name": "n",
+            "form": "polynomial",
+            "output": "y",
+            "inputs": {"u": "V"},
+            "degree": 2,
+            "lags": {"y": [1, 2], "u": [1]},
+            "coefficients": {"lower": -2, "upper": 2},
+            "terms": ["y(k-1)", "y(k-2)", "u(k-1)", "u(k-1)*y(k-1)"],
+            "initial": {"y": 0},
+        }
+    )
     values = dict(zip([p.name for p in narx.parameters], (1.1, -0.3, 0.1, 0.05), strict=True))
     control = PidControl("u", "y", 0.5, integral_time=0.04, derivative_time=0.01, limit=3.0)
     loop = close_loop(narx, control, STEP)
@@ -240,8 +278,15 @@ def test_without_integral_and_derivative_the_loop_is_the_proportional_one_bit_fo
     values = {"a": 0.9, "b": 0.1, "x(0)": 0.2} if plant is RECURSION else VALUES
     plain = PidControl("u", "y", 1.3, limit, Transport(0.9, 0.1, 0.05))
     _, expected = simulated(plant, plain, values)
-    same = replace(plain, integral_time=inf, derivative_time=0.0, derivative_filter=3.0,
-                   derivative_on="error", setpoint_weight=1.0, tracking_time=2.0)  # fmt: skip
+    same = replace(
+        plain,
+        integral_time=inf,
+        derivative_time=0.0,
+        derivative_filter=3.0,
+        derivative_on="error",
+        setpoint_weight=1.0,
+        tracking_time=2.0,
+    )
     _, found = simulated(plant, same, values)
     for one, other in zip(expected.channels, found.channels, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
@@ -270,8 +315,9 @@ def test_the_command_keeps_its_limits_and_reaches_them(plant: Model) -> None:
 
 def test_back_calculation_bounds_the_overshoot_after_a_long_saturation() -> None:
     """The limit holds the output just above the reference: it takes seconds to get there."""
-    wound_up = PidControl("u", "y", 2.0, integral_time=0.3, upper=0.66, lower=0.0,
-                          anti_windup="none")  # fmt: skip
+    wound_up = PidControl(
+        "u", "y", 2.0, integral_time=0.3, upper=0.66, lower=0.0, anti_windup="none"
+    )
     overshoots = []
     led_back = replace(wound_up, anti_windup="back-calculation")
     for control in (wound_up, led_back, replace(led_back, tracking_time=0.05)):
@@ -292,10 +338,17 @@ def test_other_numbers_of_a_controller_need_no_other_kernel() -> None:
         keys = set()
         for size in (1.0, 1.3, 0.8):
             control = replace(
-                LIMITED, gain=size, integral_time=size, derivative_time=0.2 * size,
-                derivative_filter=5.0 * size, upper=size, lower=-size, tracking_time=size,
-                setpoint_weight=0.5 * size, transport=Transport(size, 0.1 * size, 0.1 * size),
-            )  # fmt: skip
+                LIMITED,
+                gain=size,
+                integral_time=size,
+                derivative_time=0.2 * size,
+                derivative_filter=5.0 * size,
+                upper=size,
+                lower=-size,
+                tracking_time=size,
+                setpoint_weight=0.5 * size,
+                transport=Transport(size, 0.1 * size, 0.1 * size),
+            )
             keys.add(compute_kernel_key(close_loop(plant, control, STEP).model, variant))
         assert len(keys) == 1
 

@@ -17,14 +17,22 @@ from service.core.errors import FieldError
 @pytest.mark.parametrize(
     ("pointer", "place"),
     [
-        ("/sigma/2", "--sigma"), ("/relative", "--relative"), ("/truth/parameters/K", "--true K"),
-        ("/truth/parameters", "--true"), ("/truth/inputs/u/expression", "--input u"),
-        ("/truth/sample_time", "--sample-time"), ("/truth/samples", "--samples"),
-        ("/datasets/0", "--data"), ("/channels/u", "--channels u"), ("/channels", "--channels"),
-        ("/model", "--model"), ("/model/equations/x", "--model: /equations/x"),
-        ("/algorithm/population", "--set algorithm.population"), ("/hold/a~1b", "--set hold.a/b"),
+        ("/sigma/2", "--sigma"),
+        ("/relative", "--relative"),
+        ("/truth/parameters/K", "--true K"),
+        ("/truth/parameters", "--true"),
+        ("/truth/inputs/u/expression", "--input u"),
+        ("/truth/sample_time", "--sample-time"),
+        ("/truth/samples", "--samples"),
+        ("/datasets/0", "--data"),
+        ("/channels/u", "--channels u"),
+        ("/channels", "--channels"),
+        ("/model", "--model"),
+        ("/model/equations/x", "--model: /equations/x"),
+        ("/algorithm/population", "--set algorithm.population"),
+        ("/hold/a~1b", "--set hold.a/b"),
     ],
-)  # fmt: skip
+)
 def test_a_pointer_is_told_as_the_option_that_gives_it(pointer: str, place: str) -> None:
     assert sweeps.FIELD_ORIGINS.locate(pointer) == place
 
@@ -33,8 +41,17 @@ def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
     from service.sweeps.schemas import NoiseSweepIn
 
     by_options = {place.split("/")[1] for place in sweeps.FIELD_ORIGINS.options}
-    by_set = {"hold", "parameters", "prediction", "loss", "weights", "skip", "algorithm",
-              "priority", "reuse"}  # fmt: skip
+    by_set = {
+        "hold",
+        "parameters",
+        "prediction",
+        "loss",
+        "weights",
+        "skip",
+        "algorithm",
+        "priority",
+        "reuse",
+    }
     assert by_options | by_set == set(NoiseSweepIn.model_fields)
 
 
@@ -56,9 +73,10 @@ def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     entries = (
-        {"pointer": "/sigma/0", "detail": "found -1"}, {"pointer": "", "detail": "whole"},
+        {"pointer": "/sigma/0", "detail": "found -1"},
+        {"pointer": "", "detail": "whole"},
         {"pointer": "/truth/inputs/u/expression", "column": 3, "detail": "ends"},
-    )  # fmt: skip
+    )
     with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
         raise refusal(422, *entries)
     assert ended.value.exit_code == 1

@@ -22,9 +22,12 @@ points = st.builds(
     lambda island, number, rms, phase, values: HistoryPoint(
         "run_a", island, number, 7 * number, 2**33 + number, rms, phase, values
     ),
-    st.integers(0, 3), st.integers(0, 99), numbers, st.sampled_from(PHASES),
+    st.integers(0, 3),
+    st.integers(0, 99),
+    numbers,
+    st.sampled_from(PHASES),
     st.lists(numbers, min_size=2, max_size=2),
-)  # fmt: skip
+)
 many = st.lists(points, max_size=40, unique_by=lambda one: (one.island, one.number))
 
 

@@ -75,8 +75,9 @@ def test_j_is_the_rms_error_over_the_scored_samples() -> None:
     model, blank = duffing(), record()
     y = blank.outputs[0].values.copy()
     y[[7, 12]] = np.nan
-    problem = Problem.build(model, [replace(blank, outputs=(Channel("y", blank.outputs[0].times,
-                            y),))], skip=5)  # fmt: skip
+    problem = Problem.build(
+        model, [replace(blank, outputs=(Channel("y", blank.outputs[0].times, y),))], skip=5
+    )
     theta = individuals(problem, 3)
     error = (problem.predict(theta) - y)[:, 5:]
     expected = np.sqrt(np.nanmean(error**2, axis=1))
@@ -118,8 +119,10 @@ def test_outputs_are_weighted_by_their_deviation_or_as_asked() -> None:
     chosen = Problem.build(model, [data], weights={"y": 3.0, "z": 0.5})
     theta = individuals(chosen, 2)
     part = chosen.split_by_output(chosen.predict(theta)[0])[0]
-    errors = [(3.0 * (part["y"] - data.outputs[0].values)),
-              (0.5 * (part["z"] - data.outputs[1].values))]  # fmt: skip
+    errors = [
+        (3.0 * (part["y"] - data.outputs[0].values)),
+        (0.5 * (part["z"] - data.outputs[1].values)),
+    ]
     expected = np.sqrt(np.mean(np.concatenate(errors) ** 2))
     assert chosen.evaluate_fitness(theta)[0] == pytest.approx(expected)
 

@@ -29,12 +29,18 @@ def linear(
     rng = np.random.default_rng(5)
     times = 0.1 * np.arange(n)
     interval = {"lower": -5.0, "upper": 5.0} | bounds
-    model = parse_model({
-        "name": "line", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
-        "parameters": {"p": interval, "q": {"lower": -5, "upper": 5}},
-        "equations": {"x": "p*u(k) + q*sin(k) + q*u(k)"}, "outputs": {"y": "x"},
-        "initial": {"x": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "line",
+            "form": "difference",
+            "inputs": {"u": "1"},
+            "states": {"x": "1"},
+            "parameters": {"p": interval, "q": {"lower": -5, "upper": 5}},
+            "equations": {"x": "p*u(k) + q*sin(k) + q*u(k)"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
     u = rng.standard_normal(n)
     noise = rng.standard_normal(n)
     for k in range(1, n if pole else 0):
@@ -153,11 +159,18 @@ def test_where_the_profile_is_begun_does_not_matter() -> None:
 def test_factors_of_one_product_have_open_ends() -> None:
     times = STEP * np.arange(100)
     u = np.cos(times)
-    model = parse_model({
-        "name": "product", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
-        "parameters": {"g": {"lower": 0.5, "upper": 2}, "h2": {"lower": 0.1, "upper": 10}},
-        "equations": {"x": "g*h2*u(k)"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "product",
+            "form": "difference",
+            "inputs": {"u": "1"},
+            "states": {"x": "1"},
+            "parameters": {"g": {"lower": 0.5, "upper": 2}, "h2": {"lower": 0.1, "upper": 10}},
+            "equations": {"x": "g*h2*u(k)"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
     y = u + 0.1 * np.random.default_rng(1).standard_normal(times.size)
     data = Record((Channel("u", times, u),), (Channel("y", times, y),))
     found = compute_profile(Problem.build(model, [data], skip=1), np.array([1.0, 1.0]), "g")

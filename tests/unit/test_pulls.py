@@ -79,13 +79,25 @@ def test_the_step_goes_no_farther_than_is_possible() -> None:
 
 def lag(**bounds: Any) -> Model:
     """First-order lag behind a dead time."""
-    parameters = {"K": {"lower": 0.1, "upper": 5}, "T": {"lower": 0.1, "upper": 2, "unit": "s"},
-                  "L": {"lower": 0, "upper": 1, "unit": "s"}}  # fmt: skip
-    return parse_model({
-        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "parameters": {name: {**one, **bounds.get(name, {})} for name, one in parameters.items()},
-        "equations": {"x": "(K*u(t-L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    parameters = {
+        "K": {"lower": 0.1, "upper": 5},
+        "T": {"lower": 0.1, "upper": 2, "unit": "s"},
+        "L": {"lower": 0, "upper": 1, "unit": "s"},
+    }
+    return parse_model(
+        {
+            "name": "lag",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m"},
+            "parameters": {
+                name: {**one, **bounds.get(name, {})} for name, one in parameters.items()
+            },
+            "equations": {"x": "(K*u(t-L) - x)/T"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
 
 
 def problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
@@ -128,30 +140,47 @@ def test_a_lag_is_not_to_reach_as_far_back_as_the_record() -> None:
 
 def test_of_two_lags_in_a_row_each_may_take_what_the_other_leaves() -> None:
     parameters = {"a": {"lower": 0.2, "upper": 1}, "b": {"lower": -0.1, "upper": 1}}
-    model = parse_model({
-        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "parameters": parameters, "equations": {"x": "u(t-a-b) - x"}, "outputs": {"y": "x"},
-        "initial": {"x": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "two",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m"},
+            "parameters": parameters,
+            "equations": {"x": "u(t-a-b) - x"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
     made = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "m"),))])
     first, second = (find_widest_bounds(made, one) for one in made.free_parameters)
     assert first[0] == pytest.approx(0.1, abs=1e-6)
     assert second[0] == pytest.approx(-0.2, abs=1e-6)
 
 
-@pytest.mark.parametrize(("equation", "span", "expected"), [
-    ("(u - x)/c**2", (-2.0, -1.0), (-np.inf, 0.0)),
-    ("(u - x)*c**-2", (1.0, 2.0), (0.0, np.inf)),
-    ("u - c**0.5*x", (1.0, 2.0), (0.0, np.inf)),
-    ("u - c**3*x", (1.0, 2.0), ANYWHERE),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("equation", "span", "expected"),
+    [
+        ("(u - x)/c**2", (-2.0, -1.0), (-np.inf, 0.0)),
+        ("(u - x)*c**-2", (1.0, 2.0), (0.0, np.inf)),
+        ("u - c**0.5*x", (1.0, 2.0), (0.0, np.inf)),
+        ("u - c**3*x", (1.0, 2.0), ANYWHERE),
+    ],
+)
 def test_a_base_keeps_its_sign_where_its_power_needs_one(
     equation: str, span: tuple[float, float], expected: tuple[float, float]
 ) -> None:
-    model = parse_model({
-        "name": "power", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "V"},
-        "parameters": {"c": {"lower": span[0], "upper": span[1]}}, "equations": {"x": equation},
-        "outputs": {"y": "x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "power",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "V"},
+            "parameters": {"c": {"lower": span[0], "upper": span[1]}},
+            "equations": {"x": equation},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
     problem = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "V"),))])
     assert find_widest_bounds(problem, problem.free_parameters[0]) == expected

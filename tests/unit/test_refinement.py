@@ -69,10 +69,15 @@ def test_robust_refinement_withstands_outliers() -> None:
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 def test_refinement_does_not_depend_on_the_unit_of_the_data(unit: float) -> None:
     document = {
-        "name": "test", "form": "difference", "inputs": {"q": "N"}, "states": {"x": "m"},
+        "name": "test",
+        "form": "difference",
+        "inputs": {"q": "N"},
+        "states": {"x": "m"},
         "parameters": {"g": {"lower": 0, "upper": 10}, "p": {"lower": 0, "upper": 0.9}},
-        "equations": {"x": "g*q(k-1) + p*x(k-1)"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    }  # fmt: skip
+        "equations": {"x": "g*q(k-1) + p*x(k-1)"},
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
     source = force(100)
     source = replace(source, values=unit * source.values)
     y = np.zeros(100)

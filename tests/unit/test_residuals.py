@@ -75,8 +75,9 @@ def test_white_noise_has_95_and_99_of_100_lags_inside_the_bands() -> None:
     inside = []
     for seed in range(100):
         draw = draws(seed)
-        inside.append([(c.test.inside95, c.test.inside99)
-                       for c in found(draw.normal(size=N), held(draw))])  # fmt: skip
+        inside.append(
+            [(c.test.inside95, c.test.inside99) for c in found(draw.normal(size=N), held(draw))]
+        )
     white, crossed = np.mean(np.array(inside, dtype=float), axis=0)
     assert white == pytest.approx([0.95, 0.99], abs=0.012)
     assert crossed == pytest.approx([0.95, 0.99], abs=0.025)
@@ -127,8 +128,15 @@ def test_neither_test_depends_on_the_units_of_time_residual_and_input() -> None:
     draw = draws(3)
     residual, u = draw.normal(size=N), held(draw)
     first = found(residual, u)
-    one = make_residual_series(0, "y", 60 * TIMES, 1e-3 * residual, np.zeros(N), np.ones(N, dtype=bool),
-                 (Channel("u", 60 * TIMES, 1e5 * u + 3e5, hold="zero"),))  # fmt: skip
+    one = make_residual_series(
+        0,
+        "y",
+        60 * TIMES,
+        1e-3 * residual,
+        np.zeros(N),
+        np.ones(N, dtype=bool),
+        (Channel("u", 60 * TIMES, 1e5 * u + 3e5, hold="zero"),),
+    )
     for here, there in zip(first, compute_correlations([one]), strict=True):
         np.testing.assert_allclose(here.values, there.values, rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(here.band95, there.band95, rtol=1e-7)
@@ -176,8 +184,15 @@ def test_a_missed_response_is_found_at_irregular_times_too() -> None:
 def test_residuals_that_are_rounding_are_not_tested() -> None:
     measured = 1e5 + 1e4 * np.sin(TIMES)
     rounding = 1e-11 * draws(1).normal(size=N) * measured
-    one = make_residual_series(0, "y", TIMES, measured, measured - rounding, np.ones(N, dtype=bool),
-                 (Channel("u", TIMES, held(draws(1))),))  # fmt: skip
+    one = make_residual_series(
+        0,
+        "y",
+        TIMES,
+        measured,
+        measured - rounding,
+        np.ones(N, dtype=bool),
+        (Channel("u", TIMES, held(draws(1))),),
+    )
     curves = compute_correlations([one])
     assert {curve.test.outcome for curve in curves} == {"not tested"}
     assert all("rounding" in curve.test.reason for curve in curves)
@@ -244,8 +259,9 @@ def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
     assert isinstance(whole, ResidualTests)
     assert whole.passed is True
     assert [(one.kind, one.input) for one in whole.tests] == [
-        ("whiteness", None), ("independence", "u"),
-    ]  # fmt: skip
+        ("whiteness", None),
+        ("independence", "u"),
+    ]
     late = np.concatenate([np.zeros(4), clean[:-4]])
     assert run_residual_tests(true, late, "estimation").passed is False
 
@@ -307,9 +323,16 @@ def test_a_degree_of_freedom_is_always_left_and_records_share_the_loss() -> None
 
 @pytest.mark.parametrize(
     ("name", "fixed", "count"),
-    [("narx", (), 9), ("narx", ("a[y(k-1)]", "dh"), 8), ("fopdt", (), 1), ("duffing-eq16", (), 3),
-     ("tube-second-order", (), 2), ("exponential", (), 0), ("emps", (), 3)],
-)  # fmt: skip
+    [
+        ("narx", (), 9),
+        ("narx", ("a[y(k-1)]", "dh"), 8),
+        ("fopdt", (), 1),
+        ("duffing-eq16", (), 3),
+        ("tube-second-order", (), 2),
+        ("exponential", (), 0),
+        ("emps", (), 3),
+    ],
+)
 def test_coefficients_on_past_outputs_are_those_that_multiply_a_state(
     name: str, fixed: tuple[str, ...], count: int
 ) -> None:
@@ -325,9 +348,10 @@ def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -
         (Channel("u", TIMES, held(draw), hold="zero"),), (Channel("y", TIMES, draw.normal(size=N)),)
     )
     for prediction, data, degrees in (
-        ("simulation", "estimation", 25.0), ("one-step", "validation", 25.0),
+        ("simulation", "estimation", 25.0),
+        ("one-step", "validation", 25.0),
         ("one-step", "estimation", 24.0),
-    ):  # fmt: skip
+    ):
         one = Problem.build(load_model("fopdt"), (record,), prediction=prediction)  # type: ignore[arg-type]
         tests = run_residual_tests(one, np.zeros(N), data).tests  # type: ignore[arg-type]
         assert tests[0].degrees == degrees

@@ -86,8 +86,10 @@ def test_the_middle_is_that_of_the_whole_matrix_over_gaps_too(place: tuple[float
     variance = float(left @ inverse @ left) / (values.size - 3)
     np.testing.assert_allclose(
         _compute_middle(np.array(place), laid, columns, series),
-        variance * columns.T @ matrix @ columns, rtol=1e-8, atol=1e-10,
-    )  # fmt: skip
+        variance * columns.T @ matrix @ columns,
+        rtol=1e-8,
+        atol=1e-10,
+    )
 
 
 def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less() -> None:
@@ -122,8 +124,12 @@ def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
     columns, times = regressors(100), np.arange(100.0)
     degrees = []
     for pole in (0.3, 0.8):
-        each = [fit_noise_colour(space_residuals(times, residuals(slow(100, pole, s), columns)), columns)
-                for s in range(30)]  # fmt: skip
+        each = [
+            fit_noise_colour(
+                space_residuals(times, residuals(slow(100, pole, s), columns)), columns
+            )
+            for s in range(30)
+        ]
         level = np.array([1.0, 0.0, 0.0])
         degrees.append(
             np.median([2 / one.compute_variation(level) for one in each if one is not None])

@@ -72,9 +72,14 @@ both = pytest.mark.parametrize("asked", [synchronously, asynchronously])
 @both
 @pytest.mark.parametrize(
     ("name", "given"),
-    [("job", ["job_1"]), ("accept_reference", ["tube", "run_1"]), ("submit", [{}]),
-     ("noise_sweep", [{}]), ("reidentify", [{}])],
-)  # fmt: skip
+    [
+        ("job", ["job_1"]),
+        ("accept_reference", ["tube", "run_1"]),
+        ("submit", [{}]),
+        ("noise_sweep", [{}]),
+        ("reidentify", [{}]),
+    ],
+)
 def test_a_call_that_may_be_sent_twice_is_sent_until_it_is_served(
     slept: list[float], asked: Asked, name: str, given: Sequence[Any]
 ) -> None:
@@ -122,9 +127,16 @@ def test_in_the_end_the_refusal_is_raised(
 
 
 @pytest.mark.parametrize(
-    ("header", "pause"), [("2", 2.0), ("0", 0.0), (" 7 ", 7.0), ("soon", 0.5), ("-3", 0.5),
-                          ("Mon, 01 Jan 2024 00:00:00 +99999999999999999999", 0.5)],
-)  # fmt: skip
+    ("header", "pause"),
+    [
+        ("2", 2.0),
+        ("0", 0.0),
+        (" 7 ", 7.0),
+        ("soon", 0.5),
+        ("-3", 0.5),
+        ("Mon, 01 Jan 2024 00:00:00 +99999999999999999999", 0.5),
+    ],
+)
 def test_what_the_server_asks_for_is_waited(slept: list[float], header: str, pause: float) -> None:
     server = Server(AWAY, 200, headers={"Retry-After": header})
     assert synchronously(server, "job", "job_1") == JOB

@@ -136,8 +136,14 @@ def test_the_criterion_of_bayes_leaves_out_what_noise_alone_would_explain() -> N
     # Noise that enters the equation itself: then least squares one step ahead is unbiased.
     y, u = np.zeros(2000), record.inputs[0].values
     for k in range(2, 2000):
-        y[k] = (0.6 * y[k - 1] - 0.3 * y[k - 2] + 0.8 * u[k - 1] + 0.3 * y[k - 1] * u[k - 2]
-                - 0.2 * u[k - 1] ** 2 + 0.05 * errors[k])  # fmt: skip
+        y[k] = (
+            0.6 * y[k - 1]
+            - 0.3 * y[k - 2]
+            + 0.8 * u[k - 1]
+            + 0.3 * y[k - 1] * u[k - 2]
+            - 0.2 * u[k - 1] ** 2
+            + 0.05 * errors[k]
+        )
     noisy = replace(record, outputs=(replace(record.outputs[0], values=y),))
     found = chosen({"select": "frols", "criterion": "bic"}, noisy)
     assert set(found) == set(TRUTH)

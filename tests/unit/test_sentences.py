@@ -33,21 +33,30 @@ def told(kind: Any, value: Any) -> str:
         (Annotated[float, Field(gt=0)], 0, "found 0; need a number above 0"),
         (Annotated[float, Field(lt=1)], 1, "found 1; need a number below 1"),
         (Annotated[int, Field(lt=2**63)], 2**63, f"found {2**63}; need a number below {2**63}"),
-        (Annotated[float, Field(allow_inf_nan=False)], float("nan"),
-         "found nan; need a finite number"),
-        (Annotated[str, Field(max_length=2)], "abc", "found 'abc' (3 characters); need at most 2 "
-         "characters"),
+        (
+            Annotated[float, Field(allow_inf_nan=False)],
+            float("nan"),
+            "found nan; need a finite number",
+        ),
+        (
+            Annotated[str, Field(max_length=2)],
+            "abc",
+            "found 'abc' (3 characters); need at most 2 characters",
+        ),
         (Annotated[str, Field(min_length=1)], "", "found ''; need at least 1 character"),
         (Annotated[list[int], Field(min_length=1)], [], "found []; need at least 1 entry"),
-        (Annotated[list[int], Field(max_length=1)], [1, 2], "found [1, 2] (2 entries); need at "
-         "most 1 entry"),
+        (
+            Annotated[list[int], Field(max_length=1)],
+            [1, 2],
+            "found [1, 2] (2 entries); need at most 1 entry",
+        ),
         (Literal["a", "b"], "c", "found 'c'; need 'a' or 'b'"),
         (list[int], 3, "found 3; need a list"),
         (list[str], "a", "found 'a'; need a list, such as ['a']"),
         (dict[str, int], 3, "found 3; need an object (name: value)"),
         (set[int], 3, "found 3; this cannot be used here"),
     ],
-)  # fmt: skip
+)
 def test_a_sentence_tells_what_was_found_and_what_would_be_right(
     kind: Any, value: Any, sentence: str
 ) -> None:
@@ -57,8 +66,13 @@ def test_a_sentence_tells_what_was_found_and_what_would_be_right(
 @pytest.mark.parametrize("error", list_all_errors(), ids=lambda one: one["type"])
 def test_no_sentence_of_pydantic_is_told(error: Any) -> None:
     context = {name: f"<{name}>" for name in error.get("example_context") or {}}
-    entry = {"type": error["type"], "loc": ("field",), "input": 3, "ctx": context,
-             "msg": error["message_template_python"]}  # fmt: skip
+    entry = {
+        "type": error["type"],
+        "loc": ("field",),
+        "input": 3,
+        "ctx": context,
+        "msg": error["message_template_python"],
+    }
     longest = max(re.split(r"{\w+}", error["message_template_python"]), key=len)
     assert error["type"] in PYDANTIC_KINDS
     assert longest not in describe_error(entry, ["other"])

@@ -18,10 +18,15 @@ from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from tests.searching import DUFFING, noisy, record
 
 STEADY = {
-    "name": "level", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
-    "parameters": {"m": {"lower": -10, "upper": 10}}, "equations": {"x": "m + 0*u"},
-    "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "name": "level",
+    "form": "difference",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
+    "parameters": {"m": {"lower": -10, "upper": 10}},
+    "equations": {"x": "m + 0*u"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 N, POLE = 2000, 0.8
 
 

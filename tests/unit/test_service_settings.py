@@ -106,10 +106,17 @@ def test_the_web_application_loads_neither_ray_nor_the_compiler() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-@pytest.mark.parametrize(("host", "expected"), [
-    ("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False),
-    ("example.org", False), ("10.0.0.1", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("example.org", False),
+        ("10.0.0.1", False),
+    ],
+)
 def test_loopback_is_this_machine_only(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
 

@@ -11,7 +11,7 @@ from workers.fair_share import (
     MAX_ABSENT_PROJECTS,
     MAX_SAVED_SECONDS,
     FairShare,
-)  # fmt: skip
+)
 from workers.packing import PACK_SECONDS, PACKS_PER_CPU
 
 DELAY_SECONDS = 2.0

@@ -78,10 +78,18 @@ def test_of_a_record_that_was_simulated_with_the_step_nothing_is_told() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("name", [
-    "duffing-delay", "tube", "tube-second-order", "fopdt", "sopdt", "delayed-van-der-pol",
-    "delayed-logistic",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "duffing-delay",
+        "tube",
+        "tube-second-order",
+        "fopdt",
+        "sopdt",
+        "delayed-van-der-pol",
+        "delayed-logistic",
+    ],
+)
 def test_ordinary_noise_hides_the_errors_of_the_catalogues_steps(name: str, seed: int) -> None:
     for times in (1, FINE):
         assert fitted(load_model(name), name, noisy(name, times, 0.01, seed))[1] == []

@@ -39,8 +39,12 @@ def test_without_axes_there_is_one_cell_that_changes_nothing() -> None:
 @given(st.lists(st.integers(1, 4), max_size=3))
 def test_the_number_of_cells_is_the_product_of_the_axes(lengths: list[int]) -> None:
     paths = ["/seed", "/noise/sigma", "/algorithm/generations"]
-    body = job(*({"path": path, "values": list(range(1, n + 1))}
-                 for path, n in zip(paths, lengths, strict=False)))  # fmt: skip
+    body = job(
+        *(
+            {"path": path, "values": list(range(1, n + 1))}
+            for path, n in zip(paths, lengths, strict=False)
+        )
+    )
     found = cells(body)
     assert len(found) == count_runs(body, group_axes(body.sweep.axes))
     assert len({tuple(cell.values.items()) for cell in found}) == len(found)
@@ -71,8 +75,10 @@ def test_a_pointer_with_a_slash_in_a_name_is_read_as_written() -> None:
 
 
 def test_zipped_axes_of_different_lengths_are_refused_at_the_second() -> None:
-    body = job({"path": "/seed", "range": [0, 3], "zip": "z"},
-               {"path": "/noise/seed", "range": [0, 2], "zip": "z"})  # fmt: skip
+    body = job(
+        {"path": "/seed", "range": [0, 3], "zip": "z"},
+        {"path": "/noise/seed", "range": [0, 2], "zip": "z"},
+    )
     assert [fault.pointer for fault in find_axis_faults(body)] == ["/sweep/axes/1/zip"]
 
 

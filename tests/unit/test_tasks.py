@@ -38,9 +38,7 @@ def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.Monke
     first, faulty, last = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
     assert isinstance(first.outcome, RunConclusion)
     assert isinstance(last.outcome, RunConclusion)
-    assert faulty.outcome == RunFailure(
-        "internal error: OverflowError: too large", "InternalError"
-    )  # fmt: skip
+    assert faulty.outcome == RunFailure("internal error: OverflowError: too large", "InternalError")
 
 
 def test_a_result_that_travels_arrives_whole() -> None:
@@ -88,11 +86,15 @@ def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
 
 
 TWO_OUTPUTS = {
-    "name": "two", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1", "z": "1"},
+    "name": "two",
+    "form": "difference",
+    "inputs": {"u": "1"},
+    "states": {"x": "1", "z": "1"},
     "parameters": {"a": {"lower": 0, "upper": 1}, "g": {"lower": 0, "upper": 5}},
     "equations": {"x": "a*x(k-1) + g*u(k-2)", "z": "0.5*z(k-1) + x(k-1)"},
-    "outputs": {"y": "x", "w": "z"}, "initial": {"x": "measured", "z": 0},
-}  # fmt: skip
+    "outputs": {"y": "x", "w": "z"},
+    "initial": {"x": "measured", "z": 0},
+}
 
 
 def laid_out(problem: Problem | None) -> tuple[object, ...]:

@@ -38,8 +38,12 @@ def test_ties_of_ties_and_of_fixed_parameters_are_resolved() -> None:
         {"x": "c*x(k-1) + L*u(k-1) + a"}, "x", parameters=parameters, initial={"x": 0}
     )
     problem = Problem.build(model, [record()], parameters=changes)
-    plain = difference({"x": "0.2*x(k-1) + 0.1*u(k-1) + a"}, "x", parameters={
-        "a": {"lower": 0, "upper": 1}}, initial={"x": 0})  # fmt: skip
+    plain = difference(
+        {"x": "0.2*x(k-1) + 0.1*u(k-1) + a"},
+        "x",
+        parameters={"a": {"lower": 0, "upper": 1}},
+        initial={"x": 0},
+    )
     theta = np.array([[0.3]])
     np.testing.assert_allclose(
         problem.predict(theta), Problem.build(plain, [record()]).predict(theta), rtol=1e-13
@@ -84,9 +88,12 @@ def test_the_error_of_a_product_has_the_covariance_in_it() -> None:
 
 def test_a_tie_is_identified_and_validated_with_the_rest() -> None:
     found = identify(
-        load_model("duffing-eq16"), duffing_record(noisy()), QUICK,
-        parameters={"a": {"tied": "c*b"}}, validation_fraction=0.3,
-    )  # fmt: skip
+        load_model("duffing-eq16"),
+        duffing_record(noisy()),
+        QUICK,
+        parameters={"a": {"tied": "c*b"}},
+        validation_fraction=0.3,
+    )
     values = {estimate.name: estimate.value for estimate in found.estimates}
     assert values["a"] == pytest.approx(values["c"] * values["b"])
     assert values["a"] == pytest.approx(1.0, abs=0.2)
@@ -138,8 +145,11 @@ def test_a_value_fixed_outside_its_bounds_needs_bounds_that_hold_it() -> None:
 
 
 def test_both_bounds_free_a_parameter_that_the_model_gives() -> None:
-    given = {"c": {"lower": 0, "upper": 2, "fixed": 1}, "L": {"lower": 0, "upper": 0.4},
-             "b": {"lower": 0.1, "upper": 2}}  # fmt: skip
+    given = {
+        "c": {"lower": 0, "upper": 2, "fixed": 1},
+        "L": {"lower": 0, "upper": 0.4},
+        "b": {"lower": 0.1, "upper": 2},
+    }
     model = lag_element(parameters=given)
     assert "c" not in {p.name for p in Problem.build(model, [record()]).free_parameters}
     freed = Problem.build(model, [record()], parameters={"c": {"lower": 0, "upper": 3}})

@@ -16,17 +16,25 @@ from sysid.models.units import list_time_unit_warnings
 
 def model(equation: str, unit: str, **fields: Any) -> Model:
     document = {
-        "name": "first", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "V"},
-        "parameters": {"T": {"lower": 0.01, "upper": 5, "unit": unit},
-                       "K": {"lower": 0.1, "upper": 5}},
-        "equations": {"x": equation}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    }  # fmt: skip
+        "name": "first",
+        "form": "differential",
+        "inputs": {"u": "V"},
+        "states": {"x": "V"},
+        "parameters": {
+            "T": {"lower": 0.01, "upper": 5, "unit": unit},
+            "K": {"lower": 0.1, "upper": 5},
+        },
+        "equations": {"x": equation},
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
     return parse_model(document | fields)
 
 
-@pytest.mark.parametrize("equation", [
-    "(K*u - x)/T", "K*u/T - x/(60*T)", "(K*u - x)/(T + 1)", "K*u*exp(-T) - x", "(K*u - x)/-T",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "equation",
+    ["(K*u - x)/T", "K*u/T - x/(60*T)", "(K*u - x)/(T + 1)", "K*u*exp(-T) - x", "(K*u - x)/-T"],
+)
 def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: str) -> None:
     [note] = list_time_unit_warnings(model(equation, "min"))
     assert note.startswith("T has the unit min, but the equations read it as it stands")
@@ -35,21 +43,31 @@ def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: 
     assert list_time_unit_warnings(model(equation, "V")) == []
 
 
-@pytest.mark.parametrize("equation", [
-    "(K*u - x)/(60*T)", "(K*u - x)/T/60", "(K*u - x)/(60*T + 1)", "K*u*exp(-60*T) - x",
-    "(K*u - x)/(60*(T + 1))", "(K*u - x)/(60*(T + K*(T - 1)))",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "equation",
+    [
+        "(K*u - x)/(60*T)",
+        "(K*u - x)/T/60",
+        "(K*u - x)/(60*T + 1)",
+        "K*u*exp(-60*T) - x",
+        "(K*u - x)/(60*(T + 1))",
+        "(K*u - x)/(60*(T + K*(T - 1)))",
+    ],
+)
 def test_one_that_is_converted_is_not(equation: str) -> None:
     assert list_time_unit_warnings(model(equation, "min")) == []
 
 
-@pytest.mark.parametrize(("equation", "other", "told"), [
-    ("K*u*tanh(T/S) - x", "min", []),
-    ("K*u*tanh(T/S) - x", "s", ["T"]),
-    ("K*u*tanh(T*S) - x", "min", ["T", "S"]),
-    ("(K*u*T/S - x)/(T + S)", "min", ["T", "S"]),
-    ("(K*u*T/S - x)/(60*(T + S))", "min", []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("equation", "other", "told"),
+    [
+        ("K*u*tanh(T/S) - x", "min", []),
+        ("K*u*tanh(T/S) - x", "s", ["T"]),
+        ("K*u*tanh(T*S) - x", "min", ["T", "S"]),
+        ("(K*u*T/S - x)/(T + S)", "min", ["T", "S"]),
+        ("(K*u*T/S - x)/(60*(T + S))", "min", []),
+    ],
+)
 def test_of_a_ratio_of_two_times_nothing_is_to_be_converted(
     equation: str, other: str, told: list[str]
 ) -> None:

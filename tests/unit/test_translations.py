@@ -36,8 +36,12 @@ def test_an_offset_beside_a_friction_of_either_direction_is_a_group() -> None:
     found = analyse_estimate(*drive())
     statuses = {one.name: one.status for one in found.estimates}
     assert statuses == {
-        "M": "identified", "Fv": "identified", "o": "group", "Fp": "group", "Fn": "group",
-    }  # fmt: skip
+        "M": "identified",
+        "Fv": "identified",
+        "o": "group",
+        "Fp": "group",
+        "Fn": "group",
+    }
     assert found.uncertainty is not None
     values = {group.expression: group.value for group in found.uncertainty.groups}
     assert values == pytest.approx({"o + Fp": 21.0, "o - Fn": -22.0})
@@ -51,12 +55,18 @@ def test_with_the_offset_known_both_levels_are_identified() -> None:
 
 
 def test_a_strong_correlation_is_no_group_while_the_output_changes_along_it() -> None:
-    model = parse_model({
-        "name": "sum", "form": "difference", "inputs": {"u": "V"}, "states": {"y": "V"},
-        "parameters": {"a": {"lower": 0, "upper": 5}, "b": {"lower": 0, "upper": 5}},
-        "equations": {"y": "a*u + b*u*(1 + 0.001*u)"}, "outputs": {"y": "y"},
-        "initial": {"y": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "sum",
+            "form": "difference",
+            "inputs": {"u": "V"},
+            "states": {"y": "V"},
+            "parameters": {"a": {"lower": 0, "upper": 5}, "b": {"lower": 0, "upper": 5}},
+            "equations": {"y": "a*u + b*u*(1 + 0.001*u)"},
+            "outputs": {"y": "y"},
+            "initial": {"y": 0},
+        }
+    )
     theta = np.array([2.0, 1.0])
     noise = 1e-7 * np.random.default_rng(2).standard_normal(3000)
     y = 3.0 * FORCE.values + 0.001 * FORCE.values**2 + noise

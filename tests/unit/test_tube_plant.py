@@ -92,8 +92,10 @@ def test_a_tube_of_half_the_cells_gives_nearly_the_same() -> None:
 def test_a_longer_tube_answers_later() -> None:
     values = np.full(2500, 2e5)
     values[:10] = 1e5
-    ends = [simulate_tube(Tube(length_m=l), pressure(values)).channel("P2").values
-            for l in (10.0, 20.0, 40.0)]  # fmt: skip  # noqa: E741
+    ends = [
+        simulate_tube(Tube(length_m=l), pressure(values)).channel("P2").values
+        for l in (10.0, 20.0, 40.0)
+    ]  # noqa: E741
     late = [PERIOD * (np.argmax(end > 1.02e5) - 10) for end in ends]
     for length, time in zip((10.0, 20.0, 40.0), late, strict=True):
         assert 0.9 * length / 343 < time < 1.5 * length / 290
@@ -127,10 +129,14 @@ def test_gauges_tell_whole_digits_with_noise() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "pointer"),
-    [({"length_m": 0.1}, "/parameters/length_m"), ({"bore_m": float("nan")}, "/parameters/bore_m"),
-     ({"cells": 9000}, "/parameters/cells"),
-     ({"cells": 7}, "/parameters/cells"), ({"volume_m3": -1.0}, "/parameters/volume_m3")],
-)  # fmt: skip
+    [
+        ({"length_m": 0.1}, "/parameters/length_m"),
+        ({"bore_m": float("nan")}, "/parameters/bore_m"),
+        ({"cells": 9000}, "/parameters/cells"),
+        ({"cells": 7}, "/parameters/cells"),
+        ({"volume_m3": -1.0}, "/parameters/volume_m3"),
+    ],
+)
 def test_a_tube_that_cannot_be_is_told(changes: dict[str, Any], pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
         Tube(**changes)

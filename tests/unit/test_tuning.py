@@ -29,11 +29,18 @@ def identified(model: Model, **values: float) -> IdentifiedModel:
 
 def linear(equations: dict[str, str], output: str = "x1") -> IdentifiedModel:
     """A model in the differential form without parameters."""
-    return identified(parse_model({
-        "name": "plant", "form": "differential", "inputs": {"u": "V", "w": "V"},
-        "states": dict.fromkeys(equations, "m"), "equations": equations,
-        "outputs": {"y": output},
-    }))  # fmt: skip
+    return identified(
+        parse_model(
+            {
+                "name": "plant",
+                "form": "differential",
+                "inputs": {"u": "V", "w": "V"},
+                "states": dict.fromkeys(equations, "m"),
+                "equations": equations,
+                "outputs": {"y": output},
+            }
+        )
+    )
 
 
 def chain(*times: float, delay: float = 0.0, gain: float = 1.0) -> IdentifiedModel:
@@ -49,9 +56,13 @@ FOPDT = identified(load_model("fopdt"), K=2.0, T=3.0, L=1.0, y0=5.0)
 def controlled(found: Tuning, **fields: Any) -> PidControl:
     """The controller that a rule gives."""
     return PidControl(
-        "u", "y", found.gain, integral_time=found.integral_time,
-        derivative_time=found.derivative_time, **fields,
-    )  # fmt: skip
+        "u",
+        "y",
+        found.gain,
+        integral_time=found.integral_time,
+        derivative_time=found.derivative_time,
+        **fields,
+    )
 
 
 def test_simc_of_a_first_order_process_is_that_of_the_formula() -> None:
@@ -174,8 +185,9 @@ def test_the_loop_swings_where_the_gain_margin_says(gain: float, is_stable: bool
     assert (compute_margins(FOPDT, edge).phase_margin > 0) == is_stable
     times = 0.02 * np.arange(10001.0)
     loop = close_loop(FOPDT.model, edge, 0.02)
-    step = Channel(loop.reference, np.array([-1e-9, 0.0, times[-1]]), np.array([5.0, 6.0, 6.0]),
-                   hold="zero")  # fmt: skip
+    step = Channel(
+        loop.reference, np.array([-1e-9, 0.0, times[-1]]), np.array([5.0, 6.0, 6.0]), hold="zero"
+    )
     values = {**FOPDT.value_by_name, "x(0)": 0.0}
     found = loop.simulate([step], values, times=times).channel("y").values
     metrics = measure_step_response(times, found, at=0.0, before=5.0, after=6.0)
@@ -211,7 +223,7 @@ def test_stability_is_that_of_the_roots_where_there_is_no_dead_time(gain: float)
         ("(u + x1)/2",): [2.0, -1.0],
         ("(x2 - x1)/0.5", "x3", "(u - x3)/0.2"): [0.1, 0.7, 1.0, 0.0],
         ("x2", "u - x1 - 0.1*x2"): [1.0, 0.1, 1.0],
-    }  # fmt: skip
+    }
     for equations, below in polynomials.items():
         plant = linear({f"x{i}": one for i, one in enumerate(equations, 1)})
         for integral, derivative in ((None, 0.0), (1.5, 0.0), (1.5, 0.4), (0.1, 0.0)):
@@ -247,7 +259,7 @@ def test_a_dead_time_inside_the_plant_is_kept_as_it_is() -> None:
         (linear({"x1": "(w - x1)/2"}), "has no effect on 'y'"),
         (linear({"x1": "-x1"}, "u(t-1)"), "no time constant"),
     ],
-)  # fmt: skip
+)
 def test_a_plant_that_a_rule_is_not_for_is_told(plant: IdentifiedModel, part: str) -> None:
     with pytest.raises(InvalidSettings, match=part) as caught:
         tune_controller(plant, "u", "y")
@@ -255,10 +267,20 @@ def test_a_plant_that_a_rule_is_not_for_is_told(plant: IdentifiedModel, part: st
 
 
 def test_what_a_rule_cannot_take_is_told() -> None:
-    recursion = IdentifiedModel(parse_model({
-        "name": "r", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "equations": {"x": "0.9*x(k-1) + 0.1*u(k-1)"}, "outputs": {"y": "x"},
-    }), (), sample_time=0.1)  # fmt: skip
+    recursion = IdentifiedModel(
+        parse_model(
+            {
+                "name": "r",
+                "form": "difference",
+                "inputs": {"u": "V"},
+                "states": {"x": "m"},
+                "equations": {"x": "0.9*x(k-1) + 0.1*u(k-1)"},
+                "outputs": {"y": "x"},
+            }
+        ),
+        (),
+        sample_time=0.1,
+    )
     with pytest.raises(InvalidSettings, match="this one is a recursion"):
         tune_controller(recursion, "u", "y")
     with pytest.raises(NotLinear, match="this one is a recursion"):

@@ -59,9 +59,7 @@ def test_records_of_unequal_noise_each_count_with_their_own() -> None:
     assert found.uncertainty is not None
     assert found.uncertainty.noise_colour == "white"
     step = 1e-5 * np.eye(end.theta.size)
-    slopes = (
-        problem.predict(end.theta + step) - problem.predict(end.theta - step)
-    ).T / 2e-5  # fmt: skip
+    slopes = (problem.predict(end.theta + step) - problem.predict(end.theta - step)).T / 2e-5
     error = problem.evaluator.measured - problem.predict(end.theta[None])[0]
     bread = np.linalg.inv(slopes.T @ slopes)
     inner = 0.0
@@ -79,12 +77,18 @@ def test_intervals_that_a_short_exact_output_tells_cover_the_truth() -> None:
     # y tells a, T and c by 20 samples, z tells b by 1000: s² of y by 17 degrees of freedom.
     truth_ = np.array([2.0, 0.8, 0.3, 1.0])
     spans = {"a": (0.1, 5), "T": (0.1, 3), "c": (-3, 3), "b": (-3, 3)}
-    model = parse_model({
-        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m", "w": "m"},
-        "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
-        "equations": {"x": "(u - x)/T", "w": "u - w"}, "initial": {"x": 0, "w": 0},
-        "outputs": {"y": "a*x + c", "z": "b*w"},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "two",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m", "w": "m"},
+            "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
+            "equations": {"x": "(u - x)/T", "w": "u - w"},
+            "initial": {"x": 0, "w": 0},
+            "outputs": {"y": "a*x + c", "z": "b*w"},
+        }
+    )
     times, random = 0.05 * np.arange(1000.0), np.random.default_rng(7)
     u = Channel("u", times, np.repeat(random.normal(size=50), 20), hold="zero")
     given = dict(zip(spans, truth_.tolist(), strict=True))
@@ -106,11 +110,18 @@ def test_intervals_that_a_short_exact_output_tells_cover_the_truth() -> None:
 
 def test_what_has_a_small_part_in_an_unknown_direction_is_not_identified() -> None:
     spans = {"a": (0.1, 5.0), "b": (0.1, 5.0), "T": (0.1, 3.0)}
-    model = parse_model({
-        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-        "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
-        "equations": {"x": "(u - x)/T"}, "outputs": {"y": "a*x", "z": "b*x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    model = parse_model(
+        {
+            "name": "two",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "m"},
+            "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
+            "equations": {"x": "(u - x)/T"},
+            "outputs": {"y": "a*x", "z": "b*x"},
+            "initial": {"x": 0},
+        }
+    )
     times = 0.1 * np.arange(3.0)
     noise = np.random.default_rng(3).normal(0, 0.1, 3)
     data = tuple(Channel(name, times, np.sin(times) + noise, "m") for name in "yz")
@@ -168,13 +179,19 @@ def test_the_correlation_matrix_is_one_of_correlations() -> None:
 
 def document(equation: str) -> dict[str, object]:
     return {
-        "name": "test", "form": "difference", "inputs": {"q": "N"}, "states": {"x": "m"},
+        "name": "test",
+        "form": "difference",
+        "inputs": {"q": "N"},
+        "states": {"x": "m"},
         "parameters": {
-            "g": {"lower": 0.0, "upper": 10.0}, "h2": {"lower": 0.0, "upper": 10.0},
+            "g": {"lower": 0.0, "upper": 10.0},
+            "h2": {"lower": 0.0, "upper": 10.0},
             "u": {"lower": 0.0, "upper": 10.0},
         },
-        "equations": {"x": equation}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    }  # fmt: skip
+        "equations": {"x": equation},
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
 
 
 def analysed(equation: str, theta: list[float]) -> dict[str, Estimate]:
@@ -285,8 +302,12 @@ def test_a_rounded_lag_leaves_the_other_standard_errors_alone() -> None:
 
 def test_a_rounded_lag_at_its_bound_has_no_standard_error_and_says_why() -> None:
     changes = {"L": {"lower": 0.5, "upper": 1.0}}
-    model = load_model({**load_model("duffing-eq16").document,
-                        "solver": {"history": "constant", "interpolation": "nearest"}})  # fmt: skip
+    model = load_model(
+        {
+            **load_model("duffing-eq16").document,
+            "solver": {"history": "constant", "interpolation": "nearest"},
+        }
+    )
     problem = Problem.build(model, [record(noisy())], parameters=changes)
     found = by_name(analyse_estimate(problem, np.array([0.2, 0.5, 5.0, 1.0])).estimates)["L"]
     assert found.stderr is None

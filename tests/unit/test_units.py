@@ -27,23 +27,65 @@ TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 
 @pytest.mark.parametrize(
     ("unit", "other", "times"),
-    [("kPa", "Pa", 1e3), ("Pa", "kPa", 1e-3), ("bar", "mbar", 1e3),
-     ("psi", "Pa", 6894.757293168361), ("deg", "rad", np.pi / 180), ("rpm", "rad/s", np.pi / 30),
-     ("m/s^2", "m/s²", 1.0), ("N/kg", "m/s**2", 1.0), ("kg·m²", "kg m^2", 1.0),
-     ("1/(V·s)", "1/V/s", 1.0), ("s⁻¹", "Hz", 1.0), ("µm", "mm", 1e-3), ("min", "s", 60.0),
-     ("m", "min", None), ("V", "N", None), ("°C", "K", None), ("counts", "counts", 1.0),
-     ("counts", "V", None), ("(m", "m", None),
-     ("rpm", "Hz", 1 / 60), ("rev/s", "Hz", 1.0), ("rpm", "1/min", 1.0), ("rpm", "deg/s", 6.0),
-     ("rps", "1/s", 1.0), ("rev", "rad", 2 * np.pi), ("N·m/rad", "N·m/rev", 2 * np.pi),
-     ("N·m/rad", "N·m", 1.0), ("V/Hz", "V·s", 1.0), ("Hz", "rad/s", None), ("deg/s", "kHz", None),
-     ("N·m/rev", "N·m", None), ("°C", "C", None), ("°C", "degC", 1.0), ("° C", "℃", 1.0),
-     ("deg C", "C", None), ("°F", "°C", None), ("°/s", "rad/s", np.pi / 180), ("°", "deg", 1.0),
-     ("Nm", "N·m", 1.0), ("kNm", "N*m", 1e3), ("sec", "s", 1.0), ("RPM", "rpm", 1.0),
-     ("m/s2", "m/s^2", 1.0), ("m s-2", "m/s²", 1.0), ("m3/hr", "m^3/h", 1.0), ("kWh", "J", 3.6e6),
-     ("mAh", "C", 3.6), ("S", "1/ohm", 1.0), ("t", "kg", 1e3), ("inch", "mm", 25.4),
-     ("volt", "V", None), ("H2O", "m", None), ("°C/s", "K/s", None),
-     ("km^99 km^99 km^99 km^99", "m^396", None), ("m/", "m", None), ("2 m", "m", None)],
-)  # fmt: skip
+    [
+        ("kPa", "Pa", 1e3),
+        ("Pa", "kPa", 1e-3),
+        ("bar", "mbar", 1e3),
+        ("psi", "Pa", 6894.757293168361),
+        ("deg", "rad", np.pi / 180),
+        ("rpm", "rad/s", np.pi / 30),
+        ("m/s^2", "m/s²", 1.0),
+        ("N/kg", "m/s**2", 1.0),
+        ("kg·m²", "kg m^2", 1.0),
+        ("1/(V·s)", "1/V/s", 1.0),
+        ("s⁻¹", "Hz", 1.0),
+        ("µm", "mm", 1e-3),
+        ("min", "s", 60.0),
+        ("m", "min", None),
+        ("V", "N", None),
+        ("°C", "K", None),
+        ("counts", "counts", 1.0),
+        ("counts", "V", None),
+        ("(m", "m", None),
+        ("rpm", "Hz", 1 / 60),
+        ("rev/s", "Hz", 1.0),
+        ("rpm", "1/min", 1.0),
+        ("rpm", "deg/s", 6.0),
+        ("rps", "1/s", 1.0),
+        ("rev", "rad", 2 * np.pi),
+        ("N·m/rad", "N·m/rev", 2 * np.pi),
+        ("N·m/rad", "N·m", 1.0),
+        ("V/Hz", "V·s", 1.0),
+        ("Hz", "rad/s", None),
+        ("deg/s", "kHz", None),
+        ("N·m/rev", "N·m", None),
+        ("°C", "C", None),
+        ("°C", "degC", 1.0),
+        ("° C", "℃", 1.0),
+        ("deg C", "C", None),
+        ("°F", "°C", None),
+        ("°/s", "rad/s", np.pi / 180),
+        ("°", "deg", 1.0),
+        ("Nm", "N·m", 1.0),
+        ("kNm", "N*m", 1e3),
+        ("sec", "s", 1.0),
+        ("RPM", "rpm", 1.0),
+        ("m/s2", "m/s^2", 1.0),
+        ("m s-2", "m/s²", 1.0),
+        ("m3/hr", "m^3/h", 1.0),
+        ("kWh", "J", 3.6e6),
+        ("mAh", "C", 3.6),
+        ("S", "1/ohm", 1.0),
+        ("t", "kg", 1e3),
+        ("inch", "mm", 25.4),
+        ("volt", "V", None),
+        ("H2O", "m", None),
+        ("°C/s", "K/s", None),
+        ("km^99 km^99 km^99 km^99", "m^396", None),
+        ("m/", "m", None),
+        ("2 m", "m", None),
+    ],
+)
 def test_units_differ_by_a_factor_or_by_their_kind(
     unit: str, other: str, times: float | None
 ) -> None:
@@ -62,19 +104,31 @@ def test_no_text_breaks_the_comparison_and_a_factor_turns_round(unit: str, other
 
 @pytest.mark.parametrize(
     ("unit", "other"),
-    [("counts", "V"), ("V", "counts"), ("volt", "V"), ("Bar", "bar"), ("dB", "%"), ("A", "a"),
-     ("°C/s", "K/s"), ("2 m", "m")],
-)  # fmt: skip
+    [
+        ("counts", "V"),
+        ("V", "counts"),
+        ("volt", "V"),
+        ("Bar", "bar"),
+        ("dB", "%"),
+        ("A", "a"),
+        ("°C/s", "K/s"),
+        ("2 m", "m"),
+    ],
+)
 def test_of_a_unit_that_cannot_be_read_nothing_is_asserted(unit: str, other: str) -> None:
     assert not describe_difference(unit, other)
 
 
 @pytest.mark.parametrize(
     ("unit", "other", "said"),
-    [("V", "N", "V is not N"), ("°C", "C", "°C is not C"), ("°C", "K", "°C is not K"),
-     ("Hz", "rad/s", "between Hz and rad/s it is open"),
-     ("deg/s", "kHz", "between deg/s and kHz it is open")],
-)  # fmt: skip
+    [
+        ("V", "N", "V is not N"),
+        ("°C", "C", "°C is not C"),
+        ("°C", "K", "°C is not K"),
+        ("Hz", "rad/s", "between Hz and rad/s it is open"),
+        ("deg/s", "kHz", "between deg/s and kHz it is open"),
+    ],
+)
 def test_units_that_are_known_to_differ_are_told_with_both_names_and_no_number(
     unit: str, other: str, said: str
 ) -> None:
@@ -88,11 +142,18 @@ def test_a_blank_unit_goes_with_every_unit(blank: str | None, unit: str) -> None
 
 
 def model(u: str = "Pa", y: str = "1") -> Model:
-    return parse_model({
-        "name": "gauge", "form": "differential", "inputs": {"u": u}, "states": {"x": y},
-        "parameters": {"T": {"lower": 0.1, "upper": 2, "unit": "s"}},
-        "equations": {"x": "(u - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    })  # fmt: skip
+    return parse_model(
+        {
+            "name": "gauge",
+            "form": "differential",
+            "inputs": {"u": u},
+            "states": {"x": y},
+            "parameters": {"T": {"lower": 0.1, "upper": 2, "unit": "s"}},
+            "equations": {"x": "(u - x)/T"},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
+        }
+    )
 
 
 def record(u: str, y: str, name: str = "") -> Record:
@@ -103,8 +164,11 @@ def record(u: str, y: str, name: str = "") -> Record:
 
 
 def test_a_record_in_another_unit_than_the_model_is_refused_with_both_units() -> None:
-    with pytest.raises(InvalidRecord, match=r"'u' is in kPa in record 'old', but in model 'gauge' "
-                       r"it is in Pa: 1 kPa is 1000 Pa; .*unit.*\"u\": \"Pa\""):  # fmt: skip
+    with pytest.raises(
+        InvalidRecord,
+        match=r"'u' is in kPa in record 'old', but in model 'gauge' "
+        r"it is in Pa: 1 kPa is 1000 Pa; .*unit.*\"u\": \"Pa\"",
+    ):
         identify(model(), record("kPa", "1", "old"), TINY)
 
 
@@ -165,10 +229,21 @@ def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() 
 
 @pytest.mark.parametrize(
     ("unit", "meant"),
-    [("bat", "bar"), ("m/sx", "m/s"), ("Kpa", "kPa"), ("Mpa", "MPa"), ("PA", "Pa"),
-     ("seconds", "s"), ("volt", "V"), ("N*meters", "N*m"), ("Hertz", "Hz"), ("mbat", "mbar"),
-     ("pct", "%"), ("pct/s", "%/s")],
-)  # fmt: skip
+    [
+        ("bat", "bar"),
+        ("m/sx", "m/s"),
+        ("Kpa", "kPa"),
+        ("Mpa", "MPa"),
+        ("PA", "Pa"),
+        ("seconds", "s"),
+        ("volt", "V"),
+        ("N*meters", "N*m"),
+        ("Hertz", "Hz"),
+        ("mbat", "mbar"),
+        ("pct", "%"),
+        ("pct/s", "%/s"),
+    ],
+)
 def test_for_a_unit_that_nobody_knows_the_one_written_most_alike_is_suggested(
     unit: str, meant: str
 ) -> None:

@@ -12,9 +12,14 @@ from sysid.kernels.vectors import VectorFunctions, load_vector_functions
 from sysid.simulation.problem import Problem
 
 FUNCTIONS = {
-    "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "tanh": np.tanh,
     "atan": np.arctan,
-}  # fmt: skip
+}
 PLACES = np.array([-800.0, -3.0, -0.5, -1e-9, 0.0, 1e-300, 0.7, 1.0, 30.0, 709.0, 710.0, 1e5])
 
 
@@ -23,11 +28,15 @@ def values_of(expression: str, candidates: FloatArray) -> FloatArray:
     bounds = {"lower": -1e6, "upper": 1e6}
     model = load_model(
         {
-            "name": "function", "form": "difference", "states": {"x": "1"},
-            "parameters": {"p": bounds, "q": bounds}, "equations": {"x": expression},
-            "outputs": {"y": "x"}, "initial": {"x": 0},
+            "name": "function",
+            "form": "difference",
+            "states": {"x": "1"},
+            "parameters": {"p": bounds, "q": bounds},
+            "equations": {"x": expression},
+            "outputs": {"y": "x"},
+            "initial": {"x": 0},
         }
-    )  # fmt: skip
+    )
     times = np.arange(2.0)
     record = Record((), (Channel("y", times, times, "1"),))
     return np.asarray(Problem.build(model, [record]).predict(candidates)[:, 1])

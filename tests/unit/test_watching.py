@@ -9,14 +9,27 @@ from service.cli.watch import LOG_INTERVAL_SECONDS, ProgressLog, RunsProgress
 
 
 def job(state: str, finished: int = 0, **progress: Any) -> dict[str, Any]:
-    known = {"runs": 40, "finished": finished, "generation": 0, "best_rms": None, "failed": 0,
-             "reused": 0, "seconds_left": None, **progress}  # fmt: skip
+    known = {
+        "runs": 40,
+        "finished": finished,
+        "generation": 0,
+        "best_rms": None,
+        "failed": 0,
+        "reused": 0,
+        "seconds_left": None,
+        **progress,
+    }
     return {"id": "job_1", "name": "many", "state": state, "progress": known}
 
 
 def run(number: int, state: str = "succeeded", rms: float | None = 0.25) -> dict[str, Any]:
-    return {"number": number, "state": state, "rms": rms, "labels": {"length_m": 5},
-            "cell": {"/noise/sigma": 0.1, "/datasets": ["ds_1"]}}  # fmt: skip
+    return {
+        "number": number,
+        "state": state,
+        "rms": rms,
+        "labels": {"length_m": 5},
+        "cell": {"/noise/sigma": 0.1, "/datasets": ["ds_1"]},
+    }
 
 
 class Log:
@@ -49,8 +62,12 @@ def test_a_line_is_told_at_a_change_of_state_and_every_ten_seconds_at_most():
         log.show(tick / 10, job("running", tick // 10, best_rms=1 / tick))
     log.show(30, job("succeeded", 40, best_rms=0.25))
     assert [text.split(",")[0].split()[1] for text in log.told] == [
-        "queued", "running", "running", "running", "succeeded",
-    ]  # fmt: skip
+        "queued",
+        "running",
+        "running",
+        "running",
+        "succeeded",
+    ]
     assert log.told[-1] == "job_1 succeeded, 40/40 runs"
 
 
@@ -107,13 +124,21 @@ def test_nothing_new_is_not_told_again():
 @pytest.mark.parametrize(
     ("runs", "reused", "said"),
     [
-        (1, 1, "note: the same run was computed before: the result of run_0 is shown; to compute "
-               "anew: reuse: false in the job"),
-        (40, 3, "note: 3 of 40 runs were computed before: their results are shown; to compute "
-                "anew: reuse: false in the job"),
+        (
+            1,
+            1,
+            "note: the same run was computed before: the result of run_0 is shown; to compute "
+            "anew: reuse: false in the job",
+        ),
+        (
+            40,
+            3,
+            "note: 3 of 40 runs were computed before: their results are shown; to compute "
+            "anew: reuse: false in the job",
+        ),
         (40, 0, ""),
     ],
-)  # fmt: skip
+)
 def test_a_result_that_was_taken_over_is_said_to_be(capsys, runs: int, reused: int, said: str):
     ended = job("succeeded", runs, runs=runs, reused=reused)
     print_reuse_note(ended, [{"reused_from": "run_0"}], "reuse: false in the job")
@@ -127,14 +152,23 @@ class Summarised:
         self._groups = groups
 
     def summary(self, _: str) -> dict[str, Any]:
-        return {"groups": self._groups, "quantiles": [0.05, 0.25, 0.5, 0.75, 0.95],
-                "by": ["/noise/sigma"], "rms_unit": "m"}  # fmt: skip
+        return {
+            "groups": self._groups,
+            "quantiles": [0.05, 0.25, 0.5, 0.75, 0.95],
+            "by": ["/noise/sigma"],
+            "rms_unit": "m",
+        }
 
 
 def group(sigma: float) -> dict[str, Any]:
     value = {"name": "T", "unit": "s", "value": [1.0, 2.0, 3.0, 4.0, 5.0]}
-    return {"key": {"/noise/sigma": sigma}, "runs": 400, "success_rate": 0.5,
-            "rms": [0.1, 0.2, 0.3, 0.4, 0.5], "parameters": [value]}  # fmt: skip
+    return {
+        "key": {"/noise/sigma": sigma},
+        "runs": 400,
+        "success_rate": 0.5,
+        "rms": [0.1, 0.2, 0.3, 0.4, 0.5],
+        "parameters": [value],
+    }
 
 
 def test_many_runs_end_in_a_summary_whose_length_does_not_grow_with_them(capsys):

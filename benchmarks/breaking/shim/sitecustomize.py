@@ -80,9 +80,10 @@ class _Finder(importlib.abc.MetaPathFinder):
     def find_spec(self, fullname, path=None, target=None):
         """The usual module, with a loader that breaks it."""
         breakers = [
-            breaker for (module, variable), breaker in _BREAKERS.items()
+            breaker
+            for (module, variable), breaker in _BREAKERS.items()
             if module == fullname and os.environ.get(variable)
-        ]  # fmt: skip
+        ]
         if not breakers:
             return None
         sys.meta_path.remove(self)

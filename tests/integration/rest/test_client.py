@@ -25,9 +25,8 @@ class Through(httpx.BaseTransport):
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         answer = self._server.request(
-            request.method, str(request.url), content=request.read(),
-            headers=dict(request.headers),
-        )  # fmt: skip
+            request.method, str(request.url), content=request.read(), headers=dict(request.headers)
+        )
         headers = [(k, v) for k, v in answer.headers.items() if k != "content-encoding"]
         return httpx.Response(answer.status_code, headers=headers, content=answer.content)
 
@@ -100,8 +99,11 @@ def test_models_are_read_checked_and_stored(client: Client) -> None:
 
 def test_every_call_is_one_of_the_interface(server: TestClient) -> None:
     paths = server.get("/openapi.json").json()["paths"]
-    routes = {(verb.upper(), re.sub(r"{\w*}", "{}", path)) for path, verbs in paths.items()
-              for verb in verbs}  # fmt: skip
+    routes = {
+        (verb.upper(), re.sub(r"{\w*}", "{}", path))
+        for path, verbs in paths.items()
+        for verb in verbs
+    }
     table = [one for one in vars(calls).values() if isinstance(one, calls.Endpoint)]
     assert len(table) > 30
     assert {(one.method, f"/v1/{one.path}") for one in table} <= routes

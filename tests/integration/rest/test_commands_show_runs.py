@@ -21,12 +21,19 @@ from tests.integration.rest.test_client import Through
 from tests.rest import CSV, recording, settings_of
 
 MODEL: dict[str, Any] = {
-    "name": "lagged", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-    "parameters": {"K": {"lower": 0, "upper": 5, "unit": "m/V"},
-                   "T": {"lower": 0.1, "upper": 5, "unit": "s"},
-                   "L": {"lower": 0, "upper": 2, "unit": "s"}},
-    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "name": "lagged",
+    "form": "differential",
+    "inputs": {"u": "V"},
+    "states": {"x": "m"},
+    "parameters": {
+        "K": {"lower": 0, "upper": 5, "unit": "m/V"},
+        "T": {"lower": 0.1, "upper": 5, "unit": "s"},
+        "L": {"lower": 0, "upper": 2, "unit": "s"},
+    },
+    "equations": {"x": "(K*u(t - L) - x)/T"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 
 
 class Served(NamedTuple):
@@ -41,13 +48,19 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("shown")))
     with TestClient(app) as server:
         data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
-        axis = {"path": "/datasets", "values": [[data], [data]],
-                "labels": [{"length_m": 5}, {"length_m": 20}]}  # fmt: skip
+        axis = {
+            "path": "/datasets",
+            "values": [[data], [data]],
+            "labels": [{"length_m": 5}, {"length_m": 20}],
+        }
         body = {
-            "model": MODEL, "datasets": [data], "sweep": {"axes": [axis]},
+            "model": MODEL,
+            "datasets": [data],
+            "sweep": {"axes": [axis]},
             "algorithm": {"population": 20, "generations": 40, "islands": 1},
-            "hold": {"u": "zero"}, "validation": {"fraction": 0.2},
-        }  # fmt: skip
+            "hold": {"u": "zero"},
+            "validation": {"fraction": 0.2},
+        }
         job, runs = identified(app.state.parts, body)
         yield Served(Client("http://testserver", transport=Through(server)), data, job, runs)
 
@@ -128,14 +141,38 @@ def test_the_list_of_jobs_has_the_rms_of_a_single_run_with_its_unit(
 
 
 def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    point = {"x": 5.0, "value": 1.0, "stderr": 0.1, "status": "identified", "is_outlier": False,
-             "drifts": []}  # fmt: skip
-    one = {"name": "T", "unit": "s", "kind": "parameter", "points": [point], "laws": [],
-           "reason": "", "predictions": [], "notes": []}  # fmt: skip
+    point = {
+        "x": 5.0,
+        "value": 1.0,
+        "stderr": 0.1,
+        "status": "identified",
+        "is_outlier": False,
+        "drifts": [],
+    }
+    one = {
+        "name": "T",
+        "unit": "s",
+        "kind": "parameter",
+        "points": [point],
+        "laws": [],
+        "reason": "",
+        "predictions": [],
+        "notes": [],
+    }
     place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "warnings": []}
-    print_trend({"x": "length_m", "reference": None, "reference_x": None, "reference_names": [],
-                 "places": [place], "quantities": [one], "missing": 0,
-                 "notes": ["use loss: {noise_model: ar1}"]}, FieldOrigins())  # fmt: skip
+    print_trend(
+        {
+            "x": "length_m",
+            "reference": None,
+            "reference_x": None,
+            "reference_names": [],
+            "places": [place],
+            "quantities": [one],
+            "missing": 0,
+            "notes": ["use loss: {noise_model: ar1}"],
+        },
+        FieldOrigins(),
+    )
     told = capsys.readouterr().out
     assert "T [s]" in told
     assert "note: use --set loss.noise_model=ar1" in told
@@ -186,8 +223,9 @@ def test_a_free_run_over_a_part_reads_what_was_recorded_before_it(
     assert with_past < 0.02
     assert without > 2 * with_past
     assert served.client.run(served.runs[0])["known_before"] == {
-        "estimation": [0.0], "validation": [pytest.approx(24.0)],
-    }  # fmt: skip
+        "estimation": [0.0],
+        "validation": [pytest.approx(24.0)],
+    }
 
 
 def test_jobs_are_listed_by_state(served: Served) -> None:

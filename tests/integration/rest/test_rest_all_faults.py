@@ -8,13 +8,21 @@ from starlette.testclient import TestClient
 from tests.rest import refused
 
 SWEEP = {"sigma": [0.1], "replicates": 2}
-TRUTH = {"parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0}, "samples": 80, "sample_time": 0.1,
-         "inputs": {"u": {"kind": "step"}}}  # fmt: skip
+TRUTH = {
+    "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+    "samples": 80,
+    "sample_time": 0.1,
+    "inputs": {"u": {"kind": "step"}},
+}
 TWO_OUTPUTS = {
-    "name": "two", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
-    "parameters": {"T": {"lower": 1, "upper": 9}}, "equations": {"x": "(u - x)/T"},
+    "name": "two",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
+    "parameters": {"T": {"lower": 1, "upper": 9}},
+    "equations": {"x": "(u - x)/T"},
     "outputs": {"y": "x", "z": "2*x"},
-}  # fmt: skip
+}
 
 
 def faults(answer: Any) -> dict[str, str]:
@@ -24,23 +32,31 @@ def faults(answer: Any) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("changes", "pointers"),
     [
-        ({"seed": "x", "parameters": {"LL": {"upper": 1}, "K": {"upper": "x"}}},
-         {"/seed", "/parameters/K/upper"}),
+        (
+            {"seed": "x", "parameters": {"LL": {"upper": 1}, "K": {"upper": "x"}}},
+            {"/seed", "/parameters/K/upper"},
+        ),
         ({"model": "fopd", "seed": "x"}, {"/seed"}),
         ({"model": 3, "datasets": ["none"], "algoritm": {}}, {"/model", "/algoritm"}),
-        ({"algorithm": {"populaton": 3, "mutation": 3}, "hold": {"y": "zero"}},
-         {"/algorithm/populaton", "/algorithm/mutation"}),
+        (
+            {"algorithm": {"populaton": 3, "mutation": 3}, "hold": {"y": "zero"}},
+            {"/algorithm/populaton", "/algorithm/mutation"},
+        ),
         ({"datasets": 3, "parameters": {"LL": {"upper": 1}}}, {"/datasets"}),
-        ({"sweep": {"axes": [{"values": [1]}]}, "trend": {"x": "n", "parameters": ["LL"]}},
-         {"/sweep/axes/0/path"}),
+        (
+            {"sweep": {"axes": [{"values": [1]}]}, "trend": {"x": "n", "parameters": ["LL"]}},
+            {"/sweep/axes/0/path"},
+        ),
         ({"validation": {"fraction": 2}, "skip": 10_000}, {"/validation/fraction"}),
-        ({"priority": "high", "sweep": {"axes": [{"path": "/noise/sigma", "values": [0, -1]}]}},
-         {"/priority"}),
+        (
+            {"priority": "high", "sweep": {"axes": [{"path": "/noise/sigma", "values": [0, -1]}]}},
+            {"/priority"},
+        ),
         ({"channels": {"u": 3}, "hold": {"y": "zero", "u": "held"}}, {"/channels/u", "/hold/u"}),
         ({"chanels": {"u": "volts"}, "skip": 10_000}, {"/chanels"}),
         ({"seed": [], "sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}}, {"/seed"}),
     ],
-)  # fmt: skip
+)
 def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
     server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
 ) -> None:
@@ -51,30 +67,55 @@ def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
 @pytest.mark.parametrize(
     ("changes", "pointers"),
     [
-        ({"parameters": {"LL": {"upper": 1}, "KK": {"upper": 1}, "T": {"lower": 9, "upper": 1}}},
-         {"/parameters/LL", "/parameters/KK", "/parameters/T"}),
+        (
+            {"parameters": {"LL": {"upper": 1}, "KK": {"upper": 1}, "T": {"lower": 9, "upper": 1}}},
+            {"/parameters/LL", "/parameters/KK", "/parameters/T"},
+        ),
         ({"model": "fopd", "datasets": ["none"]}, {"/model", "/datasets/0"}),
-        ({"algorithm": {"mutation": [[5, 0.2]]}, "hold": {"y": "zero"}},
-         {"/algorithm/mutation", "/hold/y"}),
-        ({"channels": {"w": "u"}, "sweep": {"axes": [{"path": "/sed", "range": [0, 2]}]},
-          "parameters": {"LL": {"upper": 1}}},
-         {"/channels/w", "/sweep/axes/0/path", "/parameters/LL"}),
-        ({"sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}, "hold": {"y": "zero"}},
-         {"/sweep/axes", "/hold/y"}),
-        ({"trend": {"x": "n", "parameters": ["LL"]}, "weights": {"z": 1}},
-         {"/trend/x", "/trend/parameters/0", "/weights/z"}),
+        (
+            {"algorithm": {"mutation": [[5, 0.2]]}, "hold": {"y": "zero"}},
+            {"/algorithm/mutation", "/hold/y"},
+        ),
+        (
+            {
+                "channels": {"w": "u"},
+                "sweep": {"axes": [{"path": "/sed", "range": [0, 2]}]},
+                "parameters": {"LL": {"upper": 1}},
+            },
+            {"/channels/w", "/sweep/axes/0/path", "/parameters/LL"},
+        ),
+        (
+            {"sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}, "hold": {"y": "zero"}},
+            {"/sweep/axes", "/hold/y"},
+        ),
+        (
+            {"trend": {"x": "n", "parameters": ["LL"]}, "weights": {"z": 1}},
+            {"/trend/x", "/trend/parameters/0", "/weights/z"},
+        ),
         ({"skip": 10_000, "hold": {"y": "zero"}}, {"/datasets/0", "/hold/y"}),
-        ({"channels": {"u": "volts"}, "parameters": {"L": {"lower": 9}}},
-         {"/channels/u", "/parameters/L"}),
-        ({"parameters": {"LL": {"upper": 1}}, "sweep": {"axes": [
-            {"path": "/noise/sigma", "values": [0, -1]},
-            {"path": "/parameters/K/fixed", "values": [1, 7]},
-            {"path": "/algorithm/population", "values": [50, 2]}]}},
-         {"/parameters/LL", "/sweep/axes/0/values/1", "/sweep/axes/2/values/1"}),
-        ({"datasets": ["none"], "parameters": {"x(0)[2]": {"fixed": 0}, "x[2]": {"fixed": 0}}},
-         {"/datasets/0", "/parameters/x[2]"}),
+        (
+            {"channels": {"u": "volts"}, "parameters": {"L": {"lower": 9}}},
+            {"/channels/u", "/parameters/L"},
+        ),
+        (
+            {
+                "parameters": {"LL": {"upper": 1}},
+                "sweep": {
+                    "axes": [
+                        {"path": "/noise/sigma", "values": [0, -1]},
+                        {"path": "/parameters/K/fixed", "values": [1, 7]},
+                        {"path": "/algorithm/population", "values": [50, 2]},
+                    ]
+                },
+            },
+            {"/parameters/LL", "/sweep/axes/0/values/1", "/sweep/axes/2/values/1"},
+        ),
+        (
+            {"datasets": ["none"], "parameters": {"x(0)[2]": {"fixed": 0}, "x[2]": {"fixed": 0}}},
+            {"/datasets/0", "/parameters/x[2]"},
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_job_of_right_types_is_told_all_its_faults_and_none_that_follows_from_another(
     server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
 ) -> None:
@@ -85,21 +126,33 @@ def test_a_job_of_right_types_is_told_all_its_faults_and_none_that_follows_from_
 @pytest.mark.parametrize(
     ("changes", "pointers"),
     [
-        ({"datasets": True, "sigma": [-1], "replicates": 0, "parameters": {"LL": {"upper": 1}}},
-         {"/sigma/0", "/replicates"}),
+        (
+            {"datasets": True, "sigma": [-1], "replicates": 0, "parameters": {"LL": {"upper": 1}}},
+            {"/sigma/0", "/replicates"},
+        ),
         ({"truth": {**TRUTH, "samples": "x"}, "hold": {"y": "zero"}}, {"/truth/samples"}),
-        ({"truth": TRUTH, "hold": {"y": "zero"}, "algorithm": {"method": "simple"}},
-         {"/algorithm/method", "/hold/y"}),
-        ({"truth": {**TRUTH, "inputs": {}}, "hold": {"y": "zero"}, "replicates": 100_001},
-         {"/truth/inputs/u", "/replicates", "/hold/y"}),
-        ({"truth": {**TRUTH, "samples": 50}, "parameters": {"LL": {"upper": 1}}},
-         {"/truth", "/parameters/LL"}),
-        ({"truth": TRUTH, "model": "fopd", "algorithm": {"method": "simple"}},
-         {"/model", "/algorithm/method"}),
-        ({"datasets": True, "relative": True, "model": TWO_OUTPUTS, "hold": {"y": "zero"}},
-         {"/relative", "/hold/y", "/channels"}),
+        (
+            {"truth": TRUTH, "hold": {"y": "zero"}, "algorithm": {"method": "simple"}},
+            {"/algorithm/method", "/hold/y"},
+        ),
+        (
+            {"truth": {**TRUTH, "inputs": {}}, "hold": {"y": "zero"}, "replicates": 100_001},
+            {"/truth/inputs/u", "/replicates", "/hold/y"},
+        ),
+        (
+            {"truth": {**TRUTH, "samples": 50}, "parameters": {"LL": {"upper": 1}}},
+            {"/truth", "/parameters/LL"},
+        ),
+        (
+            {"truth": TRUTH, "model": "fopd", "algorithm": {"method": "simple"}},
+            {"/model", "/algorithm/method"},
+        ),
+        (
+            {"datasets": True, "relative": True, "model": TWO_OUTPUTS, "hold": {"y": "zero"}},
+            {"/relative", "/hold/y", "/channels"},
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_noise_sweep_is_told_its_faults_of_types_else_all_others(
     server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
 ) -> None:
@@ -122,9 +175,15 @@ def test_units_and_missing_channels_are_told_in_one_answer(server: TestClient) -
     text = b"t,u [V],x [K]\n" + b"".join(b"%d,%d,%d\n" % (n, n % 3, n % 5) for n in range(60))
     stored = server.post("/v1/datasets", content=text, headers={"content-type": "text/csv"})
     name = stored.json()["id"]
-    own = {"name": "own", "form": "differential", "inputs": {"u": "Pa"}, "states": {"x": "m"},
-           "parameters": {"T": {"lower": 1, "upper": 9}}, "equations": {"x": "(u - x)/T"},
-           "outputs": {"y": "x"}}  # fmt: skip
+    own = {
+        "name": "own",
+        "form": "differential",
+        "inputs": {"u": "Pa"},
+        "states": {"x": "m"},
+        "parameters": {"T": {"lower": 1, "upper": 9}},
+        "equations": {"x": "(u - x)/T"},
+        "outputs": {"y": "x"},
+    }
     body = {"model": own, "datasets": [name]}
     found = faults(server.post("/v1/jobs", json=body))
     assert set(found) == {"/channels", "/datasets/0"}
@@ -143,8 +202,14 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
     body = {"model": "fopdt", "batch": 3, "look_at": ["LL"], "warm_start": "reference"}
     found = faults(server.post("/v1/recipes/reidentify", json=body))
     assert set(found) == {"/label", "/batch"}
-    body = {"model": "fopdt", "label": "n", "batch": batch, "warm_start": "reference",
-            "look_at": ["LL"], "parameters": {"LL": {"upper": 1}}}  # fmt: skip
+    body = {
+        "model": "fopdt",
+        "label": "n",
+        "batch": batch,
+        "warm_start": "reference",
+        "look_at": ["LL"],
+        "parameters": {"LL": {"upper": 1}},
+    }
     found = faults(server.post("/v1/recipes/reidentify", json=body))
     assert set(found) == {"/warm_start", "/look_at/0", "/parameters/LL"}
 

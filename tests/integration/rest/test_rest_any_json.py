@@ -10,32 +10,84 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-TRUTH = {"parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0}, "samples": 90, "sample_time": 0.1,
-         "inputs": {"u": {"kind": "step"}}}  # fmt: skip
-OWN = {"name": "own", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
-       "parameters": {"T": {"lower": 1, "upper": 9}, "L": {"lower": 0, "upper": 2}},
-       "equations": {"x": "(u@L - x)/T"}, "outputs": {"y": "x"}}  # fmt: skip
+TRUTH = {
+    "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+    "samples": 90,
+    "sample_time": 0.1,
+    "inputs": {"u": {"kind": "step"}},
+}
+OWN = {
+    "name": "own",
+    "form": "differential",
+    "inputs": {"u": "V"},
+    "states": {"x": "m"},
+    "parameters": {"T": {"lower": 1, "upper": 9}, "L": {"lower": 0, "upper": 2}},
+    "equations": {"x": "(u@L - x)/T"},
+    "outputs": {"y": "x"},
+}
 AXES = [
     {"path": "/noise/sigma", "values": [0, 0.1]},
     {"path": "/seed", "range": [0, 3]},
     {"path": "/datasets", "values": [["steps"], ["x"]], "labels": [{"n": 1}, {"n": 2}]},
 ]
 BODIES: list[tuple[str, dict[str, Any]]] = [
-    ("/v1/jobs", {
-        "model": "fopdt", "datasets": ["steps"], "channels": {"u": "u"}, "skip": 3, "seed": 1,
-        "validation": {"fraction": 0.3}, "parameters": {"K": {"lower": 0, "upper": 5}},
-        "algorithm": {"population": 20, "stop": {"settled": 3}}, "hold": {"u": "zero"},
-    }),
-    ("/v1/jobs", {"model": OWN, "datasets": ["steps"], "sweep": {"axes": AXES},
-                  "trend": {"x": "n", "parameters": ["L"]}}),
+    (
+        "/v1/jobs",
+        {
+            "model": "fopdt",
+            "datasets": ["steps"],
+            "channels": {"u": "u"},
+            "skip": 3,
+            "seed": 1,
+            "validation": {"fraction": 0.3},
+            "parameters": {"K": {"lower": 0, "upper": 5}},
+            "algorithm": {"population": 20, "stop": {"settled": 3}},
+            "hold": {"u": "zero"},
+        },
+    ),
+    (
+        "/v1/jobs",
+        {
+            "model": OWN,
+            "datasets": ["steps"],
+            "sweep": {"axes": AXES},
+            "trend": {"x": "n", "parameters": ["L"]},
+        },
+    ),
     ("/v1/recipes/noise-sweep", {"model": "fopdt", "truth": TRUTH, "sigma": [0.1]}),
-    ("/v1/recipes/reidentify", {"model": "fopdt", "label": "n", "look_at": ["L"],
-                                "batch": [{"x": 1, "datasets": ["steps"]}]}),
+    (
+        "/v1/recipes/reidentify",
+        {
+            "model": "fopdt",
+            "label": "n",
+            "look_at": ["L"],
+            "batch": [{"x": 1, "datasets": ["steps"]}],
+        },
+    ),
     ("/v1/models:check", OWN),
     ("/v1/datasets:simulate", {"model": "fopdt", **TRUTH}),
-]  # fmt: skip
-NAMES = ["K", "L", "x(0)", "x(0)[2]", "u", "y", "steps", "fopdt", "/seed", "/model/name", "1/0",
-         "x**x", "\ud800", "\x00", "", "é", "=1", "run_x", "previous"]  # fmt: skip
+]
+NAMES = [
+    "K",
+    "L",
+    "x(0)",
+    "x(0)[2]",
+    "u",
+    "y",
+    "steps",
+    "fopdt",
+    "/seed",
+    "/model/name",
+    "1/0",
+    "x**x",
+    "\ud800",
+    "\x00",
+    "",
+    "é",
+    "=1",
+    "run_x",
+    "previous",
+]
 NUMBERS = [0, -1, 0.5, 1e308, -1e308, 5e-324, 2**63, 10**30, 10**400, float("nan"), float("inf")]
 LEAVES = st.sampled_from([None, True, *NAMES, *NUMBERS]) | st.text(max_size=5) | st.floats()
 VALUES = st.recursive(

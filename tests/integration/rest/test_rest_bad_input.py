@@ -8,16 +8,29 @@ from starlette.testclient import TestClient
 from tests.rest import CSV, recording, refused
 
 MODEL: dict[str, Any] = {
-    "name": "own", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "name": "own",
+    "form": "differential",
+    "inputs": {"u": "V"},
+    "states": {"x": "m"},
     "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"lower": 0, "upper": 2}},
-    "equations": {"x": "K*u(t - L) - x"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "K*u(t - L) - x"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 
 
-FEW = {**MODEL, "parameters": {name: {"lower": 0.1, "upper": 0.5} for name in "abcd"},
-       "equations": {"x": "a*u - b*x + c + d*x**2"}}  # fmt: skip
-POLYNOMIAL = {"name": "narx", "form": "polynomial", "inputs": {"u": "V"}, "output": "y",
-              "coefficients": {"lower": -1, "upper": 1}}  # fmt: skip
+FEW = {
+    **MODEL,
+    "parameters": {name: {"lower": 0.1, "upper": 0.5} for name in "abcd"},
+    "equations": {"x": "a*u - b*x + c + d*x**2"},
+}
+POLYNOMIAL = {
+    "name": "narx",
+    "form": "polynomial",
+    "inputs": {"u": "V"},
+    "output": "y",
+    "coefficients": {"lower": -1, "upper": 1},
+}
 
 
 def with_changes(dataset: str, changes: dict[str, Any]) -> dict[str, Any]:
@@ -149,16 +162,24 @@ MODELS: list[tuple[dict[str, Any], str, int | None, str]] = [
     ({"equations": {"x": "K*u(t - L) - z"}}, "/equations/x", 14, "'z'"),
     ({"equations": {"x": "__import__('os')"}}, "/equations/x", 1, "__import__"),
     ({"equations": {"x": "K*u(t + L) - x"}}, "/equations/x", 3, "L"),
-    ({"parameters": {"K": {"lower": 5, "upper": 0}, "L": {"lower": 0, "upper": 2}}},
-     "/parameters/K", None, "[5, 0]"),
-]  # fmt: skip
+    (
+        {"parameters": {"K": {"lower": 5, "upper": 0}, "L": {"lower": 0, "upper": 2}}},
+        "/parameters/K",
+        None,
+        "[5, 0]",
+    ),
+]
 
 
 @pytest.mark.parametrize(("changes", "pointer", "column", "words"), MODELS)
 def test_a_model_with_a_fault_is_refused_with_its_column(
-    server: TestClient, dataset: str, changes: dict[str, Any], pointer: str,
-    column: int | None, words: str,
-) -> None:  # fmt: skip
+    server: TestClient,
+    dataset: str,
+    changes: dict[str, Any],
+    pointer: str,
+    column: int | None,
+    words: str,
+) -> None:
     document = {**MODEL, **changes}
     told = server.post("/v1/models:check", json=document).json()
     assert told["valid"] is False
@@ -240,11 +261,14 @@ SIMULATIONS: list[tuple[dict[str, Any], str, str]] = [
     ({"inputs": {}}, "/inputs/u", "give input 'u'"),
     ({"inputs": {"u": {"kind": "cosine"}}}, "/inputs/u", "omega"),
     ({"inputs": {"u": {"kind": "saw"}}}, "/inputs/u", "saw"),
-    ({"inputs": {"u": {"kind": "expression", "expression": "cos(w*t)"}}},
-     "/inputs/u/expression", "'w'"),
+    (
+        {"inputs": {"u": {"kind": "expression", "expression": "cos(w*t)"}}},
+        "/inputs/u/expression",
+        "'w'",
+    ),
     ({"samples": 1}, "/samples", "found 1"),
     ({"sample_time": 0}, "/sample_time", "found 0"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("changes", "pointer", "words"), SIMULATIONS)
@@ -252,9 +276,13 @@ def test_a_simulation_that_cannot_be_done_is_refused(
     server: TestClient, changes: dict[str, Any], pointer: str, words: str
 ) -> None:
     body: dict[str, Any] = {
-        "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0}, "samples": 20,
-        "inputs": {"u": {"kind": "step"}}, "sample_time": 0.1, **changes,
-    }  # fmt: skip
+        "model": "fopdt",
+        "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+        "samples": 20,
+        "inputs": {"u": {"kind": "step"}},
+        "sample_time": 0.1,
+        **changes,
+    }
     faults = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
     assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
 
@@ -329,8 +357,11 @@ def test_a_fixed_start_is_no_free_parameter_and_an_estimated_one_is(
 
 def test_a_population_that_no_memory_holds_is_refused(server: TestClient, dataset: str) -> None:
     names = [f"k{i}" for i in range(101)]
-    model = {**MODEL, "parameters": {name: {"lower": 0, "upper": 1} for name in names},
-             "equations": {"x": " + ".join(names) + " + u"}}  # fmt: skip
+    model = {
+        **MODEL,
+        "parameters": {name: {"lower": 0, "upper": 1} for name in names},
+        "equations": {"x": " + ".join(names) + " + u"},
+    }
     body = {"model": model, "datasets": [dataset], "algorithm": {"population": 100_000}}
     fault = refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/algorithm/population"
@@ -339,9 +370,14 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
 
 @pytest.mark.parametrize(
     ("query", "pointer"),
-    [("limit=0", "?limit"), ("limit=x", "?limit"), ("state=done", "?state"),
-     ("limit=5000", "?limit"), ("state=queued&state=foo", "?state")],
-)  # fmt: skip
+    [
+        ("limit=0", "?limit"),
+        ("limit=x", "?limit"),
+        ("state=done", "?state"),
+        ("limit=5000", "?limit"),
+        ("state=queued&state=foo", "?state"),
+    ],
+)
 def test_a_query_value_that_cannot_be_used_is_named(
     server: TestClient, query: str, pointer: str
 ) -> None:

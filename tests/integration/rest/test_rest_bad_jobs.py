@@ -15,13 +15,19 @@ from tests.rest import CSV, recording, refused, settings_of
 
 SMALL = {"population": 20, "generations": 20, "islands": 1}
 FIRST: dict[str, Any] = {
-    "name": "first", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "first",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {
-        "K": {"lower": 0.1, "upper": 5}, "T": {"lower": 0.1, "upper": 5},
+        "K": {"lower": 0.1, "upper": 5},
+        "T": {"lower": 0.1, "upper": 5},
         "L": {"lower": 0, "upper": 2},
     },
-    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "(K*u(t - L) - x)/T"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 
 
 def constant(u: float | None = None, y: float | None = None) -> bytes:
@@ -118,10 +124,16 @@ def test_what_would_have_no_effect_is_refused_with_its_place(
 ) -> None:
     dead = {**FIRST, "parameters": {**FIRST["parameters"], "q": {"lower": 0, "upper": 1}}}
     terms = {
-        "name": "terms", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 1,
-        "lags": {"y": [1], "u": ["1 + d"]}, "parameters": {"d": {"lower": 0, "upper": 6}},
-        "terms": ["y(k-1)"], "coefficients": {"lower": -2, "upper": 2},
-    }  # fmt: skip
+        "name": "terms",
+        "form": "polynomial",
+        "output": "y",
+        "inputs": {"u": "1"},
+        "degree": 1,
+        "lags": {"y": [1], "u": ["1 + d"]},
+        "parameters": {"d": {"lower": 0, "upper": 6}},
+        "terms": ["y(k-1)"],
+        "coefficients": {"lower": -2, "upper": 2},
+    }
     data = stored(parts[0], recording())
     for body, pointer, words in (
         ({"model": dead}, "/parameters/q", "no equation and no output of model 'first' uses 'q'"),

@@ -25,8 +25,14 @@ def limited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
         yield client
 
 
-ROUTES = ["/v1/jobs", "/v1/recipes/noise-sweep", "/v1/recipes/reidentify", "/v1/runs:compare",
-          "/v1/datasets:simulate", "/v1/models"]  # fmt: skip
+ROUTES = [
+    "/v1/jobs",
+    "/v1/recipes/noise-sweep",
+    "/v1/recipes/reidentify",
+    "/v1/runs:compare",
+    "/v1/datasets:simulate",
+    "/v1/models",
+]
 JSON = {"content-type": "application/json"}
 
 
@@ -84,9 +90,10 @@ def test_a_sweep_over_a_hundred_thousand_labelled_values_is_within_the_limit(
     tmp_path: Path,
 ) -> None:
     axis = {
-        "path": "/datasets", "values": [["ds_0123456789abcdefghjkmnpqrs"]] * 100_000,
+        "path": "/datasets",
+        "values": [["ds_0123456789abcdefghjkmnpqrs"]] * 100_000,
         "labels": [{"pressure_bar": 1.2345678901234567 + k, "length_m": k} for k in range(100_000)],
-    }  # fmt: skip
+    }
     body = {"model": "fopdt", "datasets": ["ds"], "sweep": {"axes": [axis]}}
     assert len(json.dumps(body)) < Settings(data_dir=tmp_path).max_body_bytes
 
@@ -101,8 +108,9 @@ def test_a_sweep_over_a_hundred_thousand_labelled_values_is_within_the_limit(
 )
 def test_lengths_of_an_axis_are_bounded(own: TestClient, axis: Any, pointer: str) -> None:
     body = {
-        "model": "fopdt", "datasets": ["none"],
+        "model": "fopdt",
+        "datasets": ["none"],
         "sweep": {"axes": [{"path": "/seed", "values": [1], **axis}]},
-    }  # fmt: skip
+    }
     faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
     assert [one["pointer"] for one in faults] == [pointer, "/datasets/0"]  # of which none is there

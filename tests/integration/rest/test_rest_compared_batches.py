@@ -46,13 +46,15 @@ def against(served: Served, **fields: Any) -> dict[str, Any]:
 def drifts(found: dict[str, Any], name: str) -> dict[tuple[float, str], dict[str, Any]]:
     return {
         (point["x"], one["kind"]): one
-        for point in quantity(found, name)["points"] for one in point["drifts"]
-    }  # fmt: skip
+        for point in quantity(found, name)["points"]
+        for one in point["drifts"]
+    }
 
 
 def test_a_file_of_another_length_is_told_as_drifted_in_every_quantity(served: Served) -> None:
-    batch = [{"x": x, "datasets": served.datasets[4.0 if x == 8 else x][1:]}
-             for x in LENGTHS if x != 4]  # fmt: skip
+    batch = [
+        {"x": x, "datasets": served.datasets[4.0 if x == 8 else x][1:]} for x in LENGTHS if x != 4
+    ]
     found = against(served, batch=batch)
     for name in ("L", "T", "onset delay"):
         told = drifts(found, name)
@@ -80,13 +82,20 @@ def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: Serve
 def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> None:
     assert against(served)["notes"] == []
     other = against(
-        served, hold={"u": "zero"}, parameters={"K": {"fixed": 1.0}},
-        loss={"kind": "soft-l1", "scale": 0.05}, channels={"u": "y", "y": "u"},
-    )  # fmt: skip
+        served,
+        hold={"u": "zero"},
+        parameters={"K": {"fixed": 1.0}},
+        loss={"kind": "soft-l1", "scale": 0.05},
+        channels={"u": "y", "y": "u"},
+    )
     (note,) = other["notes"]
     assert note.startswith("the reference was made with ")
-    for told in ("hold of u = first (here zero)", "K = none (here 1, fixed)", "u = u (here y)",
-                 "loss = squares (here soft-l1 of scale 0.05)"):  # fmt: skip
+    for told in (
+        "hold of u = first (here zero)",
+        "K = none (here 1, fixed)",
+        "u = u (here y)",
+        "loss = squares (here soft-l1 of scale 0.05)",
+    ):
         assert told in note
 
 
@@ -102,17 +111,18 @@ def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
 def fopdt_run(served: Served) -> str:
     """A run of a model that has the tube's parameters and another."""
     job = batch_of(
-        served.server, served.parts, model="fopdt", look_at=["L"],
+        served.server,
+        served.parts,
+        model="fopdt",
+        look_at=["L"],
         batch=[{"x": 8.0, "datasets": served.datasets[8.0][:1]}],
-    )  # fmt: skip
+    )
     return run_at(served, job, 8.0)
 
 
 def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: Served) -> None:
     run = fopdt_run(served)
-    (fault,) = refused(
-        served.server.put("/v1/references/tube", json={"run": run}), 422, "invalid"
-    )  # fmt: skip
+    (fault,) = refused(served.server.put("/v1/references/tube", json={"run": run}), 422, "invalid")
     assert fault["pointer"] == "/run"
     assert "'fopdt'" in fault["detail"]
     assert "'tube' stands for runs of another, 'tube'" in fault["detail"]
@@ -147,15 +157,19 @@ def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_mo
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["5=ds_a", "6=ds_b", "--accept", "x", "--accept-run", "41"],
-         "0 experiments have length_m = 41; there are 5, 6"),
+        (
+            ["5=ds_a", "6=ds_b", "--accept", "x", "--accept-run", "41"],
+            "0 experiments have length_m = 41; there are 5, 6",
+        ),
         (["5=ds_a", "6=ds_b", "--accept", "x"], "a value of length_m; there are 5, 6"),
         (["5=ds_a", "5=ds_b", "--accept", "x"], "2 experiments have length_m = 5"),
-        (["5=ds_a", "--accept", "x", "--accept-run", "run_1"],
-         "only a run of this batch can be meant"),
+        (
+            ["5=ds_a", "--accept", "x", "--accept-run", "run_1"],
+            "only a run of this batch can be meant",
+        ),
         (["5=ds_a", "--accept-run", "5"], "--accept-run needs --accept NAME"),
     ],
-)  # fmt: skip
+)
 def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
 ) -> None:
@@ -165,7 +179,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     monkeypatch.setattr("service.cli.reidentify.connect_client", connected)
     told = CliRunner().invoke(
         lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
-    )  # fmt: skip
+    )
     assert told.exit_code == 2
     assert said in " ".join(told.output.split())
 
@@ -209,6 +223,10 @@ def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
     (note,) = found["notes"]
     assert "has 4 runs" in note
     assert "at most 3" in note
-    kinds = {drift["kind"] for one in found["quantities"] for point in one["points"]
-             for drift in point["drifts"]}  # fmt: skip
+    kinds = {
+        drift["kind"]
+        for one in found["quantities"]
+        for point in one["points"]
+        for drift in point["drifts"]
+    }
     assert kinds == {"run"}

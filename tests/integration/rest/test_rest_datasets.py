@@ -10,19 +10,22 @@ from service.formats.mcap import read_recording
 from tests.rest import CSV, recording, refused
 
 SIMULATION: dict[str, Any] = {
-    "name": "example", "model": "duffing-eq16",
+    "name": "example",
+    "model": "duffing-eq16",
     "parameters": {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0},
     "inputs": {"q": {"kind": "cosine", "amplitude": 10, "omega": 5}},
-    "samples": 60, "sample_time": 0.02,
-}  # fmt: skip
+    "samples": 60,
+    "sample_time": 0.02,
+}
 
 
 def test_the_same_bytes_again_give_the_same_dataset(server: TestClient, dataset: str) -> None:
     again = server.post("/v1/datasets?name=other", content=recording(), headers=CSV)
     assert again.status_code == 200
     assert again.json()["id"] == dataset
-    read_otherwise = server.post("/v1/datasets?sample_time=0.2", content=b"u,y\n1,2\n2,3\n",
-                                 headers=CSV)  # fmt: skip
+    read_otherwise = server.post(
+        "/v1/datasets?sample_time=0.2", content=b"u,y\n1,2\n2,3\n", headers=CSV
+    )
     assert read_otherwise.json()["sample_time"] == pytest.approx(0.2)
 
 
@@ -48,8 +51,10 @@ def test_content_goes_up_again_as_mcap_with_the_same_samples(
     content = server.get(f"/v1/datasets/{dataset}/content").content
     kind = {"content-type": "application/x-mcap"}
     copy = server.post("/v1/datasets?name=copy", content=content, headers=kind).json()
-    first, second = (read_recording(server.get(f"/v1/datasets/{one}/content").content)
-                     for one in (dataset, copy["id"]))  # fmt: skip
+    first, second = (
+        read_recording(server.get(f"/v1/datasets/{one}/content").content)
+        for one in (dataset, copy["id"])
+    )
     for name in ("u", "y"):
         np.testing.assert_array_equal(first.channel(name).values, second.channel(name).values)
         np.testing.assert_array_equal(first.channel(name).times, second.channel(name).times)
@@ -61,8 +66,10 @@ def test_content_as_csv_goes_up_again_with_the_same_samples(server: TestClient) 
     again = server.get(f"/v1/datasets/{stored['id']}/content.csv").content
     copy = server.post("/v1/datasets?segments=run", content=again, headers=CSV).json()
     assert copy["segments"] == stored["segments"]
-    first, second = (read_recording(server.get(f"/v1/datasets/{one['id']}/content").content)
-                     for one in (stored, copy))  # fmt: skip
+    first, second = (
+        read_recording(server.get(f"/v1/datasets/{one['id']}/content").content)
+        for one in (stored, copy)
+    )
     np.testing.assert_array_equal(first.channel("y").values, second.channel("y").values)
     assert second.channel("u").unit == "V"
 
@@ -119,8 +126,10 @@ def test_a_simulation_with_noise_differs_by_the_noise_alone_and_is_made_once(
     assert noisy.status_code == 201
     assert again.status_code == 200
     assert noisy.json()["id"] == again.json()["id"]
-    a, b = (read_recording(server.get(f"/v1/datasets/{one}/content").content)
-            for one in (clean["id"], noisy.json()["id"]))  # fmt: skip
+    a, b = (
+        read_recording(server.get(f"/v1/datasets/{one}/content").content)
+        for one in (clean["id"], noisy.json()["id"])
+    )
     np.testing.assert_array_equal(a.channel("q").values, b.channel("q").values)
     error = b.channel("y").values - a.channel("y").values
     assert 0.005 < float(np.std(error)) < 0.02
@@ -173,8 +182,11 @@ def test_a_part_tells_and_keeps_what_was_recorded_before_it(
     assert len(rows) == 201
     figure = server.get(f"/v1/datasets/{part['id']}/figures/signals").json()
     assert [one["name"] for one in figure["data"]] == [
-        "u", "u, before the record", "y", "y, before the record",
-    ]  # fmt: skip
+        "u",
+        "u, before the record",
+        "y",
+        "y, before the record",
+    ]
     assert "Before them" in server.get(f"/datasets/{part['id']}").text
     assert "Before them" not in server.get(f"/datasets/{dataset}").text
 
@@ -185,9 +197,13 @@ def test_an_input_from_a_part_is_what_was_recorded_before_it(
     """It jumps at 7 s, and the part begins at 10 s."""
     steps = [{"trim": {"rows": [100, 300]}}]
     part = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps}).json()["id"]
-    body = {"model": "fopdt", "parameters": {"K": 2, "T": 0.5, "L": 0.5, "y0": 0},
-            "samples": 120, "sample_time": 0.1,
-            "inputs": {"u": {"kind": "dataset", "dataset": part, "channel": "u"}}}  # fmt: skip
+    body = {
+        "model": "fopdt",
+        "parameters": {"K": 2, "T": 0.5, "L": 0.5, "y0": 0},
+        "samples": 120,
+        "sample_time": 0.1,
+        "inputs": {"u": {"kind": "dataset", "dataset": part, "channel": "u"}},
+    }
     made = server.post("/v1/datasets:simulate", json=body)
     assert made.status_code == 201, made.text
     stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
@@ -221,16 +237,24 @@ def test_metrics_count_jobs_by_state(server: TestClient) -> None:
     assert server.get("/healthz").json() == {"status": "ok"}
 
 
-@pytest.mark.parametrize(("signal", "hold"), [
-    ({"kind": "step", "time": 1.05}, "zero"),
-    ({"kind": "binary", "period": 0.7, "seed": 1}, "zero"),
-    ({"kind": "cosine", "frequency": 0.5}, "first"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("signal", "hold"),
+    [
+        ({"kind": "step", "time": 1.05}, "zero"),
+        ({"kind": "binary", "period": 0.7, "seed": 1}, "zero"),
+        ({"kind": "cosine", "frequency": 0.5}, "first"),
+    ],
+)
 def test_an_input_that_jumps_is_stored_as_held(
     server: TestClient, signal: dict[str, Any], hold: str
 ) -> None:
-    body = {"model": "fopdt", "parameters": {"K": 2, "T": 0.5, "L": 0, "y0": 0}, "samples": 40,
-            "inputs": {"u": {"amplitude": 1, **signal}}, "sample_time": 0.1}  # fmt: skip
+    body = {
+        "model": "fopdt",
+        "parameters": {"K": 2, "T": 0.5, "L": 0, "y0": 0},
+        "samples": 40,
+        "inputs": {"u": {"amplitude": 1, **signal}},
+        "sample_time": 0.1,
+    }
     made = server.post("/v1/datasets:simulate", json=body)
     assert made.status_code == 201, made.text
     assert [c["hold"] for c in made.json()["channels"] if c["name"] == "u"] == [hold]
@@ -247,15 +271,26 @@ def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
 ) -> None:
     rows = ["t,P [kPa]", *(f"{0.1 * k:.1f},{int(k >= 10)}" for k in range(40))]
     added = server.post("/v1/datasets?name=P", content="\n".join(rows).encode(), headers=CSV)
-    held = server.post(f"/v1/datasets/{added.json()['id']}:derive",
-                       json={"steps": [{"hold": {"P": "zero"}}]}).json()["id"]  # fmt: skip
+    held = server.post(
+        f"/v1/datasets/{added.json()['id']}:derive", json={"steps": [{"hold": {"P": "zero"}}]}
+    ).json()["id"]
     model = {
-        "name": "gauge", "form": "differential", "inputs": {"u": "Pa"}, "states": {"x": "Pa"},
+        "name": "gauge",
+        "form": "differential",
+        "inputs": {"u": "Pa"},
+        "states": {"x": "Pa"},
         "parameters": {"T": {"lower": 0.1, "upper": 2, "unit": "s"}},
-        "equations": {"x": "(u - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-    }  # fmt: skip
-    body = {"model": model, "parameters": {"T": 0.5}, "samples": 40, "sample_time": 0.1,
-            "inputs": {"u": {"kind": "dataset", "dataset": held, "channel": "P"}}}  # fmt: skip
+        "equations": {"x": "(u - x)/T"},
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
+    body = {
+        "model": model,
+        "parameters": {"T": 0.5},
+        "samples": 40,
+        "sample_time": 0.1,
+        "inputs": {"u": {"kind": "dataset", "dataset": held, "channel": "P"}},
+    }
     made = server.post("/v1/datasets:simulate", json=body)
     assert made.status_code == 201, made.text
     stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)

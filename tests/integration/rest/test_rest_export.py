@@ -24,10 +24,15 @@ from tests.rest import CSV, awaited, recording, refused, settings_of
 
 SMALL = {"population": 16, "generations": 20, "islands": 1}
 POLYNOMIAL = {
-    "name": "chosen", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 2,
-    "lags": {"y": [1], "u": [6]}, "coefficients": {"lower": -1, "upper": 1},
+    "name": "chosen",
+    "form": "polynomial",
+    "output": "y",
+    "inputs": {"u": "1"},
+    "degree": 2,
+    "lags": {"y": [1], "u": [6]},
+    "coefficients": {"lower": -1, "upper": 1},
     "terms": {"select": "frols", "keep": 3},
-}  # fmt: skip
+}
 FORMATS = {
     "json": ("application/json", "fopdt.json"),
     "python": ("text/x-python; charset=utf-8", "fopdt_model.py"),
@@ -53,9 +58,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
         parts = server.app.state.parts  # type: ignore[attr-defined]
         body = {
-            "model": "fopdt", "datasets": [data], "algorithm": SMALL, "hold": {"u": "zero"},
+            "model": "fopdt",
+            "datasets": [data],
+            "algorithm": SMALL,
+            "hold": {"u": "zero"},
             "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}, "x(0)": {"fixed": 0}},
-        }  # fmt: skip
+        }
         _, (run,) = identified(parts, body)
         _, (polynomial,) = identified(parts, {**body, "model": POLYNOMIAL, "parameters": {}})
         waiting = server.post("/v1/jobs", json=body).json()["id"]

@@ -23,8 +23,11 @@ def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
 def events(server: TestClient, job: str, **headers: str) -> list[str]:
     answer = server.get(f"/v1/jobs/{job}/events", headers=headers)
     assert answer.status_code in (200, 204)
-    return [line.removeprefix("event: ") for line in answer.text.splitlines()
-            if line.startswith("event: ")]  # fmt: skip
+    return [
+        line.removeprefix("event: ")
+        for line in answer.text.splitlines()
+        if line.startswith("event: ")
+    ]
 
 
 def test_a_job_without_a_dispatcher_is_accepted_and_waits(server: TestClient, dataset: str) -> None:
@@ -84,8 +87,11 @@ def test_the_pages_of_runs_together_are_all_runs_in_order(server: TestClient, da
 
 
 def test_labels_of_an_axis_over_datasets_go_to_the_runs(server: TestClient, dataset: str) -> None:
-    axis = {"path": "/datasets", "values": [[dataset], ["steps"]],
-            "labels": [{"length_m": 5}, {"length_m": 8}]}  # fmt: skip
+    axis = {
+        "path": "/datasets",
+        "values": [[dataset], ["steps"]],
+        "labels": [{"length_m": 5}, {"length_m": 8}],
+    }
     job = submit(server, dataset, sweep={"axes": [axis]})
     runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
     assert [run["labels"]["length_m"] for run in runs] == [5, 8]
@@ -122,10 +128,17 @@ def test_a_queued_job_is_cancelled_at_once_resumed_and_cloned(
 def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     own: TestClient,
 ) -> None:
-    answer = own.post("/v1/datasets:simulate", json={
-        "name": "s", "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
-        "inputs": {"u": {"kind": "binary", "period": 2}}, "samples": 300, "sample_time": 0.1,
-    })  # fmt: skip
+    answer = own.post(
+        "/v1/datasets:simulate",
+        json={
+            "name": "s",
+            "model": "fopdt",
+            "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+            "inputs": {"u": {"kind": "binary", "period": 2}},
+            "samples": 300,
+            "sample_time": 0.1,
+        },
+    )
     job = submit(own, answer.json()["id"])["id"]
     parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
     with parts.database.write_session() as session:
@@ -144,10 +157,17 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
 
 
 def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None:
-    answer = own.post("/v1/datasets:simulate", json={
-        "name": "s", "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
-        "inputs": {"u": {"kind": "step"}}, "samples": 300, "sample_time": 0.1,
-    })  # fmt: skip
+    answer = own.post(
+        "/v1/datasets:simulate",
+        json={
+            "name": "s",
+            "model": "fopdt",
+            "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+            "inputs": {"u": {"kind": "step"}},
+            "samples": 300,
+            "sample_time": 0.1,
+        },
+    )
     job = submit(own, answer.json()["id"])["id"]
     parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
     parts.stopping.set()
@@ -198,8 +218,9 @@ def test_a_summary_goes_over_the_axes_that_are_no_seeds(server: TestClient, data
     told = server.get(f"/v1/jobs/{job}/summary").json()
     assert told["by"] == ["/noise/sigma"]
     assert [(one["key"], one["runs"], one["succeeded"]) for one in told["groups"]] == [
-        ({"/noise/sigma": 0}, 3, 0), ({"/noise/sigma": 0.1}, 3, 0),
-    ]  # fmt: skip
+        ({"/noise/sigma": 0}, 3, 0),
+        ({"/noise/sigma": 0.1}, 3, 0),
+    ]
     by_seed = server.get(f"/v1/jobs/{job}/summary", params={"by": "/seed"}).json()
     assert [one["key"] for one in by_seed["groups"]] == [{"/seed": i} for i in range(3)]
 

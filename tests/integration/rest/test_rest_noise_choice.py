@@ -38,9 +38,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         parts = server.app.state.parts  # type: ignore[attr-defined]
         names = []
         quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
-        outputs = {
-            "tank": disturbed(2), "lag": disturbed(2, 1.0 / TIME_CONSTANT), "quiet": quiet,
-        }  # fmt: skip
+        outputs = {"tank": disturbed(2), "lag": disturbed(2, 1.0 / TIME_CONSTANT), "quiet": quiet}
         for name, output in outputs.items():
             pairs = zip(signal(), output, strict=True)
             lines = [
@@ -83,8 +81,9 @@ def test_a_tank_has_generalised_least_squares_unless_squares_are_asked_for(serve
     assert not notes(served, auto, ar1)
     faults = refused(
         served.server.post(f"/v1/runs/{auto['id']}:profile", json={"parameters": ["K"]}),
-        422, "invalid",
-    )  # fmt: skip
+        422,
+        "invalid",
+    )
     assert faults[0]["pointer"] == "/loss/noise_model"
 
 

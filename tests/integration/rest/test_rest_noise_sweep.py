@@ -16,15 +16,21 @@ from tests.rest import CSV, recording, refused, settings_of
 URL = "/v1/recipes/noise-sweep"
 TRUE = {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0}
 TRUTH = {
-    "parameters": TRUE, "inputs": {"u": {"kind": "binary", "period": 2}},
-    "samples": 150, "sample_time": 0.1,
-}  # fmt: skip
+    "parameters": TRUE,
+    "inputs": {"u": {"kind": "binary", "period": 2}},
+    "samples": 150,
+    "sample_time": 0.1,
+}
 SMALL = {"population": 12, "generations": 12, "islands": 1}
 BOUNDS = {"T": {"upper": 5.0}, "L": {"upper": 1.0}}
 BODY: dict[str, Any] = {
-    "model": "fopdt", "truth": TRUTH, "sigma": [0, 0.1], "replicates": 2, "algorithm": SMALL,
+    "model": "fopdt",
+    "truth": TRUTH,
+    "sigma": [0, 0.1],
+    "replicates": 2,
+    "algorithm": SMALL,
     "parameters": BOUNDS,
-}  # fmt: skip
+}
 
 
 def parts_of(server: TestClient) -> Parts:
@@ -44,9 +50,7 @@ def ended(server: TestClient, **changes: Any) -> tuple[dict[str, Any], dict[str,
     """A sweep that was carried out: the job, and its summary."""
     job = submitted(server, **changes)["id"]
     carried_out(parts_of(server), job)
-    return (
-        server.get(f"/v1/jobs/{job}").json(), server.get(f"/v1/jobs/{job}/summary").json(),
-    )  # fmt: skip
+    return (server.get(f"/v1/jobs/{job}").json(), server.get(f"/v1/jobs/{job}/summary").json())
 
 
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
@@ -95,11 +99,13 @@ def datasets_of(server: TestClient) -> list[str]:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"parameters": {"Q": {"fixed": 1}}}, {"skip": 1000}, {"algorithm": {"method": "simple"}},
+        {"parameters": {"Q": {"fixed": 1}}},
+        {"skip": 1000},
+        {"algorithm": {"method": "simple"}},
         {"relative": True, "truth": {**TRUTH, "parameters": {**TRUE, "K": 0.0}}},
         {"weights": {"nobody": 1.0}},
     ],
-)  # fmt: skip
+)
 def test_a_body_that_is_refused_leaves_no_dataset_behind(
     own: TestClient, fields: dict[str, Any]
 ) -> None:
@@ -219,8 +225,13 @@ def test_each_problem_of_a_sweep_has_a_truth_and_a_floor_of_its_own(own: TestCli
         body = {"name": f"{gain}", "model": "fopdt", **TRUTH, "parameters": {**TRUE, "K": gain}}
         names.append(own.post("/v1/datasets:simulate", json=body).json()["id"])
     axes = [{"path": "/datasets", "values": names}, {"path": "/noise/sigma", "values": [0, 0.1]}]
-    body = {"model": "fopdt", "datasets": names[:1], "algorithm": SMALL, "parameters": BOUNDS,
-            "sweep": {"axes": axes}}  # fmt: skip
+    body = {
+        "model": "fopdt",
+        "datasets": names[:1],
+        "algorithm": SMALL,
+        "parameters": BOUNDS,
+        "sweep": {"axes": axes},
+    }
     job = own.post("/v1/jobs", json=body).json()["id"]
     carried_out(parts_of(own), job)
     found = own.get(f"/v1/jobs/{job}/summary").json()
@@ -236,8 +247,10 @@ def test_each_problem_of_a_sweep_has_a_truth_and_a_floor_of_its_own(own: TestCli
 def test_a_job_without_noise_tells_no_floor(own: TestClient) -> None:
     body = {"name": "s", "model": "fopdt", **TRUTH}
     stored = own.post("/v1/datasets:simulate", json=body).json()["id"]
-    job = own.post("/v1/jobs", json={"model": "fopdt", "datasets": [stored], "algorithm": SMALL,
-                                     "parameters": BOUNDS}).json()["id"]  # fmt: skip
+    job = own.post(
+        "/v1/jobs",
+        json={"model": "fopdt", "datasets": [stored], "algorithm": SMALL, "parameters": BOUNDS},
+    ).json()["id"]
     carried_out(parts_of(own), job)
     found = own.get(f"/v1/jobs/{job}/summary").json()
     assert found["references"] == []
@@ -262,8 +275,11 @@ def test_the_figure_has_a_line_a_method_in_each_plot_and_the_floor(own: TestClie
     lines = [one for one in figure["data"] if one["mode"] == "lines+markers"]
     names = [one["name"] for one in found["groups"][0]["parameters"]]
     assert len(lines) == 2 * (1 + len(names))
-    medians = [group["rms_noise_free"][2] for group in found["groups"]
-               if group["key"]["/algorithm/method"] == "improved"]  # fmt: skip
+    medians = [
+        group["rms_noise_free"][2]
+        for group in found["groups"]
+        if group["key"]["/algorithm/method"] == "improved"
+    ]
     drawn = next(one for one in lines if one["name"] == "improved")
     assert drawn["x"] == [0, 0.1]
     assert drawn["y"] == pytest.approx(medians, rel=1e-6)
@@ -292,8 +308,11 @@ def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> Non
         ({"sigma": [0.1, 0.2, 0.1]}, "/sigma", "twice"),
         ({"methods": ["simple", "best"]}, "/methods/1", "'improved'"),
         ({"methods": []}, "/methods", "at least 1"),
-        ({"replicates": 25_001}, "/replicates",
-         "2 σ × 25001 replicates × 2 methods are 100004 runs; at most 100000 a job"),
+        (
+            {"replicates": 25_001},
+            "/replicates",
+            "2 σ × 25001 replicates × 2 methods are 100004 runs; at most 100000 a job",
+        ),
         ({"datasets": ["steps"]}, "", "either 'truth'"),
         ({"truth": None}, "", "either 'truth'"),
         ({"model": "fopdd"}, "/model", "fopdt"),
@@ -306,7 +325,7 @@ def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> Non
         ({"parameters": {"Q": {"upper": 1}}}, "/parameters/Q", "Q"),
         ({"sigmas": [1]}, "/sigmas", "unknown field"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_swept_is_refused_at_its_place(
     server: TestClient, changes: dict[str, Any], pointer: str, detail: str
 ) -> None:
@@ -319,8 +338,11 @@ def test_what_cannot_be_swept_is_refused_at_its_place(
 def test_a_deviation_relative_to_an_output_that_does_not_vary_is_refused(
     server: TestClient,
 ) -> None:
-    still = {**TRUTH, "parameters": {**TRUE, "K": 1.0},
-             "inputs": {"u": {"kind": "step", "amplitude": 0.0}}}  # fmt: skip
+    still = {
+        **TRUTH,
+        "parameters": {**TRUE, "K": 1.0},
+        "inputs": {"u": {"kind": "step", "amplitude": 0.0}},
+    }
     (fault,) = refused(
         server.post(URL, json={**BODY, "truth": still, "relative": True}), 422, "invalid"
     )

@@ -9,11 +9,18 @@ from tests.rest import refused
 @pytest.mark.parametrize(
     "path",
     [
-        "/v1/nothing", "/v1/jobs/job_0", "/v1/jobs/job_0/runs", "/v1/jobs/job_0/events",
-        "/v1/runs/run_0", "/v1/runs/run_0/history", "/v1/runs/run_0/signals.mcap",
-        "/v1/datasets/ds_0", "/v1/datasets/ds_0/content", "/v1/models/nothing",
+        "/v1/nothing",
+        "/v1/jobs/job_0",
+        "/v1/jobs/job_0/runs",
+        "/v1/jobs/job_0/events",
+        "/v1/runs/run_0",
+        "/v1/runs/run_0/history",
+        "/v1/runs/run_0/signals.mcap",
+        "/v1/datasets/ds_0",
+        "/v1/datasets/ds_0/content",
+        "/v1/models/nothing",
     ],
-)  # fmt: skip
+)
 def test_what_is_not_there_is_not_found(server: TestClient, path: str) -> None:
     refused(server.get(path), 404, "not-found")
 

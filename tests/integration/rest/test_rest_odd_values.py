@@ -37,15 +37,37 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(
         ("/v1/jobs", {"model": "fopdt", "datasets": ["steps"], HALF: 1}),
         ("/v1/jobs", {"model": "fopdt", "datasets": ["steps"], "warm_start": HALF}),
         ("/v1/models", {"name": "own", "title": HALF}),
-        ("/v1/datasets:simulate", {"model": "fopdt", "parameters": {HALF: 1}, "samples": 9,
-                                   "sample_time": 1, "inputs": {"u": {"kind": "step"}}}),
+        (
+            "/v1/datasets:simulate",
+            {
+                "model": "fopdt",
+                "parameters": {HALF: 1},
+                "samples": 9,
+                "sample_time": 1,
+                "inputs": {"u": {"kind": "step"}},
+            },
+        ),
         ("/v1/runs:compare", {"runs": [HALF, "x"]}),
-        ("/v1/recipes/reidentify", {"model": HALF, "label": "n", "look_at": ["L"],
-                                    "batch": [{"x": 1, "datasets": ["steps"]}]}),
-        ("/v1/recipes/reidentify", {"model": {"name": HALF}, "label": "n", "look_at": ["L"],
-                                    "batch": [{"x": 1, "datasets": ["steps"]}]}),
+        (
+            "/v1/recipes/reidentify",
+            {
+                "model": HALF,
+                "label": "n",
+                "look_at": ["L"],
+                "batch": [{"x": 1, "datasets": ["steps"]}],
+            },
+        ),
+        (
+            "/v1/recipes/reidentify",
+            {
+                "model": {"name": HALF},
+                "label": "n",
+                "look_at": ["L"],
+                "batch": [{"x": 1, "datasets": ["steps"]}],
+            },
+        ),
     ],
-)  # fmt: skip
+)
 def test_half_of_a_surrogate_pair_is_refused(
     server: TestClient, dataset: str, path: str, body: dict[str, Any]
 ) -> None:
@@ -95,8 +117,9 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
         f"/sweep/axes/0/values/{n}" for n in range(200)
     ]
     assert faults[-1] == {
-        "pointer": "", "detail": "200 values of axes are told; the rest is not looked at"
-    }  # fmt: skip
+        "pointer": "",
+        "detail": "200 values of axes are told; the rest is not looked at",
+    }
     axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "fopdt"]
     assert len(refused(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201
 

@@ -21,10 +21,16 @@ STEP = {"kind": "step", "amplitude": 1.0}
 CONTROL = {"input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "reference": STEP}
 BODY = {"control": CONTROL, "samples": 751, "sample_time": 0.02}
 PLANT = {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0, "x(0)": 0.0}
-ARX = {"name": "arx", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
-       "parameters": {"a": {"lower": 0, "upper": 1}, "b": {"lower": 0, "upper": 1}},
-       "equations": {"x": "a*x(k-1) + b*u(k-1)"}, "outputs": {"y": "x"},
-       "initial": {"x": 0}}  # fmt: skip
+ARX = {
+    "name": "arx",
+    "form": "difference",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
+    "parameters": {"a": {"lower": 0, "upper": 1}, "b": {"lower": 0, "upper": 1}},
+    "equations": {"x": "a*x(k-1) + b*u(k-1)"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 
 
 class Served(NamedTuple):
@@ -41,13 +47,22 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with TestClient(app) as server:
         found = []
         for model, values in (("fopdt", {**PLANT}), (ARX, {"a": 0.9, "b": 0.1})):
-            made = server.post("/v1/datasets:simulate", json={
-                "model": model, "parameters": values, "samples": 200, "sample_time": 0.1,
-                "inputs": {"u": {"kind": "binary", "period": 2}},
-            })  # fmt: skip
+            made = server.post(
+                "/v1/datasets:simulate",
+                json={
+                    "model": model,
+                    "parameters": values,
+                    "samples": 200,
+                    "sample_time": 0.1,
+                    "inputs": {"u": {"kind": "binary", "period": 2}},
+                },
+            )
             assert made.status_code == 201, made.text
-            body = {"model": model, "datasets": [made.json()["id"]],
-                    "algorithm": {"population": 16, "generations": 25, "islands": 1}}  # fmt: skip
+            body = {
+                "model": model,
+                "datasets": [made.json()["id"]],
+                "algorithm": {"population": 16, "generations": 25, "islands": 1},
+            }
             _, [run] = identified(app.state.parts, body)
             found.append(run)
         yield Served(server, *found)
@@ -67,11 +82,19 @@ def test_a_pi_controller_leaves_no_error_and_its_numbers_are_told(served: Served
     found = simulated(served, upper=0.62, setpoint_weight=0.9)
     assert found["metrics"]["steady_error"] == pytest.approx(0.0, abs=1e-4)
     assert found["controller"] == {
-        "gain": 0.5, "integral_time": 1.0, "derivative_time": 0.0, "derivative_filter": 10.0,
-        "derivative_on": "measurement", "setpoint_weight": 0.9, "lower": None, "upper": 0.62,
-        "tracking_time": 1.0, "command_min": pytest.approx(0.45, abs=1e-6), "command_max": 0.62,
+        "gain": 0.5,
+        "integral_time": 1.0,
+        "derivative_time": 0.0,
+        "derivative_filter": 10.0,
+        "derivative_on": "measurement",
+        "setpoint_weight": 0.9,
+        "lower": None,
+        "upper": 0.62,
+        "tracking_time": 1.0,
+        "command_min": pytest.approx(0.45, abs=1e-6),
+        "command_max": 0.62,
         "saturated_percent": found["controller"]["saturated_percent"],
-    }  # fmt: skip
+    }
     assert 1.0 < found["controller"]["saturated_percent"] < 20.0
     at_limit = np.mean(np.array(found["command"]["values"]) >= 0.62)
     assert found["controller"]["saturated_percent"] == pytest.approx(100 * at_limit, abs=0.5)
@@ -115,15 +138,18 @@ def test_a_rule_chooses_the_numbers_and_says_whose_it_is(served: Served) -> None
     assert told["process_gain"] == pytest.approx(2.0)
     assert "Skogestad" in told["reference"]
     assert told["formulas"]
-    by_hand = simulated(served, gain=found["controller"]["gain"],
-                        integral_time=found["controller"]["integral_time"])  # fmt: skip
+    by_hand = simulated(
+        served, gain=found["controller"]["gain"], integral_time=found["controller"]["integral_time"]
+    )
     assert by_hand["outputs"] == found["outputs"]
-    slower = simulated(served, gain=None, integral_time=None,
-                       tuning={"closed_loop_time_constant": 2.0})  # fmt: skip
+    slower = simulated(
+        served, gain=None, integral_time=None, tuning={"closed_loop_time_constant": 2.0}
+    )
     assert slower["controller"]["gain"] == pytest.approx(1.0 / (2.0 * 2.5))
     tube = {"time_constant": 0.4, "delay": 0.2}
-    pid = simulated(served, gain=None, integral_time=None, transport=tube,
-                    tuning={"controller": "PID"})  # fmt: skip
+    pid = simulated(
+        served, gain=None, integral_time=None, transport=tube, tuning={"controller": "PID"}
+    )
     assert pid["tuning"]["process_second_time_constant"] == pytest.approx(0.4)
     assert pid["controller"]["derivative_time"] > 0
     assert pid["metrics"]["is_settled"]
@@ -181,21 +207,32 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
         ({"tuning": {}, "gain": None}, "/control/integral_time", "the rule of tuning chooses"),
         ({"tuning": {"rule": "ziegler"}}, "/control/tuning/rule", "simc"),
         ({"tuning": {"controller": "PD"}}, "/control/tuning/controller", "PID"),
-        ({"tuning": {"closed_loop_time_constant": 0}},
-         "/control/tuning/closed_loop_time_constant", "above 0"),
-        ({"tuning": {"rule": "amigo", "closed_loop_time_constant": 1}, "gain": None,
-          "integral_time": None}, "/control/tuning/closed_loop_time_constant", "leave it out"),
+        (
+            {"tuning": {"closed_loop_time_constant": 0}},
+            "/control/tuning/closed_loop_time_constant",
+            "above 0",
+        ),
+        (
+            {
+                "tuning": {"rule": "amigo", "closed_loop_time_constant": 1},
+                "gain": None,
+                "integral_time": None,
+            },
+            "/control/tuning/closed_loop_time_constant",
+            "leave it out",
+        ),
         ({"derivative_time": 1e-6}, "/control/derivative_filter", "too short for steps of 0.02"),
         ({"integraltime": 1.0}, "/control/integraltime", "integral_time"),
         ({"gain": 1e30}, "/control/gain", "the loop runs away"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_control_is_told_where_it_is(
     served: Served, change: dict[str, Any], pointer: str, part: str
 ) -> None:
     body = {**BODY, "control": {**CONTROL, **change}, "parameters": PLANT}
-    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
-                     "invalid")  # fmt: skip
+    faults = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    )
     assert pointer in {fault["pointer"] for fault in faults}, faults
     assert any(part in fault["detail"] for fault in faults), faults
 
@@ -205,21 +242,24 @@ def test_steps_that_are_too_long_for_a_stable_loop_are_not_blamed_on_its_gain(
 ) -> None:
     assert simulated(served)["margins"]["is_stable"]
     body = {**BODY, "sample_time": 20, "control": CONTROL, "parameters": PLANT}
-    [fault] = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
-                      "invalid")  # fmt: skip
+    [fault] = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    )
     assert fault["pointer"] == "/sample_time"
     assert "the loop is stable, but steps of 10 s are too long to simulate it" in fault["detail"]
     wild = {**body, "control": {**CONTROL, "gain": 1e30}}
-    [fault] = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=wild), 422,
-                      "invalid")  # fmt: skip
+    [fault] = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=wild), 422, "invalid"
+    )
     assert fault["pointer"] == "/control/gain"
 
 
 @pytest.mark.parametrize("zero", [0, 0.0, -0.02])
 def test_a_sampling_period_of_zero_is_refused(served: Served, zero: float) -> None:
     body = {**BODY, "sample_time": zero}
-    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
-                     "invalid")  # fmt: skip
+    faults = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    )
     assert [fault["pointer"] for fault in faults] == ["/sample_time"]
 
 
@@ -254,9 +294,16 @@ def test_the_command_line_tells_controller_rule_and_margins(
         return done.output
 
     text = told(gain=None, integral_time=None, tuning={}, upper=0.62)
-    for part in ("IAE: 1.", "ITAE: 0.", "controller by SIMC (S. Skogestad", "K = 0.5, T_i = 1",
-                 "to 0.62, ", "% of the time at a limit", "stable, gain margin 3.14",
-                 "phase margin 61.4°"):  # fmt: skip
+    for part in (
+        "IAE: 1.",
+        "ITAE: 0.",
+        "controller by SIMC (S. Skogestad",
+        "K = 0.5, T_i = 1",
+        "to 0.62, ",
+        "% of the time at a limit",
+        "stable, gain margin 3.14",
+        "phase margin 61.4°",
+    ):
         assert part in text, text
     text = told(gain=3.0, limit=1.5)
     assert "keeps swinging" in text

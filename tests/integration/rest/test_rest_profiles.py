@@ -17,11 +17,16 @@ from tests.rest import CSV, recording, refused, settings_of
 
 SMALL = {"population": 20, "generations": 60, "islands": 1}
 MODEL: dict[str, Any] = {
-    "name": "products", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "name": "products",
+    "form": "differential",
+    "inputs": {"u": "V"},
+    "states": {"x": "m"},
     "parameters": {name: {"lower": 0.1, "upper": 5} for name in ("k", "A", "J", "T", "r")}
     | {"L": {"lower": 0, "upper": 2, "unit": "s"}},
-    "equations": {"x": "(k*A*u(t - L)/J - r*x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
-}  # fmt: skip
+    "equations": {"x": "(k*A*u(t - L)/J - r*x)/T"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0},
+}
 
 
 class Served(NamedTuple):
@@ -35,10 +40,14 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with TestClient(app) as server:
         data = server.post("/v1/datasets?name=s", content=recording(), headers=CSV).json()["id"]
         body = {
-            "model": MODEL, "datasets": [data], "algorithm": SMALL, "noise": {"sigma": 0.02},
-            "parameters": {"r": {"fixed": 1}, "T": {"tied": "r"}}, "hold": {"u": "zero"},
+            "model": MODEL,
+            "datasets": [data],
+            "algorithm": SMALL,
+            "noise": {"sigma": 0.02},
+            "parameters": {"r": {"fixed": 1}, "T": {"tied": "r"}},
+            "hold": {"u": "zero"},
             "validation": {"fraction": 0.2},
-        }  # fmt: skip
+        }
         parts = server.app.state.parts  # type: ignore[attr-defined]
         _, runs = identified(parts, body)
         yield Served(server, runs[0])
@@ -58,8 +67,14 @@ def test_groups_ties_and_criteria_are_in_the_result(served: Served) -> None:
     assert group["value"] == pytest.approx(2.0, rel=0.05)
     assert group["stderr"] < 0.05
     states = {one["name"]: one["status"] for one in document["parameters"]}
-    assert states == {"k": "group", "A": "group", "J": "group", "T": "tied", "r": "fixed",
-                      "L": "identified"}  # fmt: skip
+    assert states == {
+        "k": "group",
+        "A": "group",
+        "J": "group",
+        "T": "tied",
+        "r": "fixed",
+        "L": "identified",
+    }
     assert set(document["criteria"]) == {"aic", "aicc", "bic", "samples", "parameters"}
     assert document["criteria"]["parameters"] == 4
     history = served.server.get(f"/v1/runs/{served.run}/history").json()

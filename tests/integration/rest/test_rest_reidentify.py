@@ -25,8 +25,11 @@ LENGTHS = (2.0, 4.0, 8.0, 16.0)
 HALF_A_SAMPLE = 0.005  # the steps are taken for ramps from one sample to the next
 QUICK = {"population": 20, "islands": 2, "stop": {"settled": 3}}
 BODY: dict[str, Any] = {
-    "model": "tube", "label": "length_m", "algorithm": QUICK, "look_at": ["L", "T"],
-}  # fmt: skip
+    "model": "tube",
+    "label": "length_m",
+    "algorithm": QUICK,
+    "look_at": ["L", "T"],
+}
 
 
 def recorded(length: float, seed: int = 1, longer: float = 0.0) -> bytes:
@@ -56,8 +59,9 @@ class Served:
 def stored(server: TestClient, length: float, seed: int, longer: float = 0.0) -> str:
     answer = server.post(
         f"/v1/datasets?name=tube-{length:g}-{seed}-{longer:g}",
-        content=recorded(length, seed, longer), headers=CSV,
-    )  # fmt: skip
+        content=recorded(length, seed, longer),
+        headers=CSV,
+    )
     assert answer.status_code in (200, 201), answer.text
     return str(answer.json()["id"])
 
@@ -148,8 +152,9 @@ def test_experiments_of_one_length_are_fitted_together_or_pooled(served: Served)
     apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served.datasets[x]]
     pooled = trend(served, batch_of(served.server, served.parts, batch=apart))
     assert quantity(pooled, "L")["between_runs"] > 0
-    for one, two in zip(quantity(jointly, "L")["points"], quantity(pooled, "L")["points"],
-                        strict=True):  # fmt: skip
+    for one, two in zip(
+        quantity(jointly, "L")["points"], quantity(pooled, "L")["points"], strict=True
+    ):
         assert len(two["runs"]) == 2
         assert one["value"] == pytest.approx(two["value"], abs=4 * two["stderr"])
 
@@ -161,21 +166,26 @@ def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: Ser
     changed = stored(served.server, 8.0, 3, longer=0.05)
     batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS if x != 8.0]
     job = batch_of(
-        served.server, served.parts, reference="tube",
+        served.server,
+        served.parts,
+        reference="tube",
         batch=[*batch, {"x": 8.0, "datasets": [changed]}],
-    )  # fmt: skip
+    )
     found = trend(served, job)
     assert (found["reference"], found["reference_x"]) == (reference, 8.0)
     drifted = {
         (point["x"], drift["kind"])
-        for point in quantity(found, "L")["points"] for drift in point["drifts"]
+        for point in quantity(found, "L")["points"]
+        for drift in point["drifts"]
         if drift["drifted"]
-    }  # fmt: skip
+    }
     assert drifted == {(8.0, "run"), (8.0, "trend")}
     (against_run,) = (
-        one for point in quantity(found, "L")["points"] for one in point["drifts"]
+        one
+        for point in quantity(found, "L")["points"]
+        for one in point["drifts"]
         if one["kind"] == "run"
-    )  # fmt: skip
+    )
     assert against_run["difference"] == pytest.approx(0.05, abs=0.005)
     request = served.server.get(f"/v1/jobs/{job}").json()["request"]
     assert request["warm_start"] == request["trend"]["reference"] == reference
@@ -199,15 +209,24 @@ def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> 
 
 
 def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: Served) -> None:
-    batch = [{"x": 3, "datasets": ["ds_c"]}, {"x": 1, "datasets": ["ds_a"]},
-             {"x": 2, "datasets": served.datasets[2.0][:1]},
-             {"x": 4, "datasets": ["ds_d"]}]  # fmt: skip
+    batch = [
+        {"x": 3, "datasets": ["ds_c"]},
+        {"x": 1, "datasets": ["ds_a"]},
+        {"x": 2, "datasets": served.datasets[2.0][:1]},
+        {"x": 4, "datasets": ["ds_d"]},
+    ]
     answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
     faults = refused(answer, 422, "invalid")
-    assert {(one["pointer"][:17], named) for one in faults for named in ("ds_a", "ds_c", "ds_d")
-            if named in one["detail"]} == {
-        ("/batch/0/datasets", "ds_c"), ("/batch/1/datasets", "ds_a"), ("/batch/3/datasets", "ds_d"),
-    }  # fmt: skip
+    assert {
+        (one["pointer"][:17], named)
+        for one in faults
+        for named in ("ds_a", "ds_c", "ds_d")
+        if named in one["detail"]
+    } == {
+        ("/batch/0/datasets", "ds_c"),
+        ("/batch/1/datasets", "ds_a"),
+        ("/batch/3/datasets", "ds_d"),
+    }
     assert len(faults) == 3
 
 
@@ -283,8 +302,12 @@ def test_labels_missing_for_a_trend_are_told(
 ) -> None:
     values = [served.datasets[2.0][:1], served.datasets[4.0][:1]]
     axis = {"path": "/datasets", "values": values, "labels": labels}
-    body = {"model": "tube", "datasets": values[0], "sweep": {"axes": [axis]},
-            "trend": {"x": "length_m"}}  # fmt: skip
+    body = {
+        "model": "tube",
+        "datasets": values[0],
+        "sweep": {"axes": [axis]},
+        "trend": {"x": "length_m"},
+    }
     (fault,) = refused(served.server.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == pointer
     assert said in fault["detail"]
@@ -347,16 +370,29 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
 def test_the_command_uploads_prints_and_accepts(
     served: Served, command: CliRunner, tmp_path: Any
 ) -> None:
-    words = ["reidentify", "--model", "tube", "--label", "length_m", "--parameters", "L,T",
-             "--predict", "10", "--set", "algorithm.population=20", "--set",
-             "algorithm.islands=2"]  # fmt: skip
+    words = [
+        "reidentify",
+        "--model",
+        "tube",
+        "--label",
+        "length_m",
+        "--parameters",
+        "L,T",
+        "--predict",
+        "10",
+        "--set",
+        "algorithm.population=20",
+        "--set",
+        "algorithm.islands=2",
+    ]
     for x in LENGTHS[:3]:
         file = tmp_path / f"{x:g}.csv"
         file.write_bytes(recorded(x, 5))
         words.append(f"{x:g}={file}")
     out = tmp_path / "trend.json"
-    told = command.invoke(lagid, [*words, "--json", str(out), "--accept", "own", "--accept-run",
-                                  "4"])  # fmt: skip
+    told = command.invoke(
+        lagid, [*words, "--json", str(out), "--accept", "own", "--accept-run", "4"]
+    )
     assert told.exit_code == 0, told.output
     assert "L = (" in told.output
     assert "predicted" in told.output
@@ -372,13 +408,14 @@ def test_the_command_uploads_prints_and_accepts(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["a.csv"], "need X=DATA"), (["long=a.csv"], "need a number"),
+        (["a.csv"], "need X=DATA"),
+        (["long=a.csv"], "need a number"),
         (["5=nowhere.csv"], "there is no file nowhere.csv"),
         (["5=ds_a", "6=ds_b", "--accept", "x"], "--accept needs --accept-run"),
         (["5=ds_a", "--predict", "inf"], "need a number"),
         (["5=ds_a", "--channels", "u"], "need signal=channel"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_in_the_command_is_one_line(
     command: CliRunner, words: list[str], said: str
 ) -> None:

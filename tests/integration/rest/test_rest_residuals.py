@@ -31,14 +31,20 @@ BOUNDS = {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}}
 
 
 TWO_OUTPUTS = {
-    "name": "both", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "name": "both",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
     "parameters": {
-        "K": {"lower": 0, "upper": 5}, "T": {"lower": 0.05, "upper": 5, "unit": "s"},
-        "L": {"lower": 0, "upper": 2, "unit": "s"}, "b": {"lower": -1, "upper": 1},
+        "K": {"lower": 0, "upper": 5},
+        "T": {"lower": 0.05, "upper": 5, "unit": "s"},
+        "L": {"lower": 0, "upper": 2, "unit": "s"},
+        "b": {"lower": -1, "upper": 1},
     },
-    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x", "z": "x + b"},
+    "equations": {"x": "(K*u(t - L) - x)/T"},
+    "outputs": {"y": "x", "z": "x + b"},
     "initial": {"x": 0},
-}  # fmt: skip
+}
 
 
 class Served(NamedTuple):
@@ -77,9 +83,13 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         ]
         parts = server.app.state.parts  # type: ignore[attr-defined]
         body = {
-            "model": "fopdt", "datasets": data[:1], "hold": {"u": "zero"}, "algorithm": SMALL,
-            "parameters": BOUNDS, "validation": {"fraction": 0.3},
-        }  # fmt: skip
+            "model": "fopdt",
+            "datasets": data[:1],
+            "hold": {"u": "zero"},
+            "algorithm": SMALL,
+            "parameters": BOUNDS,
+            "validation": {"fraction": 0.3},
+        }
         models = {"axes": [{"path": "/model", "values": ["fopdt", "sopdt"]}]}
         _, runs = identified(parts, {**body, "sweep": models})
         _, other = identified(parts, {**body, "datasets": data[1:]})
@@ -114,9 +124,13 @@ def test_functions_that_are_asked_for_have_the_verdicts_that_were_stored(served:
 
 def test_under_a_noise_model_they_are_of_the_whitened_residuals(served: Served) -> None:
     body = {
-        "model": "fopdt", "datasets": [served.dataset], "hold": {"u": "zero"}, "algorithm": SMALL,
-        "parameters": BOUNDS, "loss": {"noise_model": "ar1"},
-    }  # fmt: skip
+        "model": "fopdt",
+        "datasets": [served.dataset],
+        "hold": {"u": "zero"},
+        "algorithm": SMALL,
+        "parameters": BOUNDS,
+        "loss": {"noise_model": "ar1"},
+    }
     _, (run,) = identified(served.parts, body)
     assert result(served, run)["correlation_times"]["y"] > STEP
     agree(served, run, "estimation")
@@ -151,9 +165,8 @@ def test_a_run_without_signals_has_no_residuals(served: Served) -> None:
     run = served.server.get(f"/v1/jobs/{job}/runs").json()["items"][0]["id"]
     refused(served.server.get(f"/v1/runs/{run}/residuals"), 404, "not-found")
     faults = refused(
-        served.server.post("/v1/runs:compare", json={"runs": [run, served.runs[0]]}),
-        422, "invalid",
-    )  # fmt: skip
+        served.server.post("/v1/runs:compare", json={"runs": [run, served.runs[0]]}), 422, "invalid"
+    )
     assert faults[0]["pointer"] == "/runs/0"
     assert "queued" in faults[0]["detail"]
 
@@ -186,9 +199,7 @@ def test_runs_on_other_data_do_not_compare(served: Served) -> None:
     ("runs", "expected"),
     [(["run_x", "run_y"], "run_x"), (["a"], "at least 2"), ([], "at least 2")],
 )
-def test_a_comparison_of_nothing_is_refused(
-    served: Served, runs: list[str], expected: str
-) -> None:  # fmt: skip
+def test_a_comparison_of_nothing_is_refused(served: Served, runs: list[str], expected: str) -> None:
     faults = refused(served.server.post("/v1/runs:compare", json={"runs": runs}), 422, "invalid")
     assert expected in faults[0]["detail"]
 
@@ -292,19 +303,36 @@ def test_the_report_holds_tests_and_figures(served: Served) -> None:
         {"datasets": ["d1", "d2"], "validation": None},
         {"datasets": ["d1", "d2"], "validation": {"fraction": 0.25}, "prediction": "one-step"},
         {"datasets": ["d1", "d2"], "validation": None, "prediction": "one-step", "skip": 9},
-        {"model": TWO_OUTPUTS, "channels": {"z": "y"}, "weights": {"y": 2.0}, "skip": 3,
-         "loss": {"kind": "soft-l1", "scale": 0.1}, "parameters": {}},
+        {
+            "model": TWO_OUTPUTS,
+            "channels": {"z": "y"},
+            "weights": {"y": 2.0},
+            "skip": 3,
+            "loss": {"kind": "soft-l1", "scale": 0.1},
+            "parameters": {},
+        },
     ],
-    ids=["robust", "robust part", "noise, other data", "two records", "two parts", "one step ahead",
-         "two outputs"],
-)  # fmt: skip
+    ids=[
+        "robust",
+        "robust part",
+        "noise, other data",
+        "two records",
+        "two parts",
+        "one step ahead",
+        "two outputs",
+    ],
+)
 def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
     served: Served, changes: dict[str, Any]
 ) -> None:
     body = {
-        "model": "fopdt", "datasets": ["d1"], "hold": {"u": "zero"}, "algorithm": SMALL,
-        "parameters": BOUNDS, "validation": {"fraction": 0.3},
-    }  # fmt: skip
+        "model": "fopdt",
+        "datasets": ["d1"],
+        "hold": {"u": "zero"},
+        "algorithm": SMALL,
+        "parameters": BOUNDS,
+        "validation": {"fraction": 0.3},
+    }
     _, runs = identified(served.parts, {**body, **changes})
     stored = result(served, runs[0])["residual_tests"]
     asked = served.server.get(f"/v1/runs/{runs[0]}/residuals").json()

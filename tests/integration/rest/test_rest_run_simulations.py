@@ -24,8 +24,14 @@ ARM = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 
 NEAR = {name: {"lower": 0.9 * value, "upper": 1.1 * value} for name, value in ARM.items()}
 STEP = {"kind": "step", "amplitude": pi / 2}
 TUBE = {"time_constant": 0.35, "delay": 0.127}
-CONTROL = {"input": "P_a", "output": "theta", "gain": 10e3, "limit": 0.25e6, "transport": TUBE,
-           "reference": STEP}  # fmt: skip
+CONTROL = {
+    "input": "P_a",
+    "output": "theta",
+    "gain": 10e3,
+    "limit": 0.25e6,
+    "transport": TUBE,
+    "reference": STEP,
+}
 LOOP = {"control": CONTROL, "samples": 601}
 
 
@@ -45,13 +51,23 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with TestClient(app) as server:
         parts = app.state.parts
         pressure = "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.65*t + 1) + 0.5*sin(14.5*t + 2))"
-        made = server.post("/v1/datasets:simulate", json={
-            "model": "actuator", "parameters": ARM, "samples": 600, "sample_time": 0.01,
-            "inputs": {"P_a": {"kind": "expression", "expression": pressure}},
-        })  # fmt: skip
+        made = server.post(
+            "/v1/datasets:simulate",
+            json={
+                "model": "actuator",
+                "parameters": ARM,
+                "samples": 600,
+                "sample_time": 0.01,
+                "inputs": {"P_a": {"kind": "expression", "expression": pressure}},
+            },
+        )
         assert made.status_code == 201, made.text
-        arm = {"model": "actuator", "datasets": [made.json()["id"]], "algorithm": SMALL,
-               "parameters": {**NEAR, "theta(0)": {"fixed": 0}}}  # fmt: skip
+        arm = {
+            "model": "actuator",
+            "datasets": [made.json()["id"]],
+            "algorithm": SMALL,
+            "parameters": {**NEAR, "theta(0)": {"fixed": 0}},
+        }
         steps = server.post("/v1/datasets", content=recording(), headers=CSV).json()["id"]
         lag = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
         _, [first] = identified(parts, arm)
@@ -97,10 +113,16 @@ def test_without_transport_the_controller_is_a_step_late_and_friction_leaves_an_
 def test_that_states_start_where_an_earlier_input_does_is_told(served: Served) -> None:
     def found(since: float) -> dict[str, Any]:
         u = {"kind": "series", "times": [since, 20.0], "values": [0.0, 0.0], "hold": "zero"}
-        return simulated(served, served.lag, {
-            "inputs": {"u": u}, "samples": 100, "sample_time": 0.05,
-            "parameters": {"y0": 5.0, "x(0)": 1.0},
-        })  # fmt: skip
+        return simulated(
+            served,
+            served.lag,
+            {
+                "inputs": {"u": u},
+                "samples": 100,
+                "sample_time": 0.05,
+                "parameters": {"y0": 5.0, "x(0)": 1.0},
+            },
+        )
 
     early, at_zero = found(-2.0), found(0.0)
     assert at_zero["notes"] == []
@@ -114,8 +136,12 @@ def test_that_states_start_where_an_earlier_input_does_is_told(served: Served) -
 def test_a_loop_that_is_not_at_rest_when_its_reference_steps_is_told(served: Served) -> None:
     def told(**step: float) -> list[str]:
         control = {"input": "u", "output": "y", "gain": 0.2, "reference": {"kind": "step", **step}}
-        body = {"control": control, "samples": 4000, "sample_time": 0.05,
-                "parameters": {"y0": 5.0, "x(0)": 0.0}}  # fmt: skip
+        body = {
+            "control": control,
+            "samples": 4000,
+            "sample_time": 0.05,
+            "parameters": {"y0": 5.0, "x(0)": 0.0},
+        }
         return list(simulated(served, served.lag, body)["notes"])
 
     [note] = told(offset=1.0, amplitude=2.0)
@@ -149,14 +175,18 @@ def test_starts_are_those_at_the_first_sample_also_where_a_step_comes(
 def test_overridden_parameters_are_used_and_ties_follow_them(served: Served) -> None:
     found = simulated(served, served.arm, {**LOOP, "parameters": {"F_c": 0.0, "k_a": 50.0}})
     assert found["parameters"]["F_c"] == 0.0
-    alone = simulated(served, served.arm, {**LOOP, "parameters": {"k_a": 50.0, "F_c": 0.0,
-                                                                  "k_b": 50.0}})  # fmt: skip
+    alone = simulated(
+        served, served.arm, {**LOOP, "parameters": {"k_a": 50.0, "F_c": 0.0, "k_b": 50.0}}
+    )
     assert found["outputs"] == alone["outputs"]
 
 
 def test_an_open_loop_follows_given_samples_a_dataset_or_a_formula(served: Served) -> None:
-    found = simulated(served, served.lag, {"inputs": {"u": {"kind": "step", "time": 1.0}},
-                                           "samples": 201, "sample_time": 0.05})  # fmt: skip
+    found = simulated(
+        served,
+        served.lag,
+        {"inputs": {"u": {"kind": "step", "time": 1.0}}, "samples": 201, "sample_time": 0.05},
+    )
     values = np.array(found["outputs"][0]["values"])
     times = np.array(found["outputs"][0]["times"])
     p = found["parameters"]
@@ -203,27 +233,38 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
 @pytest.mark.parametrize(
     ("change", "pointer", "part"),
     [
-        ({"control": {**CONTROL, "input": "P"}}, "/control/input",
-         "no input 'P'; known are P_a"),
-        ({"control": {**CONTROL, "reference": {"kind": "expression", "expression": "foo(t)"}}},
-         "/control/reference/expression", "tanh, where"),
-        ({"control": {**CONTROL, "reference": {"kind": "expression", "expression": "q*t"}}},
-         "/control/reference/expression", "known are h, k, pi, t"),
+        ({"control": {**CONTROL, "input": "P"}}, "/control/input", "no input 'P'; known are P_a"),
+        (
+            {"control": {**CONTROL, "reference": {"kind": "expression", "expression": "foo(t)"}}},
+            "/control/reference/expression",
+            "tanh, where",
+        ),
+        (
+            {"control": {**CONTROL, "reference": {"kind": "expression", "expression": "q*t"}}},
+            "/control/reference/expression",
+            "known are h, k, pi, t",
+        ),
         ({"control": {**CONTROL, "output": "theta_"}}, "/control/output", "did you mean 'theta'"),
         ({"control": {**CONTROL, "limit": 0}}, "/control/limit", "need a number above 0"),
         ({"control": {**CONTROL, "transport": {"delay": -1}}}, "/control/transport/delay", "0"),
-        ({"control": {**CONTROL, "reference": {**STEP, "time": 9}}}, "/control/reference/time",
-         "outside the simulation, from 0 to 6 s"),
+        (
+            {"control": {**CONTROL, "reference": {**STEP, "time": 9}}},
+            "/control/reference/time",
+            "outside the simulation, from 0 to 6 s",
+        ),
         ({"inputs": {"P_a": STEP}}, "/inputs/P_a", "the controller gives this input"),
         ({"inputs": {"u": STEP}}, "/inputs/u", "no input 'u'"),
         ({"control": None}, "/inputs/P_a", "give input 'P_a'"),
         ({"parameters": {"Fc": 1.0}}, "/parameters/Fc", "did you mean 'F_c'"),
         ({"samples": 1}, "/samples", "2"),
         ({"samples": 2_000_000}, "/samples", "1000000"),
-        ({"control": {**CONTROL, "transport": {"delay": 7}}}, "/control/transport/delay",
-         "found 7 s; the simulation lasts 6 s"),
+        (
+            {"control": {**CONTROL, "transport": {"delay": 7}}},
+            "/control/transport/delay",
+            "found 7 s; the simulation lasts 6 s",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_simulated_is_told_where_it_is(
     served: Served, change: dict[str, Any], pointer: str, part: str
 ) -> None:
@@ -243,8 +284,9 @@ def test_a_run_without_estimates_or_without_existence_is_told(served: Served) ->
 def test_a_simulation_that_diverges_is_told_with_its_time(served: Served) -> None:
     control = {"input": "u", "output": "y", "gain": 1e30, "reference": STEP}
     body = {"control": control, "samples": 201, "parameters": {"L": 0.5}}
-    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
-                     "invalid")  # fmt: skip
+    faults = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    )
     assert faults[0]["pointer"] == "/control/gain"
     assert "found 1e+30; with it the loop runs away" in faults[0]["detail"]
     assert "diverges at t =" in faults[0]["detail"]
@@ -266,8 +308,9 @@ def test_a_loop_that_runs_away_has_no_overshoot(served: Served) -> None:
 def test_no_name_of_our_own_is_suggested_in_an_expression(served: Served) -> None:
     wave = {"kind": "expression", "expression": "foo(t) + q"}
     body = {"inputs": {"u": wave}, "samples": 20}
-    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
-                     "invalid")  # fmt: skip
+    faults = refused(
+        served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
+    )
     assert [fault["column"] for fault in faults] == [1, 10]
     assert not any("unused" in fault["detail"] for fault in faults)
 

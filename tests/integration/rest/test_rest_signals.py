@@ -33,9 +33,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with TestClient(app) as server:
         stored = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()
         body = {
-            "model": "fopdt", "datasets": [stored["id"]], "algorithm": SMALL, "reuse": False,
+            "model": "fopdt",
+            "datasets": [stored["id"]],
+            "algorithm": SMALL,
+            "reuse": False,
             "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
-        }  # fmt: skip
+        }
         _, runs = identified(app.state.parts, body)
         yield Served(server, app.state.parts, runs, body)
 
