@@ -16,7 +16,7 @@ from service.storage.sessions import BUSY_SECONDS
 from service.storage.tables import Job
 from tests.dispatching import Place
 from tests.stored import Clock, claim, job_of, state_of, submit
-from tests.unit.test_feeding import ScriptedCrew, fails
+from tests.unit.workers.test_scheduler import ScriptedCrew, fails
 
 SECONDS = 30.0
 

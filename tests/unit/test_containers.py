@@ -1,15 +1,14 @@
 """The container files, checked by schema: no container engine runs where this is developed."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import yaml
 from jsonschema import Draft202012Validator
 
 from service.core.settings import Settings
+from tests.repository import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCKER = ROOT / "docker"
 
 # The part of the Compose Specification that the file uses; a key outside it is a mistake.

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.repository import ROOT
+
 CODE = ("sysid", "workers", "service", "migrations", "tests", "benchmarks")
 MACHINE = re.compile(
     r"py[p]i\.org|python[h]osted|npm[j]s\.|deb\.[d]ebian|/wor[k]/|/far[m]/|/roo[t]/"

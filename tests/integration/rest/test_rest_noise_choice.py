@@ -11,9 +11,17 @@ from service.api.app import create_app
 from service.api.dependencies import Parts
 from tests.identified import identified
 from tests.rest import CSV, refused, settings_of
-from tests.unit.test_noise_choice import LAG, STEP, TANK, N, disturbed, plant, signal
-from tests.unit.test_noise_choice import T as TIME_CONSTANT
-from tests.unit.test_serial import coloured
+from tests.unit.sysid.identification.test_noise_model_choice import (
+    LAG,
+    STEP,
+    TANK,
+    N,
+    disturbed,
+    plant,
+    signal,
+)
+from tests.unit.sysid.identification.test_noise_model_choice import T as TIME_CONSTANT
+from tests.unit.sysid.residuals.test_coloured import coloured
 
 SMALL = {"population": 24, "generations": 20, "islands": 1}
 

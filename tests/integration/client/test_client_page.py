@@ -1,0 +1,96 @@
+"""docs/client.md: every snippet runs, one after the other, against a server."""
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.client.client import Client
+from service.core.states import JobState
+from service.repositories.jobs import JobRepository
+from tests.identified import carried_out
+from tests.repository import ROOT
+from tests.rest import settings_of
+
+PAGE = (ROOT / "docs/client.md").read_text(encoding="utf-8")
+SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+ADDRESS = "http://127.0.0.1:8000"
+
+
+class _Worker(threading.Thread):
+    """Carries out what is queued, as a dispatcher would."""
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(daemon=True)
+        self._parts, self.ended = parts, threading.Event()
+
+    def run(self) -> None:
+        while not self.ended.wait(0.02):
+            with self._parts.database.read_session() as session:
+                queued = JobRepository(session).list_page(limit=10, states=[JobState.QUEUED]).items
+                waiting = [job.id for job in queued]
+            for job in reversed(waiting):
+                carried_out(self._parts, job)
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> Iterator[str]:
+    app = create_app(settings_of(tmp_path))
+    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive()
+        time.sleep(0.01)
+    worker = _Worker(app.state.parts)
+    worker.start()
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        worker.ended.set()
+        worker.join(timeout=20)
+        app.state.parts.stopping.set()
+        server.should_exit = True
+        thread.join(timeout=20)
+
+
+def test_the_page_shows_every_recipe_and_what_follows_it() -> None:
+    for name in (
+        "noise_sweep",
+        "reidentify",
+        "wait",
+        "summary",
+        "trend",
+        "accept_reference",
+        "validate_run",
+        "simulate_run",
+        "ProblemError",
+    ):
+        assert any(name in snippet for snippet in SNIPPETS), name
+
+
+def test_every_method_that_the_page_names_is_there() -> None:
+    for name in re.findall(r"\bclient\.([a-z]\w*)", PAGE):
+        assert hasattr(Client, name), name
+
+
+@pytest.mark.slow
+def test_the_snippets_run_one_after_the_other(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    known: dict[str, Any] = {}
+    assert any(ADDRESS in snippet for snippet in SNIPPETS)
+    for snippet in SNIPPETS:
+        exec(compile(snippet.replace(ADDRESS, url), "docs/client.md", "exec"), known)
+    told = capsys.readouterr().out
+    assert re.search(r"^L = 0\.\d+ ± 0\.\d+ s   identified$", told, re.MULTILINE)
+    assert re.search(r"fit 9\d\.\d %", told)
+    assert "{'/noise/sigma': 0.1, '/algorithm/method': 'improved'} 3 of 3" in told
+    assert re.search(r"^L a.* \(0\.\d+, ", told, re.MULTILINE)
+    assert "/algorithm/population" in told

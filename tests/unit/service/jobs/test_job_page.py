@@ -1,0 +1,136 @@
+"""docs/job.md: every field of a job and every step is there, and its examples hold."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from service.datasets.schemas import DeriveIn
+from service.jobs.schemas import JobIn
+from sysid.core.settings import SEARCH_METHODS, TOPOLOGIES
+from sysid.data.derivations import STEPS, derive_recording
+from sysid.data.noise import NOISE_KINDS
+from sysid.data.records import HOLDS, Channel, Recording, Segment
+from tests.repository import ROOT
+
+PAGE = (ROOT / "docs/job.md").read_text(encoding="utf-8")
+EXAMPLES = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
+JOBS = [one for one in EXAMPLES if "model" in one]
+STEP_LISTS = [one for one in EXAMPLES if "steps" in one]
+
+
+def rows(page: str) -> dict[str, list[str]]:
+    """Cells of every row of a page's tables by the name in the first."""
+    return {
+        cells[1].strip().strip("`"): [cell.strip() for cell in cells[2:-1]]
+        for line in page.splitlines()
+        if (cells := line.split("|"))[0] == "" and len(cells) > 3 and "`" in cells[1]
+    }
+
+
+ROWS, STEP_ROWS = (rows(part) for part in PAGE.split("# Steps of a derived dataset"))
+
+
+def within(field: Any) -> Iterator[str]:
+    """Names of the object types that a field of the schema may hold, on its own or in a list."""
+    if isinstance(field, dict):
+        if "$ref" in field:
+            yield field["$ref"].rpartition("/")[2]
+        for key in ("anyOf", "items", "additionalProperties"):
+            inside = field.get(key, [])
+            for one in inside if isinstance(inside, list) else [inside]:
+                yield from within(one)
+
+
+def fields(schema: dict[str, Any], kind: dict[str, Any], path: str = "") -> Iterator[Any]:
+    """Path and schema of every field of a body."""
+    for name, field in kind["properties"].items():
+        yield path + name, field
+        for inner in within(field):
+            yield from fields(schema, schema["$defs"][inner], f"{path}{name}.")
+
+
+SCHEMA = JobIn.model_json_schema()
+FIELDS = dict(fields(SCHEMA, SCHEMA))
+
+
+@pytest.mark.parametrize("path", FIELDS)
+def test_every_field_of_a_job_is_told_with_its_default(path: str) -> None:
+    assert path in ROWS, f"docs/job.md has no row for {path}"
+    kind, default, meaning = ROWS[path]
+    assert kind
+    assert meaning
+    field = FIELDS[path]
+    is_object = isinstance(field.get("default"), dict) and "$ref" in field
+    if "default" in field and path != "name" and not is_object:
+        assert default == f"`{json.dumps(field['default'])}`"
+    if "default" not in field and path != "model":
+        assert default == "needed"
+
+
+def choices(field: Any) -> set[str]:
+    """Names that a field, its entries or its values take, where these are listed."""
+    if not isinstance(field, dict):
+        return set()
+    inner = [field.get("items"), field.get("additionalProperties"), *field.get("anyOf", [])]
+    return set(field.get("enum", ())).union(*(choices(one) for one in inner))
+
+
+CHOICES = {path: choices(field) for path, field in FIELDS.items() if choices(field)}
+
+
+@pytest.mark.parametrize("path", CHOICES)
+def test_every_name_that_a_field_of_a_job_takes_is_told_and_no_other(path: str) -> None:
+    kind = ROWS[path][0]
+    if kind.startswith("as "):
+        kind = ROWS[kind.removeprefix("as ").strip("`")][0]
+    named = set(re.findall(r"`([^`]+)`", kind))
+    assert named == CHOICES[path], f"docs/job.md, row {path}: {named ^ CHOICES[path]}"
+
+
+def test_the_fields_that_take_names_are_found() -> None:
+    assert set(TOPOLOGIES) == CHOICES["algorithm.migration.topology"]
+    assert set(SEARCH_METHODS) == CHOICES["algorithm.method"] == CHOICES["algorithm.islands.method"]
+    assert set(HOLDS) == CHOICES["hold"]
+
+
+@pytest.mark.parametrize(("step", "names"), [("hold", HOLDS), ("noise", NOISE_KINDS)])
+def test_every_name_that_a_step_takes_is_told(step: str, names: tuple[str, ...]) -> None:
+    told = " ".join(STEP_ROWS[step])
+    assert [name for name in names if not re.search(rf"(?<![\w-]){name}(?![\w-])", told)] == []
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_every_step_of_a_derivation_is_told(step: str) -> None:
+    assert step in STEP_ROWS
+
+
+def test_nothing_is_told_that_is_not_there() -> None:
+    assert set(ROWS) <= set(FIELDS)
+    assert set(STEP_ROWS) <= set(STEPS)
+
+
+@pytest.mark.parametrize("body", JOBS, ids=lambda one: str(one["model"]))
+def test_the_examples_of_jobs_are_valid(body: dict[str, Any]) -> None:
+    assert JobIn.model_validate(body).model == body["model"]
+
+
+def test_the_example_of_steps_takes_every_step() -> None:
+    [body] = STEP_LISTS
+    steps = DeriveIn.model_validate(body).steps
+    assert {name for step in steps for name in step} == set(STEPS)
+    own = np.arange(0.0, 4.0, 0.01)
+    times = np.concatenate([10.0 * i + own for i in range(4)])
+    segments = tuple(
+        Segment(10.0 * i, 10.0 * i + 3.99, 0.0, {"direction": "up", "repeat": float(i)})
+        for i in range(4)
+    )
+    values = 100.0 + np.sin(times)
+    made = Recording((Channel("P1", times, values, "kPa"), Channel("P2", times, values)), segments)
+    found = derive_recording(made, steps)
+    assert [(one.name, one.unit) for one in found.channels] == [("u", "Pa"), ("y", "Pa")]
+    assert len(JOBS) >= 3

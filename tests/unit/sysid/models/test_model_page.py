@@ -1,0 +1,43 @@
+"""docs/model.md: every field and function is there, and its example holds."""
+
+import re
+
+import pytest
+
+from sysid.language.functions import FUNCTIONS
+from sysid.models.documents import parse_yaml
+from sysid.models.parse import parse_model
+from tests.repository import ROOT
+
+PAGE = (ROOT / "docs/model.md").read_text(encoding="utf-8")
+SOLVER = ("method", "step", "substeps", "history", "interpolation")
+FIELDS = (
+    "name",
+    "title",
+    "description",
+    "source",
+    "form",
+    "inputs",
+    "states",
+    "parameters",
+    "constants",
+    "equations",
+    "outputs",
+    "initial",
+)
+
+
+def test_the_example_of_the_page_is_a_model() -> None:
+    [text] = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
+    assert parse_model(parse_yaml(text)).name == "valve-and-oven"
+
+
+@pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])
+def test_every_field_of_a_model_is_on_the_page(field: str) -> None:
+    assert re.search(rf"^\|.*`{re.escape(field)}`.*\|.*\|.+\|$", PAGE, re.M)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_every_function_of_the_language_is_on_the_page(function: str) -> None:
+    [row] = re.findall(r"^\| functions \|(.*)\|$", PAGE, re.M)
+    assert re.search(rf"\b{function}\b", row)
