@@ -8,10 +8,11 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.simulation import loss
+from sysid.simulation.loss import compute_loss as _plain_loss
+from sysid.simulation.loss import compute_loss_weight as _plain_weight
 
-compute_loss = jit_compile(loss.compute_loss)
-_compute_loss_weight = jit_compile(loss.compute_loss_weight)
+compute_loss = jit_compile(_plain_loss)
+_compute_loss_weight = jit_compile(_plain_weight)
 
 FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below what curvature needs
 

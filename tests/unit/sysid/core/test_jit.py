@@ -74,7 +74,7 @@ class Names:
             elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for name in {one for target in targets for one in names_in(target)}:
-                    self.made[name] = node.value
+                    self.made[name] = what_is_compiled(node.value)
 
 
 def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
@@ -97,6 +97,13 @@ def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
         elif name in known[path].made:
             waiting += [(path, used) for used in names_in(known[path].made[name])]
     return {path for path, name in seen if name in known[path].made}
+
+
+def what_is_compiled(value: ast.expr) -> ast.expr:
+    """A function, where it is compiled by a call; else the value itself."""
+    if isinstance(value, ast.Call) and names_in(value.func) == {"compiled"}:
+        return value.args[0]
+    return value
 
 
 def is_compiled(function: ast.FunctionDef) -> bool:
