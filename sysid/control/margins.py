@@ -101,7 +101,7 @@ class _LoopGain:
     def evaluate_static_gain(self) -> FloatArray:
         """L(0), (1,), a real number; (0,) where something integrates."""
         above, below = self.evaluate_fraction(np.zeros(1))
-        found: FloatArray = (above[below != 0] / below[below != 0]).write_float
+        found: FloatArray = (above[below != 0] / below[below != 0]).real
         return found[np.isfinite(found)]
 
     def evaluate_fraction(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:

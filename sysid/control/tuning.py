@@ -220,7 +220,7 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
     others = [pole for pole in poles if abs(pole) > _INTEGRATOR_TOLERANCE * scale and pole != 0]
     if len(integrators) > 1:
         raise _make_refusal("the model integrates twice; the rules are of models that do so once")
-    if any(pole.write_float > 0 for pole in others):
+    if any(pole.real > 0 for pole in others):
         raise _make_refusal("the model is unstable by itself; the rules are of stable models")
     if any(abs(pole.imag) > _REAL_POLE_TOLERANCE * abs(pole) for pole in others):
         raise _make_refusal(

@@ -283,7 +283,7 @@ def test_profiles_are_of_squares_whatever_was_chosen() -> None:
 @pytest.mark.parametrize(("damping", "period"), [(0.0, 2.0), (0.02, 2.0)])
 def test_an_oscillation_that_goes_on_is_no_drift(damping: float, period: float) -> None:
     pole = np.exp((-damping + 2j * np.pi / period) * STEP)
-    swing = f"{2 * pole.write_float}*x(k-1) - {abs(pole) ** 2}*x(k-2) + h**2*(K*u(k-1) - o)"
+    swing = f"{2 * pole.real}*x(k-1) - {abs(pole) ** 2}*x(k-2) + h**2*(K*u(k-1) - o)"
     assert not remembers({**TANK, "equations": {"x": swing}}, (K, OFFSET))
     both = {
         **TANK,
