@@ -23,7 +23,7 @@ $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --config-settings editable_mode=compat -e .
-	@$(BIN)/python -c 'from sysid.identification.warmup import warm_up; warm_up()'  # compile the search once
+	@$(BIN)/python -c 'from sysid.identification.warmup import compile_search; compile_search()'  # compile the search once
 	@git config core.hooksPath .ci/hooks 2>/dev/null || true  # subjects of at most 72 characters
 	@touch $@
 

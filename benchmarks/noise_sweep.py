@@ -23,7 +23,7 @@ from service.client.embedded import run_embedded_service
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise, add_output_noise
 from sysid.identification.identify import identify
-from sysid.islands import evolve as voyage
+from sysid.islands import evolve
 from sysid.models.catalogue.load import load_model
 from sysid.search import least_squares
 from sysid.simulation import problem
@@ -32,11 +32,11 @@ from sysid.uncertainty import sensitivities
 SIGMAS = [round(0.05 * i, 2) for i in range(21)]
 METHODS = ["simple", "improved"]
 COMPILED: Sequence[tuple[Any, str]] = (
-    (voyage, "_sail"),
-    (least_squares, "_descend"),
-    (problem, "population_fitness"),
-    (problem, "population_predictions"),
-    (sensitivities, "_central"),
+    (evolve, "_run_epochs"),
+    (least_squares, "_run_steps"),
+    (problem, "evaluate_population"),
+    (problem, "predict_population"),
+    (sensitivities, "_compute_central_differences"),
 )
 """Where Python enters compiled loops during a run: search, least squares, simulations, slopes."""
 

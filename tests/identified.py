@@ -7,7 +7,7 @@ from service.api.dependencies import Parts
 from service.dispatch.cramer_rao import build_bounds_maker
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.recorder import RunRecorder
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import LeaseQueue
 from service.repositories.runs import RunRepository
@@ -17,7 +17,7 @@ from workers.scheduler import Scheduler
 
 def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[str, list[str]]:
     """Submit a job and carry it out; gives its id and those of its runs."""
-    job = jobs.submit_job(parts.database, JobIn.model_validate(body), parts.settings).id
+    job = submit.submit_job(parts.database, JobIn.model_validate(body), parts.settings).id
     return job, carried_out(parts, job, steps)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.core.states import OPEN_STATES, JobState
-from service.dispatch import cramer_rao as floors
+from service.dispatch import cramer_rao
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.sweeps.cramer_rao import StoredBounds
@@ -52,14 +52,14 @@ def notes(job):
 
 def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
-    made = floors.cramer_rao_bound
+    made = cramer_rao.cramer_rao_bound
 
     def held(problem, theta):
         begun.set()
         assert may_go_on.wait(LIMIT_SECONDS)
         return made(problem, theta)
 
-    monkeypatch.setattr(floors, "cramer_rao_bound", held)
+    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", held)
     noisy = place.submit(**NOISY)
     states = []
 
@@ -84,7 +84,7 @@ def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
         assert may_go_on.wait(LIMIT_SECONDS)
         raise ZeroDivisionError
 
-    monkeypatch.setattr(floors, "cramer_rao_bound", held)
+    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", held)
     noisy = place.submit(**NOISY)
 
     def meanwhile():
@@ -106,18 +106,18 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
     def broken(problem, theta):
         raise error
 
-    monkeypatch.setattr(floors, "cramer_rao_bound", broken)
+    monkeypatch.setattr(cramer_rao, "cramer_rao_bound", broken)
     (job,) = carried_out(place, place.submit(**NOISY))
     assert job.state is JobState.SUCCEEDED
     assert any("there is no floor: internal error" in one for one in notes(job))
 
 
 def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatch):
-    monkeypatch.setattr(floors, "MOST_PROBLEMS", 2)
+    monkeypatch.setattr(cramer_rao, "MOST_PROBLEMS", 2)
     (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
     (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
     assert [len(job.floors["problems"]) for job in (few, many)] == [2, 2]
-    assert [floors.LEFT_OUT_NOTE in notes(job) for job in (few, many)] == [False, True]
+    assert [cramer_rao.LEFT_OUT_NOTE in notes(job) for job in (few, many)] == [False, True]
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]

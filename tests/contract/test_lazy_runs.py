@@ -5,9 +5,9 @@ from datetime import timedelta
 import pytest
 
 from service.core.states import JobState
-from service.dispatch import job_runs as preparing
+from service.dispatch import job_runs
 from service.dispatch.job_runs import JobRuns
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.run_writes import RunWriter
@@ -33,8 +33,8 @@ AT_ONCE, N_RUNS = 5, 12
 
 @pytest.fixture
 def place(tmp_path, database, monkeypatch):
-    monkeypatch.setattr(jobs, "CELLS_AT_SUBMISSION", AT_ONCE)
-    monkeypatch.setattr(preparing, "CHUNK_ROWS", 2)
+    monkeypatch.setattr(submit, "CELLS_AT_SUBMISSION", AT_ONCE)
+    monkeypatch.setattr(job_runs, "CHUNK_ROWS", 2)
     return Place(tmp_path / "data", database)
 
 
@@ -62,7 +62,7 @@ def cells(place, job):
 def submit_whole(place, monkeypatch, **body):
     """A job whose runs are all made at submission."""
     with monkeypatch.context() as patched:
-        patched.setattr(jobs, "CELLS_AT_SUBMISSION", 1000)
+        patched.setattr(submit, "CELLS_AT_SUBMISSION", 1000)
         return place.submit(**body)
 
 
@@ -173,7 +173,7 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
         (group,) = group_all_runs(session, place.job(job), [], [], 10)
     assert group.states[JobState.CANCELLED] == N_RUNS
     with place.database.write() as session:
-        jobs.resume_job(session, job, place.settings)
+        submit.resume_job(session, job, place.settings)
     carry_out(place, job, InlineExecutor())
     assert place.job(job).state is JobState.SUCCEEDED
     assert cells(place, job) == cells(place, whole)
@@ -181,7 +181,7 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
 
 def test_a_clone_has_the_same_cells(place):
     job = place.submit(**SWEEP)
-    other = jobs.clone_job(place.database, job, place.settings).id
+    other = submit.clone_job(place.database, job, place.settings).id
     assert place.job(other).n_runs == N_RUNS
     carry_out(place, job, InlineExecutor())
     assert cells(place, other) == cells(place, job)
@@ -207,7 +207,7 @@ def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(place):
     job = place.submit(**SWEEP)
     with place.database.read() as session:
         listed = list_runs(session, job, None, 100, RunQuery())
-        progress = jobs.to_job_out(JobRepository(session).get(job)).progress
+        progress = submit.to_job_out(JobRepository(session).get(job)).progress
         assert RunRepository(session).count_created(job) == len(listed.items) == AT_ONCE
     assert (progress.runs, progress.finished) == (N_RUNS, 0)
 

@@ -136,7 +136,6 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
             "service.dispatch.job_runs.prepare_run_records",
             lambda *_: FitRecords((), None, None, None),
         )
-        patched.setattr("sysid.identification.run.conclude_run", broken)
         patched.setattr("workers.tasks.conclude_run", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
     assert run.state is JobState.FAILED

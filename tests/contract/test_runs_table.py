@@ -9,7 +9,7 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
-from service.runs import table as runs_table
+from service.runs import table
 from service.storage.sessions import Database
 from tests.stored import claim
 
@@ -52,7 +52,7 @@ def _outcome(run: str, told: dict[str, float] | str) -> RunOutcome:
 
 
 def rows(database: Database, job: str) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO("".join(runs_table.stream_table(database, job)))))
+    return list(csv.DictReader(io.StringIO("".join(table.stream_table(database, job)))))
 
 
 def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database) -> None:

@@ -15,7 +15,7 @@ from service.core.settings import Settings
 from service.core.states import JobState
 from service.datasets.datasets import add_recording
 from service.formats.mcap import FitRole, FittedOutput, write_fitted_outputs
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import Claim, JobProgress, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
@@ -89,7 +89,7 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
         running_run = _first(session, running)
         RunWriter(session, running.lease).start_runs([running_run])
     progress(database, running, running_run, 60)
-    queued = jobs.submit_job(database, _body(dataset, "tube 5 m, waits"), settings).id
+    queued = submit.submit_job(database, _body(dataset, "tube 5 m, waits"), settings).id
     return Filled(
         dataset,
         finished.job.id,
@@ -154,7 +154,7 @@ def _simulated(u: np.ndarray) -> np.ndarray:
 
 
 def _claimed(database: Database, settings: Settings, body: JobIn) -> Claim:
-    jobs.submit_job(database, body, settings)
+    submit.submit_job(database, body, settings)
     with database.write_session() as session:
         claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
     assert claim is not None

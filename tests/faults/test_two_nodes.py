@@ -22,10 +22,10 @@ ALGORITHM = {"generations": 1500, "islands": 2, "stop": {"settled": None}}
 JOIN = """
 import sys
 from workers.ray_executor import ClusterSettings
-from workers.ray_executor import RayCrew
+from workers.ray_executor import RayExecutor
 from workers.errors import ClusterUnavailable
 try:
-    RayCrew(ClusterSettings(sys.argv[1]))
+    RayExecutor(ClusterSettings(sys.argv[1]))
 except ClusterUnavailable as error:
     print(error)
 """

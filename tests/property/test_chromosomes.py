@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.search import operators as random
+from sysid.search import operators
 from sysid.search.operators import (
     cross_over,
     decode,
@@ -113,7 +113,7 @@ def test_the_mutation_rate_follows_its_schedule() -> None:
 def test_philox_gives_its_published_values() -> None:
     def words(counter: tuple[int, ...], key: tuple[int, int]) -> tuple[int, ...]:
         draw, generation, island, use = counter
-        return tuple(random.draw_words(key[0] | key[1] << 32, use, island, generation, draw))
+        return tuple(operators.draw_words(key[0] | key[1] << 32, use, island, generation, draw))
 
     zero = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
     pi = (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1)
@@ -124,7 +124,7 @@ def test_philox_gives_its_published_values() -> None:
 
 def test_no_two_places_of_a_run_share_draws() -> None:
     seen = [
-        tuple(random.draw_words(seed, use, island, generation, draw))
+        tuple(operators.draw_words(seed, use, island, generation, draw))
         for seed in (0, 1, 2**40)
         for use in range(1, 7)
         for island in range(4)
@@ -136,10 +136,10 @@ def test_no_two_places_of_a_run_share_draws() -> None:
 
 def test_draws_are_uniform() -> None:
     values = np.array(
-        [random.to_uniform(random.draw_words(7, 1, 0, 0, i)[0]) for i in range(20_000)]
+        [operators.to_uniform(operators.draw_words(7, 1, 0, 0, i)[0]) for i in range(20_000)]
     )
     counts = np.histogram(values, bins=20, range=(0, 1))[0]
     assert np.sum((counts - 1000) ** 2 / 1000) < 60  # chi-squared, 19 degrees: P < 1e-5
-    assert {random.to_integer(random.draw_words(7, 2, 0, 0, i)[1], 7) for i in range(500)} == set(
-        range(7)
-    )
+    assert {
+        operators.to_integer(operators.draw_words(7, 2, 0, 0, i)[1], 7) for i in range(500)
+    } == set(range(7))

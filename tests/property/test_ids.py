@@ -7,7 +7,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.storage import statements as ids
+from service.storage import statements
 from service.storage.statements import new_id, new_ids
 
 
@@ -24,17 +24,17 @@ def test_each_identifier_is_greater_than_the_one_before(sizes):
 @given(st.lists(st.integers(0, 2**47), min_size=2, max_size=30))
 def test_a_clock_that_jumps_back_does_not_disturb_the_order(milliseconds):
     clock = iter(milliseconds)
-    sequence = ids._IdSequence()
+    sequence = statements._IdSequence()
     true_time, time.time_ns = time.time_ns, lambda: next(clock) * 1_000_000
     try:
-        made = [ids._encode_base32(sequence.take_numbers(1)[0]) for _ in milliseconds]
+        made = [statements._encode_base32(sequence.take_numbers(1)[0]) for _ in milliseconds]
     finally:
         time.time_ns = true_time
     assert made == sorted(set(made))
 
 
 def test_later_identifiers_of_another_process_are_greater():
-    early, late = ids._IdSequence(), ids._IdSequence()
+    early, late = statements._IdSequence(), statements._IdSequence()
     before = early.take_numbers(1)[0]
     time.sleep(0.002)
     assert late.take_numbers(1)[0] > before

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
-from service.formats import mcap_writer as mcap_file
+from service.formats import mcap_writer
 from service.formats.mcap import read_recording
 from service.formats.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
@@ -45,7 +45,7 @@ def recordings(draw: st.DrawFn) -> Recording:
 @given(recordings(), st.integers(1, 40))
 @settings(max_examples=120)
 def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chunk: int) -> None:
-    with mock.patch.object(mcap_file, "CHUNK_SAMPLES", chunk):
+    with mock.patch.object(mcap_writer, "CHUNK_SAMPLES", chunk):
         content = recorded(recording)
     back = read_recording(content)
     assert back.names == recording.names

@@ -206,7 +206,7 @@ def test_the_target_rms_ends_a_run() -> None:
     assert state.rms <= 0.05
     plan = make_plans(problem(), algorithm, 1)
     assert any(
-        is_island_resting(p, i.fitness, i.counters, i.champion_rms)
+        is_island_resting(p, i.arrays, i.champion_rms)
         for p, i in zip(plan, state.islands, strict=True)
     )
 

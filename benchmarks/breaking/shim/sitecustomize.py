@@ -31,7 +31,7 @@ def _break_clock(module):
 
 def _break_runs(module):
     deadly = {int(seed) for seed in os.environ["BREAK_SEEDS"].split(",")}
-    advance = module.advance
+    advance = module.process_pack
 
     @functools.wraps(advance)
     def broken(pack, keys, *shared):
@@ -39,12 +39,12 @@ def _break_runs(module):
             os.kill(os.getpid(), signal.SIGKILL)
         return advance(pack, keys, *shared)
 
-    module.advance = broken
+    module.process_pack = broken
 
 
 def _break_memory(module):
     greedy = {int(seed) for seed in os.environ["BREAK_MEMORY"].split(",")}
-    advanced = module._advanced
+    advanced = module._advance_item
 
     def broken(item, *parts):
         taken = []
@@ -52,18 +52,18 @@ def _break_memory(module):
             taken.append(b"x" * 2**24)
         return advanced(item, *parts)
 
-    module._advanced = broken
+    module._advance_item = broken
 
 
 def _break_start(module):
-    initialise = module._initialise
+    initialise = module._start_ray
 
     def broken(*arguments):
         if Path(os.environ["BREAK_RAY"]).exists():
             raise ConnectionError("nobody answers")
         initialise(*arguments)
 
-    module._initialise = broken
+    module._start_ray = broken
 
 
 _BREAKERS = {

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from service.api.app import create_app
 from service.core.states import JobState
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
@@ -57,7 +57,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
                 },
             }
         )
-        job = jobs.submit_job(parts.database, body, settings).id
+        job = submit.submit_job(parts.database, body, settings).id
         with parts.database.write() as session:
             claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
         assert claim is not None

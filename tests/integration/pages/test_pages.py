@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from service.api.app import create_app
 from service.core.settings import Settings
 from service.datasets.datasets import add_recording
-from service.pages import render as assets
+from service.pages import render
 from service.storage.tables import Job
 from sysid.data.records import Channel, Recording
 from tests.e2e.filled import Filled, fill
@@ -82,7 +82,7 @@ def test_the_pages_of_jobs_follow_each_other(client: TestClient, filled: Filled)
 
 
 def test_plotly_is_served_compressed_and_kept_forever(client: TestClient) -> None:
-    name = f"/static/{assets.plotly_file_name()}"
+    name = f"/static/{render.plotly_file_name()}"
     answer = client.get(name, headers={"Accept-Encoding": "gzip"})
     assert answer.headers["content-encoding"] == "gzip"
     assert "immutable" in answer.headers["cache-control"]
@@ -238,7 +238,7 @@ def test_what_scripts_load_has_a_problem_document_also_in_a_browser(
 
 
 def test_every_column_of_a_page_has_a_heading() -> None:
-    folder = Path(assets.__file__).parent / "templates"
+    folder = Path(render.__file__).parent / "templates"
     for path in folder.glob("*.html"):
         assert "<th></th>" not in path.read_text(encoding="utf-8"), path.name
 

@@ -19,7 +19,7 @@ from service.jobs.stored_run import StoredRun
 from service.pages.simulate import _default_values, _FormContext
 from service.storage.tables import Dataset, Job, Run
 from sysid.models.catalogue.load import load_model
-from sysid.search import refine as refinement
+from sysid.search import refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from tests.identified import identified
@@ -105,7 +105,7 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
         searched.append([one.name for one in problem.free_parameters])
         return refine_candidates(problem, *arguments)
 
-    monkeypatch.setattr(refinement, "refine_candidates", noted)
+    monkeypatch.setattr(refine, "refine_candidates", noted)
     found = validated(place, dataset=answer.json()["id"]).json()
     assert searched == 5 * [["x(0)"]]
     assert list(found["starts"]) == ["x(0)", *(f"x(0)[{n}]" for n in range(2, 6))]

@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.cli import runs as program
+from service.cli import runs
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
@@ -283,13 +283,13 @@ def test_the_command_line_tells_controller_rule_and_margins(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(program, "connect_client", connected)
+    monkeypatch.setattr(runs, "connect_client", connected)
     file = tmp_path / "loop.json"
 
     def told(**control: Any) -> str:
         body = {**BODY, "parameters": PLANT, "control": {**CONTROL, **control}}
         file.write_text(json.dumps(body))
-        done = CliRunner().invoke(program.app, ["simulate", served.lag, str(file)])
+        done = CliRunner().invoke(runs.app, ["simulate", served.lag, str(file)])
         assert done.exit_code == 0, done.output
         return done.output
 

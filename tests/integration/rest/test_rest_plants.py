@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.cli import datasets as program
+from service.cli import datasets
 from service.client.client import Client
 from service.formats.mcap import read_recording
 from sysid.data.records import Recording
@@ -126,13 +126,13 @@ def test_the_command_line_makes_a_tube_from_its_length(
     server: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     client = Client("http://testserver", transport=Through(server))
-    monkeypatch.setattr(program, "connect_client", lambda url, key: client)
+    monkeypatch.setattr(datasets, "connect_client", lambda url, key: client)
     run = CliRunner().invoke
     file = tmp_path / "short.yaml"
     file.write_text("{samples: 100, parameters: {length_m: 10}}")
     words = ["simulate", str(file), "--plant", "tube", "--set", "length_m=30", "--name", "long"]
-    done = run(program.app, words)
+    done = run(datasets.app, words)
     assert done.exit_code == 0, done.output
     assert "long: 100 samples" in done.output
-    assert run(program.app, ["simulate"]).exit_code == 1
-    assert run(program.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code == 1
+    assert run(datasets.app, ["simulate"]).exit_code == 1
+    assert run(datasets.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code == 1

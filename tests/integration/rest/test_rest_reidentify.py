@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.cli import reidentify as references
+from service.cli import reidentify
 from service.cli import reidentify as reidentifying
 from service.cli.main import app as lagid
 from service.client.client import Client
@@ -361,7 +361,7 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
         carried_out(served.parts, job)
         return opened.job(job)
 
-    for module in (reidentifying, references):
+    for module in (reidentifying, reidentify):
         monkeypatch.setattr(f"{module.__name__}.connected", connected)
     monkeypatch.setattr(f"{reidentifying.__name__}.follow", follow)
     return CliRunner()

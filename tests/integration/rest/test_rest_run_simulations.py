@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.cli import runs as program
+from service.cli import runs
 from service.client.client import Client
 from service.formats.mcap import read_recording
 from tests.identified import identified
@@ -327,15 +327,15 @@ def test_the_command_line_tells_the_measures_of_the_step(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(program, "connect_client", connected)
+    monkeypatch.setattr(runs, "connect_client", connected)
     file = tmp_path / "loop.json"
     file.write_text(json.dumps({**LOOP, "store": True}))
-    done = CliRunner().invoke(program.app, ["simulate", served.arm, str(file)])
+    done = CliRunner().invoke(runs.app, ["simulate", served.arm, str(file)])
     assert done.exit_code == 0, done.output
     told = ("theta [rad]: 601 samples", "overshoot of the reference: ", "settling time (2 %): 1.")
     for part in (*told, "stored as"):
         assert part in done.output
-    raw = CliRunner().invoke(program.app, ["simulate", served.arm, str(file), "--json"])
+    raw = CliRunner().invoke(runs.app, ["simulate", served.arm, str(file), "--json"])
     assert json.loads(raw.output)["metrics"]["output"] == "theta"
 
 

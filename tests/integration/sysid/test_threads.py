@@ -75,9 +75,9 @@ sys.argv = ["lagid", "--help"]
 try:
     main()
 except SystemExit:
-    from sysid.core.threads import _libraries
+    from sysid.core.threads import _load_libraries
 
-    print([library.threads() for library in _libraries()], file=sys.stderr)
+    print([library.get_threads() for library in _load_libraries()], file=sys.stderr)
 """
 
 

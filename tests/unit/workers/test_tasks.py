@@ -182,12 +182,12 @@ def interrupts() -> Iterator[None]:
 @pytest.mark.parametrize(
     "part",
     [
-        "conclude.refine",
-        "conclude.analyse",
-        "conclude.residual_tests",
-        "conclude.onset_delays",
-        "generalised_least_squares._correlation_times",
-        "generalised_least_squares._proposals",
+        "conclude.refine_candidates",
+        "conclude.analyse_estimate",
+        "conclude.run_residual_tests",
+        "conclude.estimate_onset_delays",
+        "generalised_least_squares._estimate_correlation_times",
+        "generalised_least_squares._draw_starts",
     ],
 )
 def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_later_one(

@@ -6,8 +6,7 @@ import httpx
 import pytest
 import typer
 
-from service.cli import identify, sweeps
-from service.cli import runs as exporting
+from service.cli import identify, runs, sweeps
 from service.cli.common import FieldOrigins, file_origins, report_faults
 from service.client.calls import NotFinite, ProblemError
 from service.client.client import Client
@@ -129,7 +128,7 @@ def test_a_refused_export_is_told_at_its_option(
     fault = {"pointer": "?format", "detail": "'control' is not possible: a**3"}
     answer = httpx.Response(422, json={"title": "refused", "errors": [fault]})
     client = Client(transport=httpx.MockTransport(lambda _: answer))
-    monkeypatch.setattr(exporting, "connect_client", lambda *_: client)
+    monkeypatch.setattr(runs, "connect_client", lambda *_: client)
     with pytest.raises(typer.Exit):
-        exporting.export_model("run_1", "control")
+        runs.export_model("run_1", "control")
     assert capsys.readouterr().err == "lagid: --format: 'control' is not possible: a**3\n"

@@ -30,11 +30,11 @@ def test_identify_imports_nothing_that_it_does_not_need(tmp_path: Path) -> None:
 SHORT = """
 import sys
 import numpy as np
-from sysid.residuals.autocorrelation import laid_out
-from sysid.residuals.restricted_likelihood import modelled
+from sysid.residuals.autocorrelation import space_residuals
+from sysid.residuals.restricted_likelihood import fit_noise_colour
 
 walk = np.cumsum(np.random.default_rng(0).standard_normal(60))
-assert modelled(laid_out(np.arange(60.0), walk), np.ones((60, 1))) is not None
+assert fit_noise_colour(space_residuals(np.arange(60.0), walk), np.ones((60, 1))) is not None
 print("scipy.signal" in sys.modules)
 """
 

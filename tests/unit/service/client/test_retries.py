@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.client import async_client as asynchronous
+from service.client import async_client
 from service.client import client as synchronous
 from service.client.async_client import AsyncClient
 from service.client.calls import ProblemError, ServerUnreachable
@@ -47,7 +47,7 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     # In the clients alone: threads of other tests may sleep meanwhile.
     monkeypatch.setattr(synchronous, "time", SimpleNamespace(sleep=pauses.append))
-    monkeypatch.setattr(asynchronous, "asyncio", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(async_client, "asyncio", SimpleNamespace(sleep=sleep))
     return pauses
 
 

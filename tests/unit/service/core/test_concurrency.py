@@ -5,7 +5,7 @@ from threading import BoundedSemaphore, Event, Semaphore
 
 import pytest
 
-from service.core import concurrency as module
+from service.core import concurrency
 from service.core.concurrency import ConcurrencyLimit
 from service.core.errors import ServiceBusy
 
@@ -23,7 +23,7 @@ def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
                 asked.release()
             return super().acquire(blocking, timeout)
 
-    monkeypatch.setattr(module, "BoundedSemaphore", Told)
+    monkeypatch.setattr(concurrency, "BoundedSemaphore", Told)
     turns, begun, ended = (
         ConcurrencyLimit(at_once=2, waiting=1),
         [Event(), Event(), Event()],

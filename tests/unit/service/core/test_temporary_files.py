@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from sysid.core import machine
 from workers import local_ray, ray_folders
 from workers.errors import ClusterUnavailable
@@ -31,15 +31,15 @@ def ended() -> int:
 def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", LEAVE, f"{tmp_path}/"], check=True, timeout=60)
     assert len(list(tmp_path.iterdir())) == 1
-    mine = tmp_path / f"{temporary.make_temporary_prefix()}file"
+    mine = tmp_path / f"{temporary_files.make_temporary_prefix()}file"
     mine.touch()
     other = tmp_path / "lagid-tmp-another-host-1-file"
     other.touch()
-    temporary.remove_leftovers(tmp_path)
+    temporary_files.remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {mine.name, other.name}
-    old = 2 * temporary.STALE_SECONDS
+    old = 2 * temporary_files.STALE_SECONDS
     os.utime(other, (other.stat().st_mtime - old, other.stat().st_mtime - old))
-    temporary.remove_leftovers(tmp_path)
+    temporary_files.remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]
 
 
@@ -48,7 +48,7 @@ def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
 ) -> None:
     gone = tmp_path / "lagid-tmp-another-host-1-file"
     monkeypatch.setattr(Path, "glob", lambda *_: [gone])
-    temporary.remove_leftovers(tmp_path)
+    temporary_files.remove_leftovers(tmp_path)
 
 
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
@@ -59,14 +59,14 @@ def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_fold
         there.setattr(machine, "read_machine_id", lambda: ELSEWHERE)
         there.setattr(os, "getpid", lambda: ended)
         theirs = [
-            tmp_path / f"{temporary.make_temporary_prefix()}file",
+            tmp_path / f"{temporary_files.make_temporary_prefix()}file",
             ray_folders.get_ray_folder(ended),
         ]
     for path in theirs:
         path.mkdir()
     gone = ray_folders.get_ray_folder(ended)
     gone.mkdir()
-    temporary.remove_leftovers(tmp_path)
+    temporary_files.remove_leftovers(tmp_path)
     ray_folders.clear_dead_dispatchers()
     assert set(tmp_path.iterdir()) == set(theirs)
 
@@ -75,7 +75,7 @@ def test_files_of_a_process_whose_number_another_has_by_now_go(tmp_path: Path) -
     number = os.getpid()
     former = tmp_path / f"lagid-tmp-{machine.make_machine_tag()}-{number}-1-file"
     former.touch()
-    temporary.remove_leftovers(tmp_path)
+    temporary_files.remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.dispatch import fitted_signals as signals
+from service.dispatch import fitted_signals
 from service.dispatch.fitted_signals import SignalsBatch, SignalsLocation
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import StoredObject
@@ -25,8 +25,8 @@ class FullStore:
 
 @pytest.fixture(autouse=True)
 def no_patience(monkeypatch):
-    monkeypatch.setattr(signals, "RETRY_SECONDS", -1.0)
-    monkeypatch.setattr(signals, "RETRY_PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(fitted_signals, "RETRY_SECONDS", -1.0)
+    monkeypatch.setattr(fitted_signals, "RETRY_PAUSE_SECONDS", 0.0)
 
 
 class MemoryStore:
@@ -87,7 +87,7 @@ def test_files_that_wait_together_are_one_object(store):
 
 
 def test_no_more_is_kept_in_memory_than_a_parcel(store, monkeypatch):
-    monkeypatch.setattr(signals, "UPLOAD_BYTES", 10)
+    monkeypatch.setattr(fitted_signals, "UPLOAD_BYTES", 10)
     shelf = SignalsBatch(store)
     small, large = shelf.add_file(b"12345"), shelf.add_file(b"1234567890")
     assert store.get(small.store_file().sha256) == b"123451234567890"
@@ -126,7 +126,7 @@ class RecoveringStore(MemoryStore):
 
 
 def test_a_store_that_is_full_for_a_while_is_waited_for(monkeypatch):
-    monkeypatch.setattr(signals, "RETRY_SECONDS", 60.0)
+    monkeypatch.setattr(fitted_signals, "RETRY_SECONDS", 60.0)
     store = RecoveringStore(5)
     shelf = SignalsBatch(store)
     first, second = shelf.add_file(b"first"), shelf.add_file(b"second")
@@ -140,7 +140,7 @@ def test_a_store_that_stays_full_is_waited_for_once_until_it_takes_something(
     shelf = SignalsBatch(store)
     with pytest.raises(ObjectStoreFailed):
         shelf.add_file(b"lost").store_file()
-    monkeypatch.setattr(signals, "RETRY_SECONDS", 60.0)
+    monkeypatch.setattr(fitted_signals, "RETRY_SECONDS", 60.0)
     before = store.left
     with pytest.raises(ObjectStoreFailed):
         shelf.add_file(b"lost too").store_file()
@@ -152,7 +152,7 @@ def test_a_store_that_stays_full_is_waited_for_once_until_it_takes_something(
 def test_a_store_that_stays_full_is_waited_for_by_one_job_of_many(monkeypatch):
     full = FullStore()
     for place in range(1, 5):
-        monkeypatch.setattr(signals, "RETRY_SECONDS", -1.0 if place == 1 else 0.2)
+        monkeypatch.setattr(fitted_signals, "RETRY_SECONDS", -1.0 if place == 1 else 0.2)
         with pytest.raises(ObjectStoreFailed):
             SignalsBatch(full).add_file(b"of another job").store_file()
         assert full.asked == place

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.figures import plotly as figures
-from service.figures import signals as figures_signals
+from service.figures import plotly, signals
 from service.figures.data import (
     ExperimentTraces,
     FreeParameter,
@@ -60,17 +59,17 @@ def experiment(samples: int, since: float | None = None) -> ExperimentTraces:
     return ExperimentTraces("record 1", outputs, (signal(samples, "u"),), since)
 
 
-def drawn(figure: figures.Figure, name: str) -> dict[str, object]:
+def drawn(figure: plotly.Figure, name: str) -> dict[str, object]:
     return next(trace for trace in figure["data"] if trace.get("name") == name)
 
 
 @pytest.mark.parametrize(
     "figure",
     [
-        figures.plot_history,
-        figures.plot_convergence,
-        figures.plot_correlation,
-        figures.plot_waterfall,
+        plotly.plot_history,
+        plotly.plot_convergence,
+        plotly.plot_correlation,
+        plotly.plot_waterfall,
     ],
 )
 @pytest.mark.parametrize("evidence", [run(), RunFigureData("run_0", "V")], ids=["full", "empty"])
@@ -79,7 +78,7 @@ def test_every_figure_is_json_without_nan(figure, evidence) -> None:  # type: ig
 
 
 def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
-    figure = figures.plot_history(run())
+    figure = plotly.plot_history(run())
     lines = [trace for trace in figure["data"] if trace["mode"] == "lines"]
     assert [line["name"] for line in lines] == ["island 1", "island 2"]
     assert figure["layout"]["yaxis"]["type"] == "log"
@@ -87,7 +86,7 @@ def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
 
 
 def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
-    for draw in (figures.plot_history, figures.plot_waterfall):
+    for draw in (plotly.plot_history, plotly.plot_waterfall):
         assert draw(replace(run(), unit="1"))["layout"]["yaxis"]["title"]["text"] == "RMS"
 
 
@@ -95,41 +94,41 @@ def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
 def test_digits_of_a_log_axis_do_not_lie_upon_each_other(
     smallest: float, digits: str | None
 ) -> None:
-    axis = figures.plot_waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
+    axis = plotly.plot_waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
     assert axis.get("dtick") == digits
 
 
 def test_a_history_line_goes_on_to_the_last_generation_at_its_last_value() -> None:
-    line = drawn(figures.plot_history(run()), "island 2")
+    line = drawn(plotly.plot_history(run()), "island 2")
     assert line["x"][-1] == 400
     assert line["y"][-1] == line["y"][-2]
 
 
 def test_a_history_over_evaluations_has_the_evaluations_as_abscissa() -> None:
-    figure = figures.plot_history(run(), "evaluations")
+    figure = plotly.plot_history(run(), "evaluations")
     assert drawn(figure, "island 1")["x"][:3] == [0, 50, 100]
     assert figure["layout"]["shapes"] == []
 
 
 def test_the_phases_of_a_history_are_marked_where_they_improved() -> None:
-    marks = drawn(figures.plot_history(run()), "sequence")
+    marks = drawn(plotly.plot_history(run()), "sequence")
     assert marks["x"] == [4, 9, 14, 19, 24, 29, 4, 9, 14, 19]
 
 
 def test_migrations_stand_at_the_end_of_their_epochs() -> None:
-    shapes = figures.plot_history(run())["layout"]["shapes"]
+    shapes = plotly.plot_history(run())["layout"]["shapes"]
     assert [shape["x0"] for shape in shapes] == [25, 50, 75]
 
 
 @pytest.mark.parametrize("points", [999, 1000, 1001, 50_000])
 def test_no_line_of_a_history_or_convergence_has_over_a_thousand_points(points: int) -> None:
     evidence = run(history=[island(points)], generations=10 * points)
-    for figure in (figures.plot_history(evidence), figures.plot_convergence(evidence)):
+    for figure in (plotly.plot_history(evidence), plotly.plot_convergence(evidence)):
         assert all(len(trace["x"]) <= MAX_POINTS for trace in figure["data"])
 
 
 def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error() -> None:
-    figure = figures.plot_convergence(run())
+    figure = plotly.plot_convergence(run())
     low, high = figure["layout"]["yaxis"]["range"]
     assert low < 0.0 < 0.5 < high
     assert [shape["y0"] for shape in figure["layout"]["shapes"]] == [0.0, 0.5]
@@ -138,7 +137,7 @@ def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error()
 
 def test_a_parameter_over_decades_has_a_log_axis() -> None:
     sought = FreeParameter("T", "s", 0.01, 100.0, "log")
-    axis = figures.plot_convergence(run(parameters=[sought]))["layout"]["yaxis"]
+    axis = plotly.plot_convergence(run(parameters=[sought]))["layout"]["yaxis"]
     assert axis["type"] == "log"
     assert axis["range"][0] < -2 < 2 < axis["range"][1]
 
@@ -148,7 +147,7 @@ def test_a_parameter_over_decades_has_a_log_axis() -> None:
 def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, columns: int) -> None:
     sought = [FreeParameter(f"p{n}", "1", 0.0, 1.0) for n in range(count)]
     history = [[IslandImprovement(0, 0, 1.0, "start", (0.5,) * count)]]
-    layout = figures.plot_convergence(run(parameters=sought, history=history), columns)["layout"]
+    layout = plotly.plot_convergence(run(parameters=sought, history=history), columns)["layout"]
     boxes = []
     for n in range(count):
         axis = "" if n == 0 else str(n + 1)
@@ -162,29 +161,29 @@ def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, col
 
 
 def test_the_waterfall_puts_the_best_island_first() -> None:
-    after = drawn(figures.plot_waterfall(run()), "after refinement")
+    after = drawn(plotly.plot_waterfall(run()), "after refinement")
     assert after["text"] == ["island 2", "island 1", "island 3"]
     assert after["y"] == [1.0, 1.1, None]
 
 
 def test_a_response_shows_measured_minus_identified_as_residual() -> None:
-    figure = figures_signals.plot_response(experiment(50))
+    figure = signals.plot_response(experiment(50))
     assert drawn(figure, "residual")["y"] == [-0.5] * 50
 
 
 def test_every_row_of_a_response_has_the_same_time_axis() -> None:
-    figure = figures_signals.plot_response(experiment(50))
+    figure = signals.plot_response(experiment(50))
     assert all("xaxis" not in trace for trace in figure["data"])
     assert {trace["yaxis"] for trace in figure["data"]} == {"y", "y2", "y3"}
 
 
 def test_validation_is_shaded_from_its_first_sample_to_the_last() -> None:
-    shape = figures_signals.plot_response(experiment(100, since=0.7))["layout"]["shapes"][0]
+    shape = signals.plot_response(experiment(100, since=0.7))["layout"]["shapes"][0]
     assert (shape["x0"], shape["x1"]) == (0.7, 0.99)
 
 
 def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
-    shape = figures_signals.plot_response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
+    shape = signals.plot_response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
     assert shape["x0"] == 0.0
 
 
@@ -195,20 +194,20 @@ def before_record(name: str, known: SignalTrace) -> ExperimentTraces:
 def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it() -> None:
     times = np.arange(-50, 0) * 0.01
     record = before_record("u", SignalTrace("u", "V", times, np.cos(times)))
-    trace = drawn(figures_signals.plot_response(record), "u, before the record")
+    trace = drawn(signals.plot_response(record), "u, before the record")
     assert trace["x"] == pytest.approx(times[-9:])
-    assert trace["yaxis"] == drawn(figures_signals.plot_response(record), "u")["yaxis"]
+    assert trace["yaxis"] == drawn(signals.plot_response(record), "u")["yaxis"]
     assert trace["line"]["dash"] == "dot"  # type: ignore[index]
-    whole = drawn(figures_signals.plot_signals(record.inputs), "u, before the record")
+    whole = drawn(signals.plot_signals(record.inputs), "u, before the record")
     assert whole["x"] == pytest.approx(times)
-    names = [one["name"] for one in figures_signals.plot_response(experiment(100))["data"]]
+    names = [one["name"] for one in signals.plot_response(experiment(100))["data"]]
     assert not any("before the record" in name for name in names)
 
 
 def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
     record = experiment(20_000)
-    whole = figures_signals.plot_response(record)
-    part = figures_signals.plot_response(record, 50.0, 53.0)
+    whole = signals.plot_response(record)
+    part = signals.plot_response(record, 50.0, 53.0)
     assert all(len(trace["x"]) <= MAX_POINTS for trace in whole["data"])
     assert whole["layout"]["meta"]["thinned"]
     inside = [x for x in drawn(part, "measured")["x"] if 50.0 <= x <= 53.0]
@@ -218,33 +217,29 @@ def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
 def test_pooled_samples_are_drawn_as_points() -> None:
     times = np.repeat(np.arange(500) * 0.01, 4)
     output = OutputTraces(SignalTrace("y", "1", times, times), times)
-    figure = figures_signals.plot_response(ExperimentTraces("record 1", (output,), ()))
+    figure = signals.plot_response(ExperimentTraces("record 1", (output,), ()))
     assert drawn(figure, "measured")["mode"] == "markers"
 
 
 def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
-    assert figures_signals.plot_response(experiment(9))["layout"][
+    assert signals.plot_response(experiment(9))["layout"]["height"] == signals.response_height(1, 1)
+    assert signals.plot_signals([signal(9), signal(9)])["layout"][
         "height"
-    ] == figures_signals.response_height(1, 1)
-    assert figures_signals.plot_signals([signal(9), signal(9)])["layout"][
-        "height"
-    ] == figures_signals.signals_height(2)
-    assert figures.plot_convergence(run(), 3)["layout"]["height"] == figures.convergence_height(
-        1, 3
-    )
-    assert figures.plot_correlation(run())["layout"]["height"] == figures.correlation_height(2)
+    ] == signals.signals_height(2)
+    assert plotly.plot_convergence(run(), 3)["layout"]["height"] == plotly.convergence_height(1, 3)
+    assert plotly.plot_correlation(run())["layout"]["height"] == plotly.correlation_height(2)
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
-    lines = figures.to_csv(figures_signals.plot_signals([signal(3, "a,b")])).splitlines()
+    lines = plotly.to_csv(signals.plot_signals([signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
-    assert figures.to_csv(figures.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
+    assert plotly.to_csv(plotly.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
 
 
 def test_a_figure_in_the_dark_has_the_same_data() -> None:
-    light = figures.plot_history(run())
-    dark = figures.apply_theme(light, "dark")
+    light = plotly.plot_history(run())
+    dark = plotly.apply_theme(light, "dark")
     assert dark["data"] == light["data"]
     assert dark["layout"]["template"] != light["layout"]["template"]
 
@@ -282,7 +277,7 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
     assert window_slice(times, -5.0, 50.0) == slice(0, 10)
 
 
-@pytest.mark.parametrize("draw", [figures.plot_history, figures.plot_waterfall])
+@pytest.mark.parametrize("draw", [plotly.plot_history, plotly.plot_waterfall])
 def test_a_robust_loss_is_not_called_the_rms(draw):
     robust = fitness_label({"loss": {"kind": "soft-l1", "scale": 0.1}})
     shown = draw(run(fitness=robust))["layout"]["yaxis"]["title"]["text"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.core.text import format_p_value
-from service.figures import plotly as figures
+from service.figures import plotly
 from service.figures.data import CorrelationTrace
 from service.figures.residuals import plot_residuals, residuals_height
 from service.pages.diagnostics import to_diagnostics
@@ -77,7 +77,7 @@ def test_the_axis_says_what_a_lag_is() -> None:
 def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
     figure = plot_residuals([trace(), trace(is_auto=False)])
     json.dumps(figure, allow_nan=False)
-    rows = figures.to_csv(figure).splitlines()
+    rows = plotly.to_csv(figure).splitlines()
     assert rows[0] == "series,x,y"
     assert sum(row.startswith("of y,") for row in rows) == 25 + 51
 

@@ -10,7 +10,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from service.formats import mcap_writer as mcap_file
+from service.formats import mcap_writer
 from service.formats.mcap import (
     FittedOutput,
     read_fitted_outputs,
@@ -38,7 +38,7 @@ def two_bases() -> Recording:
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_file, "CHUNK_SAMPLES", 16)
+    monkeypatch.setattr(mcap_writer, "CHUNK_SAMPLES", 16)
 
 
 @pytest.mark.usefixtures("small_chunks")

@@ -5,8 +5,7 @@ import pytest
 
 from service.datasets.schemas import SimulateIn
 from service.jobs.schemas import JobIn
-from service.paper import figures, noise, oscillators, published, study
-from service.paper import force_noise as forces
+from service.paper import figures, force_noise, noise, oscillators, published, study
 from service.paper.bench import ArchipelagoImprovement, MethodRun, champion_history
 from service.paper.cramer_rao import cramer_rao_bound
 from service.paper.document import Check, ReportTable, Section, to_markdown
@@ -161,17 +160,18 @@ def test_a_line_of_convergence_reaches_the_last_generation() -> None:
 def test_the_noise_enters_the_recursion_as_a_force_or_as_printed() -> None:
     known = copy_catalogue_document("duffing-eq16")
     force, printed = (
-        str(forces.model_document(known, kind)["equations"]["x"]) for kind in forces.NOISE_TERMS
+        str(force_noise.model_document(known, kind)["equations"]["x"])
+        for kind in force_noise.NOISE_TERMS
     )
     assert force.endswith("- q(k-2) - sigma*phi(k-2))/m")  # h² and 1/m stand before the bracket
     assert printed.endswith("- q(k-2))/m + sigma*phi(k-2)")
-    for kind in forces.NOISE_TERMS:
-        model = parse_model(forces.model_document(known, kind))
+    for kind in force_noise.NOISE_TERMS:
+        model = parse_model(force_noise.model_document(known, kind))
         assert [one.name for one in model.inputs] == ["q", "phi"]
 
 
 def test_a_recursion_without_that_place_for_noise_is_refused() -> None:
     with pytest.raises(ValueError, match="no 'q"):
-        forces.model_document(
+        force_noise.model_document(
             {**copy_catalogue_document("duffing-eq16"), "equations": {"x": "x(k-1)"}}, "force"
         )

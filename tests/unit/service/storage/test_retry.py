@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 
-from service.storage import retry as patience
+from service.storage import retry
 from service.storage.sessions import Database, make_sqlite_url
 
 
@@ -17,7 +17,7 @@ def away() -> OperationalError:
 
 
 def test_work_is_tried_until_the_database_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(retry, "PAUSE_SECONDS", 0.0)
     troubles = [away(), away()]
 
     def work() -> str:
@@ -25,18 +25,18 @@ def test_work_is_tried_until_the_database_is_back(monkeypatch: pytest.MonkeyPatc
             raise troubles.pop()
         return "done"
 
-    assert patience.retry_transient(work) == "done"
+    assert retry.retry_transient(work) == "done"
 
 
 def test_a_database_that_does_not_come_back_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "PAUSE_SECONDS", 0.0)
-    monkeypatch.setattr(patience, "GIVE_UP_SECONDS", 0.0)
+    monkeypatch.setattr(retry, "PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(retry, "GIVE_UP_SECONDS", 0.0)
 
     def work() -> None:
         raise away()
 
     with pytest.raises(OperationalError):
-        patience.retry_transient(work)
+        retry.retry_transient(work)
 
 
 def test_a_fault_of_the_statement_is_not_tried_again() -> None:
@@ -47,7 +47,7 @@ def test_a_fault_of_the_statement_is_not_tried_again() -> None:
         raise IntegrityError("INSERT", {}, Exception("duplicate"))
 
     with pytest.raises(IntegrityError):
-        patience.retry_transient(work)
+        retry.retry_transient(work)
     assert len(tries) == 1
 
 
@@ -73,7 +73,7 @@ def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
 ) -> None:
     mistake = raised(database, "SELECT nothing FROM nowhere")
     assert isinstance(mistake, OperationalError)
-    assert not patience.is_transient(mistake)
+    assert not retry.is_transient(mistake)
     tries = []
 
     def work() -> None:
@@ -81,7 +81,7 @@ def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
         raise mistake
 
     with pytest.raises(OperationalError):
-        patience.retry_transient(work)
+        retry.retry_transient(work)
     assert len(tries) == 1
 
 
@@ -90,9 +90,9 @@ def test_a_locked_file_and_one_that_cannot_be_opened_may_pass(
 ) -> None:
     with database.write_session() as session:
         session.execute(text("SELECT 1"))  # a transaction begins with its first statement
-        assert patience.is_transient(raised(database, "SELECT 1"))
+        assert retry.is_transient(raised(database, "SELECT 1"))
     other = Database(make_sqlite_url(tmp_path / "absent" / "a.db"))
-    assert patience.is_transient(raised(other, "SELECT 1"))
+    assert retry.is_transient(raised(other, "SELECT 1"))
     other.dispose()
 
 
@@ -104,7 +104,7 @@ def test_a_disk_that_is_full_may_pass(database: Database) -> None:
         with pytest.raises(OperationalError) as caught:
             session.execute(text("INSERT INTO t VALUES (zeroblob(100000))"))
         session.rollback()
-    assert patience.is_transient(caught.value)
+    assert retry.is_transient(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -124,9 +124,9 @@ def test_a_disk_that_is_full_may_pass(database: Database) -> None:
 def test_postgresql_tells_by_its_state_whether_an_error_may_pass(
     cause: psycopg.Error, passes: bool
 ) -> None:
-    assert patience.is_transient(OperationalError("SELECT 1", {}, cause)) is passes
+    assert retry.is_transient(OperationalError("SELECT 1", {}, cause)) is passes
 
 
 def test_a_value_that_sqlite_cannot_take_does_not_pass() -> None:
     cause = sqlite3.InterfaceError("Error binding parameter")
-    assert not patience.is_transient(InterfaceError("SELECT ?", {}, cause))
+    assert not retry.is_transient(InterfaceError("SELECT ?", {}, cause))

@@ -18,22 +18,21 @@ from numba.core.compiler import CompileResult
 from numba.core.runtime import nrt
 from packaging.requirements import Requirement
 
-from sysid.core import code_cache as keeping
-from sysid.core import jit as caching
+from sysid.core import code_cache, jit
 
-ROOT = Path(caching.__file__).parents[2]
+ROOT = Path(jit.__file__).parents[2]
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from sysid.core import jit as caching
-caching.fingerprint = lambda: sys.argv[2]
+from sysid.core import jit
+jit.get_sources_digest = lambda: sys.argv[2]
 from module import doubled
 print(doubled(2.0), sum(doubled.stats.cache_hits.values()))
 """
 MODULE = """
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 
-@compiled
+@jit_compile
 def doubled(x):
     return 2.0 * x
 """
@@ -47,13 +46,13 @@ def doubled(x: float) -> float:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and a process that has told nothing yet."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(keeping, "_logged_reasons", [])
+    monkeypatch.setattr(code_cache, "_logged_reasons", [])
     return tmp_path / "cache"
 
 
 def hits() -> int:
     """How often a new copy of the function was found on disk; its result is right anyway."""
-    copy: Any = caching.jit_compile(doubled)
+    copy: Any = jit.jit_compile(doubled)
     assert copy(2.0) == 4.0
     return sum(copy.stats.cache_hits.values())
 
@@ -108,7 +107,7 @@ def what_is_compiled(value: ast.expr) -> ast.expr:
 
 def is_compiled(function: ast.FunctionDef) -> bool:
     marks = {one.id for one in function.decorator_list if isinstance(one, ast.Name)}
-    return bool(marks & {"compiled", "intrinsic"})
+    return bool(marks & {"jit_compile", "intrinsic"})
 
 
 def names_in(node: ast.AST) -> set[str]:
@@ -119,11 +118,11 @@ def names_in(node: ast.AST) -> set[str]:
 
 def test_the_fingerprint_covers_all_that_compiled_functions_take_values_from() -> None:
     package = ROOT / "sysid"
-    covered = {path for pattern in caching._SOURCE_PATTERNS for path in package.glob(pattern)}
+    covered = {path for pattern in jit._SOURCE_PATTERNS for path in package.glob(pattern)}
     frozen = frozen_by_compiled(package.rglob("*.py"))
     assert {package / "kernels" / "layout.py", package / "search" / "state.py"} <= frozen
     assert frozen <= covered
-    assert len(caching.get_sources_digest()) == 64
+    assert len(jit.get_sources_digest()) == 64
 
 
 @pytest.mark.slow
@@ -177,7 +176,7 @@ def test_what_was_loaded_is_taken_into_what_is_compiled_with_it(folder: Path) ->
         return 3.0 * x + inner(x)
 
     for loaded in (0, 1):
-        inner: Any = caching.jit_compile(doubled)
+        inner: Any = jit.jit_compile(doubled)
         assert inner(2.0) == 4.0
         assert sum(inner.stats.cache_hits.values()) == loaded
         outer: Any = numba.njit(tripled)
@@ -208,7 +207,7 @@ def test_what_is_whole_but_no_compiled_function_is_replaced(folder: Path) -> Non
     hits()
     (path,) = folder.iterdir()
     for content in (b"", b"no pickle", b"\x80\x04]\x94."):
-        keeping.store_code(path.stem, content, "loop")
+        code_cache.store_code(path.stem, content, "loop")
         assert [hits(), hits()] == [0, 1]
 
 
@@ -288,18 +287,18 @@ def test_a_function_of_numba_that_has_no_cache_works(
         def __call__(self, x: float) -> float:
             return self.call(x)
 
-    monkeypatch.setattr(keeping, "_logged_reasons", [])
+    monkeypatch.setattr(code_cache, "_logged_reasons", [])
     monkeypatch.setattr(numba, "njit", lambda **_: Plain)
-    assert caching.jit_compile(doubled)(2.0) == 4.0
+    assert jit.jit_compile(doubled)(2.0) == 4.0
     assert len(caplog.records) == 1
 
 
 def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeping, "_MAX_FILES", 2)
+    monkeypatch.setattr(code_cache, "_MAX_FILES", 2)
     folder.mkdir(mode=0o700)
     (folder / "a letter.o").write_text("somebody else's")
     for number in range(4):
-        keeping.store_code(f"{number:064x}", b"code", "loop")
+        code_cache.store_code(f"{number:064x}", b"code", "loop")
         os.utime(folder / f"{number:064x}.loop", ns=(number, number))
     kept = sorted(one.name for one in folder.iterdir())
     assert kept == [f"{2:064x}.loop", f"{3:064x}.loop", "a letter.o"]
@@ -308,22 +307,22 @@ def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch
 def test_what_is_used_stays_longer_than_what_is_newer(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keeping, "_MAX_FILES", 2)
+    monkeypatch.setattr(code_cache, "_MAX_FILES", 2)
     for number in range(2):
-        keeping.store_code(f"{number:064x}", b"code", "loop")
+        code_cache.store_code(f"{number:064x}", b"code", "loop")
         os.utime(folder / f"{number:064x}.loop", ns=(number, number))
-    assert keeping.load_code(f"{0:064x}", "loop") == b"code"
-    keeping.store_code(f"{2:064x}", b"code", "loop")
+    assert code_cache.load_code(f"{0:064x}", "loop") == b"code"
+    code_cache.store_code(f"{2:064x}", b"code", "loop")
     assert sorted(one.name for one in folder.iterdir()) == [f"{0:064x}.loop", f"{2:064x}.loop"]
 
 
 def test_files_that_another_process_removes_meanwhile_are_no_fault(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(keeping, "_MAX_FILES", 1)
-    monkeypatch.setattr(keeping, "_logged_reasons", [])
+    monkeypatch.setattr(code_cache, "_MAX_FILES", 1)
+    monkeypatch.setattr(code_cache, "_logged_reasons", [])
     for number in range(2):
-        keeping.store_code(f"{number:064x}", b"code", "loop")
+        code_cache.store_code(f"{number:064x}", b"code", "loop")
     listed = os.scandir
 
     def outrun(at: Path) -> list[os.DirEntry[str]]:
@@ -332,8 +331,8 @@ def test_files_that_another_process_removes_meanwhile_are_no_fault(
             os.unlink(one.path)
         return found
 
-    monkeypatch.setattr(keeping.os, "scandir", outrun)
-    keeping.store_code(f"{2:064x}", b"code", "loop")
+    monkeypatch.setattr(code_cache.os, "scandir", outrun)
+    code_cache.store_code(f"{2:064x}", b"code", "loop")
     assert not caplog.records
 
 
@@ -361,8 +360,8 @@ def test_numba_is_bounded_where_its_insides_are_known() -> None:
 
 WARM = """
 import sys
-from sysid.identification.warmup import warm_up
-warm_up()
+from sysid.identification.warmup import compile_search
+compile_search()
 loaded = ("numba.np.arraymath", "numba.np.npyimpl", "scipy.linalg")
 print([name for name in loaded if name in sys.modules])
 """

@@ -8,7 +8,7 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identifiability import subsystems as sections
+from sysid.identifiability import subsystems
 from sysid.identifiability.exchange import (
     ExchangeGroups,
     describe_exchanges,
@@ -187,18 +187,18 @@ START = {"lower": -2, "upper": 2}
 
 
 def beside(
-    sections: str = "xy", records: int = 1, written: dict[str, str] | None = None, **changed: Any
+    subsystems: str = "xy", records: int = 1, written: dict[str, str] | None = None, **changed: Any
 ) -> Problem:
     """First orders side by side, each with its own gain, time constant and start."""
     document = {
         "name": "beside",
         "form": "differential",
         "inputs": {"u": "V"},
-        "states": dict.fromkeys(sections, "m"),
-        "parameters": {f"K{s}": GAIN for s in sections} | {f"T{s}": SPAN for s in sections},
-        "equations": {s: f"(K{s}*u - {s})/T{s}" for s in sections} | (written or {}),
-        "outputs": {"z": "0 + " + " + ".join(sections)},
-        "initial": dict.fromkeys(sections, START),
+        "states": dict.fromkeys(subsystems, "m"),
+        "parameters": {f"K{s}": GAIN for s in subsystems} | {f"T{s}": SPAN for s in subsystems},
+        "equations": {s: f"(K{s}*u - {s})/T{s}" for s in subsystems} | (written or {}),
+        "outputs": {"z": "0 + " + " + ".join(subsystems)},
+        "initial": dict.fromkeys(subsystems, START),
     }
     document["parameters"] |= changed
     return Problem.build(parse_model(document), [recorded("in series")] * records)
@@ -273,14 +273,14 @@ def test_sums_of_names_that_fit_either_way_round_are_not_all_tried(
     ]
     written = {"x": product("x", 1), "y": product("y", 2)}
     posed = beside(written=written, **dict.fromkeys(names, SPAN))
-    apart, looked_at = sections._split_expression, []
+    apart, looked_at = subsystems._split_expression, []
 
     def counted(tree: Expression) -> Any:
         looked_at.append(tree)
         return apart(tree)
 
-    monkeypatch.setattr(sections, "_split_expression", counted)
-    assert list(sections.find_equivalent_subsystems(posed)) == []
+    monkeypatch.setattr(subsystems, "_split_expression", counted)
+    assert list(subsystems.find_equivalent_subsystems(posed)) == []
     assert len(looked_at) < 10_000
 
 

@@ -55,7 +55,9 @@ def test_grace_is_neither_nothing_nor_without_end() -> None:
 def test_least_squares_that_is_late_ends_between_its_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = example()
     whole = refine_candidates(problem, [NEAR])[0]
-    monkeypatch.setattr(least_squares, "_AT_ONCE", problem.n_steps * (4 + N_TRIED))  # a step a call
+    monkeypatch.setattr(
+        least_squares, "_STEPS_PER_CALL", problem.n_steps * (4 + N_TRIED)
+    )  # a step a call
     [first] = refine_candidates(problem, [NEAR], None, asked(0))
     [second] = refine_candidates(problem, [NEAR], None, asked(1))
     never = refine_candidates(problem, [NEAR], None, asked(10**6))[0]
@@ -84,7 +86,9 @@ def test_a_run_that_is_late_has_a_whole_result_that_tells_what_was_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = example()
-    monkeypatch.setattr(least_squares, "_AT_ONCE", problem.n_steps * (4 + N_TRIED))  # a step a call
+    monkeypatch.setattr(
+        least_squares, "_STEPS_PER_CALL", problem.n_steps * (4 + N_TRIED)
+    )  # a step a call
     state = advance_run(problem, LIMITED, begin_run(problem, LIMITED, 1))
     in_time = conclude_run(problem, LIMITED, replace(state, seconds=0.0), clock=lambda: 0.0)
     late = conclude_run(problem, LIMITED, replace(state, seconds=1e9), clock=lambda: 0.0)

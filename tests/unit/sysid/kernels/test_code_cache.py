@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid.core import code_cache as keeping
-from sysid.kernels import build as compiler
+from sysid.core import code_cache
+from sysid.kernels import build
 from sysid.kernels.layout import KernelVariant
 from sysid.simulation.problem import Problem
 from tests.models import difference, duffing, individuals, record
@@ -16,10 +16,10 @@ from tests.models import difference, duffing, individuals, record
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and a process that has loaded no kernel."""
-    loops = os.environ.get("NUMBA_CACHE_DIR") or str(keeping.find_cache_folder())
+    loops = os.environ.get("NUMBA_CACHE_DIR") or str(code_cache.find_cache_folder())
     monkeypatch.setenv("NUMBA_CACHE_DIR", loops)  # these are not what is looked at here
     monkeypatch.setenv("LAGID_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(compiler, "_kernel_addresses", {})
+    monkeypatch.setattr(build, "_kernel_addresses", {})
     return tmp_path / "cache"
 
 
@@ -37,8 +37,8 @@ def test_a_kernel_is_compiled_once_and_found_again(
 ) -> None:
     first = fitness()
     assert len(list(folder.glob("*.o"))) == 1
-    monkeypatch.setattr(compiler, "_kernel_addresses", {})
-    monkeypatch.setattr(compiler, "compile_bounded", refuse)
+    monkeypatch.setattr(build, "_kernel_addresses", {})
+    monkeypatch.setattr(build, "compile_bounded", refuse)
     np.testing.assert_array_equal(fitness(), first)
 
 
@@ -64,11 +64,11 @@ def test_a_damaged_file_is_made_again(
     if damage == "flip":
         content[len(content) // 2] ^= 1
     elif damage == "another kernel":
-        key = compiler.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant())
-        keeping.store_code(key, b"something else")
+        key = build.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant())
+        code_cache.store_code(key, b"something else")
         content = bytearray((folder / f"{key}.o").read_bytes())
     path.write_bytes(bytes({"cut": content[:100], "empty": content[:0]}.get(damage, content)))
-    monkeypatch.setattr(compiler, "_kernel_addresses", {})
+    monkeypatch.setattr(build, "_kernel_addresses", {})
     np.testing.assert_array_equal(fitness(), first)
     assert path.stat().st_size > 1000
 
@@ -84,7 +84,7 @@ def test_without_a_writable_folder_kernels_still_work(
 def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
     model = duffing()
     keys = {
-        compiler.compute_kernel_key(model, KernelVariant(one, soft, grid, weight))
+        build.compute_kernel_key(model, KernelVariant(one, soft, grid, weight))
         for one in (True, False)
         for soft in (True, False)
         for grid in (True, False)
@@ -92,10 +92,8 @@ def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
     }
     assert len(keys) == 16
     narrow = Problem.build(model, [record()], parameters={"c": {"lower": 0.1}}).model
-    assert compiler.compute_kernel_key(narrow, KernelVariant()) in keys
-    assert (
-        compiler.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant()) not in keys
-    )
+    assert build.compute_kernel_key(narrow, KernelVariant()) in keys
+    assert build.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant()) not in keys
 
 
 def test_a_stale_temporary_file_is_left_nowhere(folder: Path) -> None:

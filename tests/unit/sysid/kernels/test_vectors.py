@@ -6,8 +6,7 @@ import pytest
 from sysid import load_model
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.kernels import machine_code as machine
-from sysid.kernels import vectors as lanes
+from sysid.kernels import machine_code, vectors
 from sysid.kernels.vectors import VectorFunctions, load_vector_functions
 from sysid.simulation.problem import Problem
 
@@ -70,13 +69,13 @@ def test_a_lane_does_not_depend_on_its_neighbours() -> None:
 def test_a_machine_without_the_library_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     candidates = np.column_stack([PLACES, PLACES])
     with_library = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
-    monkeypatch.setattr(lanes, "load_vector_functions", lambda: VectorFunctions(1, {}))
-    monkeypatch.setattr(machine, "load_vector_functions", lambda: VectorFunctions(1, {}))
-    machine.describe_machine.cache_clear()
+    monkeypatch.setattr(vectors, "load_vector_functions", lambda: VectorFunctions(1, {}))
+    monkeypatch.setattr(machine_code, "load_vector_functions", lambda: VectorFunctions(1, {}))
+    machine_code.describe_machine.cache_clear()
     try:
         without = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
     finally:
-        machine.describe_machine.cache_clear()
+        machine_code.describe_machine.cache_clear()
     np.testing.assert_allclose(without, with_library, rtol=1e-13)
 
 

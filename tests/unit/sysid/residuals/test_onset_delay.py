@@ -10,7 +10,7 @@ from service.formats.csv_recordings import read_csv
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model
-from sysid.residuals import onset_delay as onset
+from sysid.residuals import onset_delay
 from sysid.residuals.onset_delay import OnsetDelay, estimate_onset_delays, find_unprompted_output
 from tests.repository import ROOT
 
@@ -143,17 +143,17 @@ def test_a_channel_s_noise_is_taken_as_often_for_many_events_as_for_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls: list[int] = []
-    noise = onset._estimate_noise
+    noise = onset_delay._estimate_noise
 
     def counted(values: FloatArray) -> float:
         calls.append(values.size)
         return noise(values)
 
-    monkeypatch.setattr(onset, "_estimate_noise", counted)
+    monkeypatch.setattr(onset_delay, "_estimate_noise", counted)
     counts = []
     for u in (np.where(steps() > 0, 1.0, 0.0), steps()):
         calls.clear()
-        onset._find_cached_rests.cache_clear()  # of what other tests have looked at
+        onset_delay._find_cached_rests.cache_clear()  # of what other tests have looked at
         other = Channel("v", TIMES, np.zeros(TIMES.size))
         assert delays(u, response(TIMES), others=(other,)).events > 0
         counts.append(len(calls))
@@ -167,7 +167,7 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
     y = np.concatenate([np.zeros(lag), u[:-lag]])
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
     (every,) = estimate_onset_delays(load_model("fopdt"), (record,))
-    monkeypatch.setattr(onset, "_MOST_EVENTS", 40)
+    monkeypatch.setattr(onset_delay, "_MOST_EVENTS", 40)
     (some,) = estimate_onset_delays(load_model("fopdt"), (record,))
     assert every.events > 150
     assert 20 < some.events <= 40
@@ -175,7 +175,7 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
 
 
 def test_of_a_square_wave_both_edges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onset, "_MOST_EVENTS", 40)
+    monkeypatch.setattr(onset_delay, "_MOST_EVENTS", 40)
     times, falls = 0.1 * np.arange(79 * 30 + 20), np.arange(79) % 2 == 1
     u, y = np.zeros(times.size), np.zeros(times.size)
     for event, does_fall in enumerate(falls):

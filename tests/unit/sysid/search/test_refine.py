@@ -8,8 +8,7 @@ import pytest
 from sysid.core.settings import Loss
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
-from sysid.search import least_squares
-from sysid.search import refine as refinement
+from sysid.search import least_squares, refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from tests.searching import example, force, noisy, record
@@ -100,7 +99,7 @@ def test_on_long_records_a_compiled_call_makes_few_steps_and_the_bits_are_the_sa
         calls.append(at_once)
         return least_squares.solve_least_squares(*arguments, at_once=at_once, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(refinement, "solve_least_squares", noted)
+    monkeypatch.setattr(refine, "solve_least_squares", noted)
     problem = example()
     whole = refine_candidates(problem, [NEAR])[0]
     monkeypatch.setattr(

@@ -1,0 +1,87 @@
+"""Sentences of documents and messages stay short: readers are engineers in a hurry."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.repository import ROOT
+
+MOST_WORDS, MEAN_WORDS = 25, 16
+DOCUMENTS = sorted(
+    path
+    for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
+    if "notes" not in path.parts
+)
+
+
+def sentences(markdown: str) -> list[str]:
+    """Sentences of prose: without code, tables and headings; an entry of a list is one."""
+    prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
+    prose = re.sub(r"^\s*\|.*$|^#.*$", "", prose, flags=re.MULTILINE)
+    parts = re.split(r"(?<=[.!?:])\s+|\n\s*\n|^\s*(?:[-*]|\d+\.) ", prose, flags=re.MULTILINE)
+    return [part for part in parts if len(part.split()) > 2]
+
+
+def messages(path: Path) -> Iterator[tuple[int, str]]:
+    """Texts of a module that a person may read; a value that is filled in counts as a word."""
+    tree = ast.parse(path.read_text())
+    skipped = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr):
+            skipped.add(node.value)
+        if isinstance(node, ast.JoinedStr):
+            skipped |= {inner for inner in ast.walk(node) if inner is not node}
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        if isinstance(node, ast.JoinedStr):
+            text = "".join(
+                part.value if isinstance(part, ast.Constant) else "X" for part in node.values
+            )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = node.value
+        else:
+            continue
+        if _is_prose(text):
+            yield node.lineno, text
+
+
+def _is_prose(text: str) -> bool:
+    """Whether it is a line of words, and no code, markup or SQL."""
+    return (
+        len(text.split()) >= 6
+        and "\n" not in text
+        and re.search(r"[a-z]{3} [a-z]{2}", text) is not None
+        and re.search(r"<\w+|SELECT |UPDATE |INSERT |CREATE |\{%|= %|; ModuleID", text) is None
+    )
+
+
+def test_a_long_sentence_is_seen() -> None:
+    long = " ".join(["word"] * 26) + "."
+    assert [len(one.split()) for one in sentences(f"# Title\n\nShort one here. {long}\n")] == [
+        3,
+        26,
+    ]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_sentences_of_documents_are_short(path: Path) -> None:
+    lengths = {one: len(one.split()) for one in sentences(path.read_text())}
+    assert {one: count for one, count in lengths.items() if count > MOST_WORDS} == {}
+    if lengths:
+        assert sum(lengths.values()) / len(lengths) <= MEAN_WORDS
+
+
+def test_sentences_of_messages_are_short() -> None:
+    long = [
+        f"{path.relative_to(ROOT)}:{line}: {sentence}"
+        for part in ("sysid", "workers", "service")
+        for path in sorted((ROOT / part).rglob("*.py"))
+        for line, text in messages(path)
+        for sentence in re.split(r"(?<=[.!?])\s+", text)
+        if len(sentence.split()) > MOST_WORDS
+    ]
+    assert long == []
