@@ -213,17 +213,15 @@ class VectorBuilder:
 
     def load_double(self, base: IrValue, index: IrValue) -> IrValue:
         """The double at ``base[index]``."""
-        return self.builder.load_double(self._compute_address(base, index), typ=DOUBLE)
+        return self.builder.load(self._compute_address(base, index), typ=DOUBLE)
 
     def load_integer(self, base: IrValue, index: IrValue) -> IrValue:
         """The whole number at ``base[index]``."""
-        return self.builder.load_double(self._compute_address(base, index), typ=INT)
+        return self.builder.load(self._compute_address(base, index), typ=INT)
 
     def load_row(self, base: IrValue, index: IrValue) -> IrValue:
         """The vector of doubles that begins at ``base[index]``."""
-        return self.builder.load_double(
-            self._compute_address(base, index), typ=self.vector, align=8
-        )
+        return self.builder.load(self._compute_address(base, index), typ=self.vector, align=8)
 
     def store_row(self, value: IrValue, base: IrValue, index: IrValue) -> None:
         """Store a vector of doubles from ``base[index]`` on."""
@@ -247,7 +245,7 @@ class VectorBuilder:
             lane = ir.Constant(_INT32, number)
             start = b.inttoptr(b.extract_element(addresses, lane), ir.PointerType())
             place = b.gep(start, [step], source_etype=ir.IntType(8))
-            found = b.insert_element(found, b.load_double(place, typ=DOUBLE, align=8), lane)
+            found = b.insert_element(found, b.load(place, typ=DOUBLE, align=8), lane)
         return found
 
     def copy_rows(self, base: IrValue, target: IrValue, source: IrValue, doubles: IrValue) -> None:
