@@ -42,7 +42,7 @@ FAULTS: dict[str, Fault] = {
     "runs that kill their workers, one that takes all memory": cancelling.bad_runs,
     "cancel of a running job, resumed": cancelling.cancel_running,
     "cancel of a finishing job, resumed": cancelling.cancel_finishing,
-    "cancel of a queued and of an orphaned job, dispatcher killed": cancelling.cancel_without_dispatcher,
+    "cancel of a queued and an orphaned job, no dispatcher": cancelling.cancel_without_dispatcher,
     "Ray not available at start": conditions.withhold_ray,
     "stopped in order with jobs queued, started": conditions.restart,
 }

@@ -124,7 +124,8 @@ def test_a_child_that_was_at_work_is_started_again_without_waiting_longer_each_t
     monkeypatch.setattr(supervision, "LONGEST_PAUSE_SECONDS", 600.0)
     monkeypatch.setattr(supervision, "LIVED_SECONDS", 0.0)
     file = tmp_path / "pids"
-    code = f"import os, sys; open(sys.argv[1], 'a').write('1\\n'); os._exit({supervision.RESTART_EXIT_CODE})"
+    leave = f"os._exit({supervision.RESTART_EXIT_CODE})"
+    code = f"import os, sys; open(sys.argv[1], 'a').write('1\\n'); {leave}"
     supervisor = Supervisor([sys.executable, "-S", "-c", code, str(file)], {})
     supervisor.start()
     until(lambda: len(pids(file)) >= 12, "the twelfth start")

@@ -27,26 +27,26 @@ def sentences(markdown: str) -> list[str]:
 
 def messages(path: Path) -> Iterator[tuple[int, str]]:
     """Texts of a module that a person may read; a value that is filled in counts as a word."""
-    tree = ast.parse(path.read_text())
-    skipped = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr):
-            skipped.add(node.value)
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    skipped = {node.value for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.JoinedStr):
             skipped |= {inner for inner in ast.walk(node) if inner is not node}
-    for node in ast.walk(tree):
-        if node in skipped:
-            continue
-        if isinstance(node, ast.JoinedStr):
-            text = "".join(
-                part.value if isinstance(part, ast.Constant) else "X" for part in node.values
-            )
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            text = node.value
-        else:
-            continue
+    for node in nodes:
+        text = "" if node in skipped else _text_of(node)
         if _is_prose(text):
-            yield node.lineno, text
+            yield node.lineno, text  # type: ignore[attr-defined]
+
+
+def _text_of(node: ast.AST) -> str:
+    if isinstance(node, ast.JoinedStr):
+        return "".join(
+            str(getattr(part, "value", "X")) if isinstance(part, ast.Constant) else "X"
+            for part in node.values
+        )
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    return ""
 
 
 def _is_prose(text: str) -> bool:
