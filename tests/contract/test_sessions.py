@@ -58,7 +58,7 @@ def test_writers_wait_for_each_other_and_none_is_lost(database):
         for _ in range(10):
             with database.write() as session:
                 lock = select(Job).where(Job.id == job_id).with_for_update()
-                session.scalars(lock).acquire().priority += 1
+                session.scalars(lock).one().priority += 1
 
     threads = [threading.Thread(target=raise_priority) for _ in range(4)]
     for thread in threads:

@@ -291,7 +291,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         (["--model", "fopdt", "--set", "parameters.L.lower=9"], "[9, 5]"),
         (
             ["--model", "fopdt", "--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"],
-            "lagid: --set parameters.K.tied: the ties go in a circle",
+            "lagid: --set parameters.K.tied: the ties are circular",
         ),
         (
             ["--model", "fopdt", "--set", "parameters.LL.upper=9", "--set", "hold.y=zero"],

@@ -90,7 +90,7 @@ def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient
         (
             {**TUBE, "parameters": {"length_m": 20, "cells": 100}, "samples": 400_000},
             "/samples",
-            "ask for fewer samples",
+            "Request fewer samples",
         ),
         (
             {**TUBE, "parameters": {"length_m": 2000, "cells": 1}},
@@ -98,7 +98,7 @@ def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient
             "need 400 or more",
         ),
         ({**TUBE, "sample_time": 1e308}, "/sample_time", "need 1000000000 or less"),
-        ({**TUBE, "sample_time": 1e9}, "/samples", "ask for fewer samples"),
+        ({**TUBE, "sample_time": 1e9}, "/samples", "Request fewer samples"),
         ({**ARM, "samples": 2, "sample_time": 1e6}, "/sample_time", "300 s at most"),
         ({**ARM, "sample_time": 1e-12}, "/sample_time", "need 1e-09 or more"),
         ({**ARM, "parameters": {"k_a": 1e308}}, "/parameters", "not finite at t = "),

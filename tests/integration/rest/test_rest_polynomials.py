@@ -54,7 +54,7 @@ def test_more_candidates_than_samples_are_refused_when_the_job_is_sent(server: T
     few = answer.json()["id"]
     (fault,) = refused(job(server, few, frols(3)), 422, "invalid")
     assert fault["pointer"] == "/model/terms"
-    assert "14 candidates cannot be told apart by 12 samples" in fault["detail"]
+    assert "14 candidates cannot be distinguished with 12 samples" in fault["detail"]
 
 
 def test_the_model_of_a_run_has_the_terms_that_were_selected_on_its_data() -> None:

@@ -174,7 +174,7 @@ def test_a_record_in_another_unit_than_the_model_is_refused_with_both_units() ->
 
 @pytest.mark.parametrize(("u", "y"), [("Hz", "C"), ("rad/s", "°C")])
 def test_cycles_for_radians_and_degrees_for_coulombs_are_refused(u: str, y: str) -> None:
-    with pytest.raises(InvalidRecord, match=r"correct the one that is wrong"):
+    with pytest.raises(InvalidRecord, match=r"correct the wrong unit"):
         identify(model("rad/s", "C"), record(u, y), TINY)
 
 

@@ -33,7 +33,7 @@ def test_of_very_many_names_a_message_lists_some() -> None:
 
 def test_an_output_that_is_its_own_input_is_refused() -> None:
     recording = Recording((ramp("P1"), ramp("P2")))
-    with pytest.raises(InvalidRecord, match="'P2' is given to input 'u' and to output 'y'"):
+    with pytest.raises(InvalidRecord, match="'P2' is both input 'u' and output 'y'"):
         recording.to_record({"u": "P2"}, {"y": "P2"})
 
 

@@ -161,7 +161,7 @@ def test_the_truncated_series_approaches_the_exponential() -> None:
 def test_bounds_of_a_request_that_let_a_lag_be_negative_are_refused() -> None:
     tube = load_model("tube")
     check_delays(tube, tube.parameters)
-    with pytest.raises(InvalidSettings, match=r"lag of u\(t - L\) can be as small as -0.5 s"):
+    with pytest.raises(InvalidSettings, match=r"delay of u\(t - L\) can be as small as -0.5 s"):
         check_delays(tube, override_parameters(tube.parameters, {"L": {"lower": -0.5}}))
     with pytest.raises(InvalidSettings, match=r"-0\.2 s"):
         check_delays(

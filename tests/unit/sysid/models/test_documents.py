@@ -107,7 +107,7 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"inputs": {"q": "N", "sin": "N"}}, "/inputs/sin", "word of the language"),
         ({"inputs": {"q": "N", "2a": "N"}}, "/inputs/2a", "cannot be a name"),
         ({"inputs": {"q": "N", "a/b": "N"}}, "/inputs/a~1b", "cannot be a name"),
-        ({"inputs": {"q": "N", "y": "N"}}, "/outputs/y", "is an input, too"),
+        ({"inputs": {"q": "N", "y": "N"}}, "/outputs/y", "is also an input"),
         ({"states": {}}, "/states", "is missing"),
         ({"constants": {"m": "2"}}, "/constants/m", "'2' is not a number"),
         ({"constants": {"m": float("nan")}}, "/constants/m", "nan is not a finite number"),
@@ -121,7 +121,7 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"outputs": {"y": {"expression": "z"}}}, "/outputs/y/expression", "is not declared"),
         ({"outputs": {"y": {"unit": "m"}}}, "/outputs/y/expression", "is missing"),
         ({"initial": {"z": 0}}, "/initial/z", "no such state"),
-        ({"initial": {"x": "mesured"}}, "/initial/x", "no start of a state"),
+        ({"initial": {"x": "mesured"}}, "/initial/x", "is not an initial state"),
         ({"initial": {"x": {"lower": 0}}}, "/initial/x/upper", "is missing"),
         ({"initial": {"x": {"lower": 1, "upper": 1}}}, "/initial/x", "need lower < upper"),
         ({"outputs": {"y": "2*x"}, "initial": {"x": "measured"}}, "/initial/x", "not measured"),
@@ -258,8 +258,8 @@ def test_documents_beyond_the_limits_are_refused(changes: dict[str, Any], pointe
 @pytest.mark.parametrize(
     ("unit", "index", "right"),
     [
-        ("min", "t - L", "this lag counts seconds: give it in s, or write t - 60*L"),
-        ("ms", "t - 0.1 - L", "this lag counts seconds: give it in s, or write t - 0.001*L"),
+        ("min", "t - L", "this delay is in seconds: give it in s, or write t - 60*L"),
+        ("ms", "t - 0.1 - L", "this delay is in seconds: give it in s, or write t - 0.001*L"),
     ],
 )
 def test_a_lag_in_minutes_is_not_read_in_seconds(unit: str, index: str, right: str) -> None:
@@ -286,7 +286,7 @@ def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
         "equations": {"x": "0.5*w + w(k-3)", "w": f"x({index})"},
     }
     told = faults(DISCRETE, **changed)
-    assert told == {"/parameters/d/unit": f"found {unit!r}, but this lag counts {right}"}
+    assert told == {"/parameters/d/unit": f"found {unit!r}, but this delay is in {right}"}
     fits = {"s": "k-1-d/h", "min": "k-1-60*d/h"}[unit]
     parse_model(DISCRETE | changed | {"equations": {"x": "w", "w": f"x({fits})"}})
 

@@ -149,12 +149,12 @@ def test_inlets_that_cannot_be_and_simulations_that_take_too_long_are_told() -> 
         simulate_tube(tube, pressure(np.array([0.0, -2e5, 0.0])))
     with pytest.raises(InvalidRecord, match="two samples or more"):
         simulate_tube(tube, pressure(np.array([0.0])))
-    with pytest.raises(InvalidSettings, match="ask for fewer samples"):
+    with pytest.raises(InvalidSettings, match="Request fewer samples"):
         simulate_tube(Tube(cells=5000), pressure(np.zeros(10_000)))
 
 
 def test_a_record_s_memory_is_bounded_and_no_period_is_too_long_to_be_told() -> None:
     with pytest.raises(InvalidSettings, match="need at most 500000 at a sample_time"):
         simulate_tube_record(Tube(length_m=5.0, cells=1), 1, 10_000_000, 0.005)
-    with pytest.raises(InvalidSettings, match="ask for fewer samples"):
+    with pytest.raises(InvalidSettings, match="Request fewer samples"):
         simulate_tube_record(Tube(length_m=5.0), 1, 2, 1e308)

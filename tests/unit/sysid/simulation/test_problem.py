@@ -187,7 +187,7 @@ MISSING = np.full(30, np.nan)
         (_with(np.ones(30), "inputs", "u1"), r"no input 'u'; did you mean 'u1'\?"),
         (_with(np.ones(30), "outputs", "yy"), r"no output 'y'; did you mean 'yy'\?"),
         (_with(GAP, "inputs"), r"input 'u' has no finite value at 0\.2 s \(sample 4"),
-        (_with(MISSING, "outputs"), r"output 'y' has 30 samples and none with a value"),
+        (_with(MISSING, "outputs"), r"output 'y' has 30 samples, but none with a value"),
         (record(irregular=True), r"output 'y' is not sampled regularly: sample \d+ at"),
     ],
 )
@@ -207,9 +207,9 @@ def test_no_record_and_a_constant_output_among_several_are_refused() -> None:
 
 
 def test_a_record_shorter_than_the_largest_lag_is_refused() -> None:
-    with pytest.raises(RecordTooShort, match=r"lasts 0\.25 s, but the lag of 'x' needs more than"):
+    with pytest.raises(RecordTooShort, match=r"lasts 0\.25 s, but the delay of 'x' needs more than"):
         Problem.build(duffing(), [record(6)])
-    with pytest.raises(RecordTooShort, match=r"the lag of 'u' needs more than 0\.4 s"):
+    with pytest.raises(RecordTooShort, match=r"the delay of 'u' needs more than 0\.4 s"):
         Problem.build(lag_element(), [record(6)])
     with pytest.raises(RecordTooShort, match=r"upper bound of L is .*of L: below 0\.25"):
         Problem.build(lag_element(), [record(6)])
@@ -237,7 +237,7 @@ def test_options_that_cannot_be_used_are_refused() -> None:
     with pytest.raises(InvalidSettings, match=r"need \(P, 4\)"):
         Problem.build(model, data).evaluate_fitness(np.zeros((3, 5)))
     tiny_steps = lag_element(solver={"step": 1e-9})
-    with pytest.raises(InvalidSettings, match="may take"):
+    with pytest.raises(InvalidSettings, match="the limit is"):
         Problem.build(tiny_steps, data)
 
 
@@ -246,7 +246,7 @@ def test_a_state_that_nothing_measures_cannot_start_measured() -> None:
     measured = Problem.build(
         differential({"x": "v", "v": "-b*x"}, "x", initial={"x": "measured", "v": 0}), [record()]
     ).model.initial
-    with pytest.raises(InvalidRecord, match="state 'x' is to start at its measured value"):
+    with pytest.raises(InvalidRecord, match="state 'x' must start at its measured value"):
         Problem.build(replace(model, initial=measured), [record()])
 
 
@@ -267,11 +267,11 @@ def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
 @pytest.mark.parametrize(
     ("initial", "name", "told"),
     [
-        (0, "x(0)", "a start is one where the model's document has bounds for it, initial: {x: {"),
+        (0, "x(0)", "an initial state is a parameter if the model's document gives it bounds, initial: {x: {"),
         (
             {"lower": -1, "upper": 1},
             "x(0)[2]",
-            "the records hold 1 start(s) of 'x', x(0) and so on",
+            "the records have 1 initial state(s) of 'x': x(0) and so on",
         ),
     ],
 )

@@ -48,5 +48,5 @@ def test_what_is_missing_or_unknown_is_said() -> None:
         simulate(lag_element(), [STEP], values | {"b": np.nan}, times=TIMES)
     with pytest.raises(InvalidRecord, match="no input 'u'"):
         simulate(lag_element(), [], values, times=TIMES)
-    with pytest.raises(InvalidRecord, match="need two times or more"):
+    with pytest.raises(InvalidRecord, match="Need two times or more"):
         simulate(lag_element(), [STEP], values, times=TIMES[:1])
