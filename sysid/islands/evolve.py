@@ -1,7 +1,8 @@
-"""All islands of a run evolved in one compiled call: generations, migration, a look at the end.
+"""All islands of a run evolved in one compiled call: generations, migration, stopping.
 
-Between two calls nothing has to be decided, so a call may end anywhere: the result is that of
-islands that evolve one after the other up to each border, and migrate there.
+A border is a generation at which all islands meet, to migrate and to check the stopping rule. No
+decision falls between two calls, so a call may end anywhere. The result is the same as if the
+islands evolved one after the other up to each border.
 """
 
 from collections.abc import Sequence
@@ -30,9 +31,9 @@ from sysid.search.state import COLUMN_RMS, COLUMN_VALUES, IslandArrays, IslandPl
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.problem import Problem, compute_record_progress
 
-_CHECK_INTERVAL = 5  # generations between two looks at the target RMS, or at a warm start
+_CHECK_INTERVAL = 5  # generations between two checks of the target RMS, or of a warm start
 _MOST_BORDERS, _MOST_MIGRANTS = 100, 100_000
-"""Borders that one call passes at most, and migrants that it has room for."""
+"""Limits of one call: the borders it passes, and the migrants it has room for."""
 
 
 _INTEGER_FIELDS = (
@@ -48,20 +49,20 @@ _INTEGER_FIELDS = (
 
 
 class PackedPlans(NamedTuple):
-    """The plans of all islands; `own` and `floats` have what differs.
+    """The plans of all islands; `integers` and `floats` hold what differs between them.
 
     See `sysid.search.state.IslandPlan`.
 
     Attributes
     ----------
-    seed, total : int
+    seed, population : int
     loss_scale : float
     progress : FloatArray, shape (M,)
-    own : IntArray, shape (I, 8)
-        Those of `_INTEGER_FIELDS`.
+    integers : IntArray, shape (I, 8)
+        The fields of `_INTEGER_FIELDS`.
     floats : FloatArray, shape (I, 2)
-        beta, rms.
-    starts, rates : arrays, shape (I, S)
+        beta, target_rms.
+    mutation_starts, mutation_rates : arrays, shape (I, S)
         Shorter mutation schedules end with their last entry repeated.
     """
 
@@ -76,14 +77,14 @@ class PackedPlans(NamedTuple):
 
 
 class SearchPlan(NamedTuple):
-    """What the islands of a run do, up to its end.
+    """The search plan of a run: island plans, migration routes and stopping rule.
 
     Attributes
     ----------
-    step, every : int
-        Generations from border to border at most, and from one migration to the next.
-    borders : int
-        After so many borders a call ends.
+    border_interval, migration_interval : int
+        Generations from one border to the next at most, and from one migration to the next.
+    most_borders : int
+        A call ends after so many borders.
     """
 
     plans: PackedPlans
@@ -95,7 +96,7 @@ class SearchPlan(NamedTuple):
 
 
 class ArchipelagoState(NamedTuple):
-    """Where a run stands after a call; `has_crossed`: at a border that it has just passed."""
+    """State of a run after a call; `has_crossed`: it has just passed a border."""
 
     islands: tuple[Island, ...]
     migrants: tuple[Migrant, ...]
@@ -107,23 +108,23 @@ class ArchipelagoState(NamedTuple):
 def make_search_plan(
     problem: Problem, algorithm: GeneticAlgorithm, seed: int, *, is_warm: bool
 ) -> SearchPlan:
-    """The course of a run; `is_warm`: an earlier result stands behind it."""
-    way = _make_shared_search_plan(
+    """Make the search plan of a run; `is_warm`: it starts from an earlier result."""
+    shared_plan = _make_shared_search_plan(
         algorithm, len(problem.free_parameters), problem.loss_scale, is_warm
     )
-    own = way.plans._replace(seed=seed, progress=compute_record_progress(problem))
-    return way._replace(plans=own)
+    plans = shared_plan.plans._replace(seed=seed, progress=compute_record_progress(problem))
+    return shared_plan._replace(plans=plans)
 
 
 def make_stopping_rule(algorithm: GeneticAlgorithm, *, is_warm: bool) -> StoppingRule:
-    """When a run ends."""
+    """Make the stopping rule of a run."""
     stop = algorithm.stop
     target = NO_TARGET_RMS if stop.rms is None else float(stop.rms)
     return StoppingRule(algorithm.generations, target, stop.settled or 0, is_warm)
 
 
 def get_border_interval(algorithm: GeneticAlgorithm, *, is_warm: bool) -> int:
-    """Generations from one border to the next at most."""
+    """Get the largest number of generations from one border to the next."""
     looks_often = algorithm.stop.rms is not None or is_warm
     return (
         min(algorithm.migration.every, _CHECK_INTERVAL)
@@ -136,29 +137,32 @@ def get_border_interval(algorithm: GeneticAlgorithm, *, is_warm: bool) -> int:
 def _make_shared_search_plan(
     algorithm: GeneticAlgorithm, n: int, scale: float, is_warm: bool
 ) -> SearchPlan:
-    """What the courses of all runs of n parameters share; its arrays are not to be written to."""
-    planned = make_shared_plans(algorithm, n, scale)
-    longest = max(plan.mutation_starts.size for plan in planned)
+    """Make the plan that all runs of n parameters share. Its arrays must not be modified."""
+    island_plans = make_shared_plans(algorithm, n, scale)
+    longest = max(plan.mutation_starts.size for plan in island_plans)
     plans = PackedPlans(
         0,
         algorithm.population,
         scale,
         np.zeros(0),
         np.array(
-            [[getattr(plan, name) for name in _INTEGER_FIELDS] for plan in planned], dtype=np.int64
+            [[getattr(plan, name) for name in _INTEGER_FIELDS] for plan in island_plans],
+            dtype=np.int64,
         ),
-        np.array([(plan.beta, plan.target_rms) for plan in planned]),
-        np.array([_pad_schedule(plan.mutation_starts, longest) for plan in planned]),
-        np.array([_pad_schedule(plan.mutation_rates, longest) for plan in planned]),
+        np.array([(plan.beta, plan.target_rms) for plan in island_plans]),
+        np.array([_pad_schedule(plan.mutation_starts, longest) for plan in island_plans]),
+        np.array([_pad_schedule(plan.mutation_rates, longest) for plan in island_plans]),
     )
-    ways = make_routes([plan.bits for plan in planned], algorithm.migration, algorithm.population)
-    room = _MOST_MIGRANTS // max(1, len(ways.edges) * ways.most_migrants)
+    routes = make_routes(
+        [plan.bits for plan in island_plans], algorithm.migration, algorithm.population
+    )
+    room = _MOST_MIGRANTS // max(1, len(routes.edges) * routes.most_migrants)
     borders = (
         1 if is_warm else max(1, min(_MOST_BORDERS, room))
-    )  # a warm one's history is looked at
+    )  # the history of a warm run is checked at each border
     return SearchPlan(
         plans,
-        ways,
+        routes,
         make_stopping_rule(algorithm, is_warm=is_warm),
         get_border_interval(algorithm, is_warm=is_warm),
         algorithm.migration.every,
@@ -168,28 +172,30 @@ def _make_shared_search_plan(
 
 def evolve_islands(
     evaluator: Evaluator,
-    way: SearchPlan,
+    plan: SearchPlan,
     islands: Sequence[Island],
     generation: int,
     epoch: int,
     budget: int,
 ) -> ArchipelagoState:
-    """The islands of a run after at most `budget` generations of all of them together.
+    """Evolve the islands of a run by at most `budget` generations, summed over the islands.
 
     Parameters
     ----------
     generation, epoch : int
-        The last border, and migrations until then.
+        The last border, and the number of migrations until then.
     """
-    fleet, edges = pack_islands(islands), len(way.routes.edges)
-    news = allocate_log(
-        budget + way.most_borders * (len(islands) + edges),
-        way.most_borders * edges * way.routes.most_migrants,
-        fleet.champions.shape[1],
+    packed, edges = pack_islands(islands), len(plan.routes.edges)
+    log = allocate_log(
+        budget + plan.most_borders * (len(islands) + edges),
+        plan.most_borders * edges * plan.routes.most_migrants,
+        packed.champions.shape[1],
     )
-    at, epoch, has_crossed = _run_epochs(evaluator, way, fleet, generation, epoch, budget, news)
+    border, epoch, has_crossed = _run_epochs(
+        evaluator, plan, packed, generation, epoch, budget, log
+    )
     return ArchipelagoState(
-        unpack_islands(fleet, news, islands), list_migrants(news), at, epoch, has_crossed
+        unpack_islands(packed, log, islands), list_migrants(log), border, epoch, has_crossed
     )
 
 
@@ -199,19 +205,19 @@ def _pad_schedule(values: IntArray | FloatArray, size: int) -> IntArray | FloatA
 
 @jit_compile
 def unpack_plan(plans: PackedPlans, i: int) -> IslandPlan:
-    """The plan of one island."""
-    own, floats = plans.integers[i], plans.floats[i]
+    """Extract the plan of one island."""
+    integers, floats = plans.integers[i], plans.floats[i]
     return IslandPlan(
         plans.seed,
-        own[0],
-        own[1],
+        integers[0],
+        integers[1],
         plans.population,
-        own[2],
-        own[3],
-        own[4],
-        own[5],
-        own[6],
-        own[7],
+        integers[2],
+        integers[3],
+        integers[4],
+        integers[5],
+        integers[6],
+        integers[7],
         floats[0],
         floats[1],
         plans.loss_scale,
@@ -222,38 +228,43 @@ def unpack_plan(plans: PackedPlans, i: int) -> IslandPlan:
 
 
 @jit_compile
-def compute_next_border(generation: int, step: int, every: int, generations_: int) -> int:
-    """The generation up to which all islands evolve alone."""
-    return min(generation + min(step, every - generation % every), generations_)
+def compute_next_border(
+    generation: int, border_interval: int, migration_interval: int, most_generations: int
+) -> int:
+    """Compute the generation up to which the islands evolve without exchange."""
+    return min(
+        generation + min(border_interval, migration_interval - generation % migration_interval),
+        most_generations,
+    )
 
 
 @jit_compile
 def _run_epochs(
     evaluator: Evaluator,
-    way: SearchPlan,
-    fleet: PackedIslands,
+    plan: SearchPlan,
+    packed: PackedIslands,
     generation: int,
     epoch: int,
     budget: int,
-    news: EvolutionLog,
+    log: EvolutionLog,
 ) -> tuple[int, int, bool]:
-    """Go on in place; gives the last border, the migrations and whether it was passed just now."""
-    for _ in range(way.most_borders):
+    """Evolve in place; return the last border, the migrations and whether it was just passed."""
+    for _ in range(plan.most_borders):
         target = compute_next_border(
             generation,
-            way.border_interval,
-            way.migration_interval,
-            way.stopping_rule.most_generations,
+            plan.border_interval,
+            plan.migration_interval,
+            plan.stopping_rule.most_generations,
         )
-        budget = _evolve_to_border(evaluator, way.plans, fleet, target, budget, news)
+        budget = _evolve_to_border(evaluator, plan.plans, packed, target, budget, log)
         if budget < 0:
             return generation, epoch, False
         generation = target
-        if generation % way.migration_interval == 0 and fleet.champion_rms.size > 1:
-            exchange_migrants(way.routes, fleet, epoch, news)
+        if generation % plan.migration_interval == 0 and packed.champion_rms.size > 1:
+            exchange_migrants(plan.routes, packed, epoch, log)
             epoch += 1
         if has_process_ended(
-            way.stopping_rule, generation, fleet.champion_rms, fleet.search, False
+            plan.stopping_rule, generation, packed.champion_rms, packed.search, False
         ):
             break
     return generation, epoch, True
@@ -263,28 +274,28 @@ def _run_epochs(
 def _evolve_to_border(
     evaluator: Evaluator,
     plans: PackedPlans,
-    fleet: PackedIslands,
+    packed: PackedIslands,
     target: int,
     budget: int,
-    news: EvolutionLog,
+    log: EvolutionLog,
 ) -> int:
-    """Evolve every island up to a border; gives what is left of the budget, −1 if too little."""
-    for i in range(fleet.champion_rms.size):
-        begin, end = fleet.offsets[i], fleet.offsets[i + 1]
-        plan, search, written = unpack_plan(plans, i), fleet.search[i], news.counts[0]
+    """Evolve every island up to a border; return the remaining budget, −1 if it ran out."""
+    for i in range(packed.champion_rms.size):
+        begin, end = packed.offsets[i], packed.offsets[i + 1]
+        plan, search, written = unpack_plan(plans, i), packed.search[i], log.counts[0]
         island = IslandArrays(
-            fleet.chromosomes[begin:end], fleet.fitness[begin:end], search, fleet.points[i]
+            packed.chromosomes[begin:end], packed.fitness[begin:end], search, packed.points[i]
         )
-        if search.generation >= target or is_island_resting(plan, island, fleet.champion_rms[i]):
+        if search.generation >= target or is_island_resting(plan, island, packed.champion_rms[i]):
             continue
         if budget == 0:
             return -1
-        before, rows = search.generation, news.improvements[written:]
-        made = run_generations(evaluator, plan, min(target - before, budget), island, rows)
-        _record_improvements(fleet, i, made, news)
+        before, rows = search.generation, log.improvements[written:]
+        improvements = run_generations(evaluator, plan, min(target - before, budget), island, rows)
+        _record_improvements(packed, i, improvements, log)
         budget -= search.generation - before
         if search.generation < target and not is_island_resting(
-            plan, island, fleet.champion_rms[i]
+            plan, island, packed.champion_rms[i]
         ):
             return -1
     return budget
@@ -292,9 +303,9 @@ def _evolve_to_border(
 
 @jit_compile
 def is_island_resting(plan: IslandPlan, island: IslandArrays, rms: float) -> bool:
-    """Whether an island has used up its evaluations or reached the target RMS.
+    """Return whether an island has used up its evaluations or reached the target RMS.
 
-    Not before its population is evaluated: finding the starts of a polynomial counts, too.
+    False before its population is evaluated, because the starts of a polynomial already count.
     """
     if np.all(np.isnan(island.fitness)):
         return False
@@ -302,13 +313,15 @@ def is_island_resting(plan: IslandPlan, island: IslandArrays, rms: float) -> boo
 
 
 @jit_compile
-def _record_improvements(fleet: PackedIslands, island: int, made: int, news: EvolutionLog) -> None:
-    """Whose the improvements just written are, and the champion that the last one is."""
-    for r in range(news.counts[0], news.counts[0] + made):
-        news.improvement_islands[r] = island
-    news.counts[0] += made
-    if made:
-        last = news.improvements[news.counts[0] - 1]
-        fleet.champion_rms[island] = last[COLUMN_RMS]
-        for d in range(fleet.champions.shape[1]):
-            fleet.champions[island, d] = last[COLUMN_VALUES + d]
+def _record_improvements(
+    packed: PackedIslands, island: int, improvements: int, log: EvolutionLog
+) -> None:
+    """Record the island of the improvements just written, and make the last one its champion."""
+    for r in range(log.counts[0], log.counts[0] + improvements):
+        log.improvement_islands[r] = island
+    log.counts[0] += improvements
+    if improvements:
+        last = log.improvements[log.counts[0] - 1]
+        packed.champion_rms[island] = last[COLUMN_RMS]
+        for d in range(packed.champions.shape[1]):
+            packed.champions[island, d] = last[COLUMN_VALUES + d]

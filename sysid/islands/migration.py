@@ -1,4 +1,4 @@
-"""Migration: copies of the best of one island replace the worst of another, all at once."""
+"""Synchronous migration: copies of an island's best individuals replace another's worst."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,16 +27,16 @@ from sysid.search.state import (
 
 
 class MigrationRoutes(NamedTuple):
-    """Who sends how many to whom, as compiled code reads it.
+    """Connections of the islands and migrants per connection, as compiled code reads them.
 
     Attributes
     ----------
     edges : IntArray, shape (E, 2)
         Source and destination.
     bits : IntArray, shape (I,)
-        Of each island's chromosomes.
-    migrants : int
-        Of each edge, at most.
+        Bits of each island's chromosomes.
+    most_migrants : int
+        Limit for each edge.
     """
 
     edges: IntArray
@@ -45,7 +45,7 @@ class MigrationRoutes(NamedTuple):
 
 
 def make_routes(bits: Sequence[int], migration: Migration, largest: int) -> MigrationRoutes:
-    """The routes between islands, the largest of which has so many individuals."""
+    """Make the routes between islands; the largest island has `largest` individuals."""
     pairs = list_edges(migration.topology, len(bits))
     return MigrationRoutes(
         np.array(pairs, dtype=np.int64).reshape(len(pairs), 2),
@@ -57,81 +57,83 @@ def make_routes(bits: Sequence[int], migration: Migration, largest: int) -> Migr
 def migrate(
     islands: Sequence[Island], bits: Sequence[int], migration: Migration, epoch: int
 ) -> tuple[tuple[Island, ...], tuple[Migrant, ...]]:
-    """The islands after one exchange, and its log.
+    """Exchange migrants once; return the islands and the log.
 
-    Synchronous: every island sends what it had before the exchange. A migrant replaces the
-    receiver's worst individual only if it is fitter and not there already, so no island gets
-    worse. `bits` are those of each island; between islands that differ the nearest chromosome
-    arrives, to be evaluated at its destination.
+    Synchronous: every island sends individuals that it had before the exchange. A migrant replaces
+    the receiver's worst individual only if it is fitter and new there, so no island gets worse.
+    `bits` are those of each island. Between islands of different bits the nearest chromosome
+    arrives and is evaluated at its destination.
     """
-    ways = make_routes(bits, migration, max(island.fitness.size for island in islands))
-    fleet, count = pack_islands(islands), len(ways.edges)
-    news = allocate_log(count, count * ways.most_migrants, fleet.champions.shape[1])
-    exchange_migrants(ways, fleet, epoch, news)
-    return unpack_islands(fleet, news, islands), list_migrants(news)
+    routes = make_routes(bits, migration, max(island.fitness.size for island in islands))
+    packed, count = pack_islands(islands), len(routes.edges)
+    log = allocate_log(count, count * routes.most_migrants, packed.champions.shape[1])
+    exchange_migrants(routes, packed, epoch, log)
+    return unpack_islands(packed, log, islands), list_migrants(log)
 
 
 @jit_compile
 def exchange_migrants(
-    ways: MigrationRoutes, fleet: PackedIslands, epoch: int, news: EvolutionLog
+    routes: MigrationRoutes, packed: PackedIslands, epoch: int, log: EvolutionLog
 ) -> None:
-    """One exchange in place: see `migrate`. An edge writes one improvement at most."""
-    words, fitness = fleet.chromosomes.copy(), fleet.fitness.copy()
-    champions = fleet.champions.copy()
-    discontinuities = fleet.search.fitness_discontinuities.copy()
-    for e in range(ways.edges.shape[0]):
-        source, destination = ways.edges[e, 0], ways.edges[e, 1]
-        begin, end = fleet.offsets[source], fleet.offsets[source + 1]
-        exact = ways.bits[source] == ways.bits[destination]
-        known = fleet.search[destination]  # of the fitness, not of the place:
-        known.fitness_discontinuities = max(known.fitness_discontinuities, discontinuities[source])
-        for p in range(begin, min(end, begin + ways.most_migrants)):
+    """Exchange migrants once in place (see `migrate`). An edge writes one improvement at most."""
+    words, fitness = packed.chromosomes.copy(), packed.fitness.copy()
+    champions = packed.champions.copy()
+    discontinuities = packed.search.fitness_discontinuities.copy()
+    for e in range(routes.edges.shape[0]):
+        source, destination = routes.edges[e, 0], routes.edges[e, 1]
+        begin, end = packed.offsets[source], packed.offsets[source + 1]
+        exact = routes.bits[source] == routes.bits[destination]
+        receiver = packed.search[destination]  # a property of the fitness, not of the position:
+        receiver.fitness_discontinuities = max(
+            receiver.fitness_discontinuities, discontinuities[source]
+        )
+        for p in range(begin, min(end, begin + routes.most_migrants)):
             word = words[p : p + 1]
             if not exact:
-                word = encode(decode(word, ways.bits[source]), ways.bits[destination])
-            if not _accepts_migrant(fleet, destination, word[0], fitness[p]):
+                word = encode(decode(word, routes.bits[source]), routes.bits[destination])
+            if not _accepts_migrant(packed, destination, word[0], fitness[p]):
                 continue
-            _insert_migrant(fleet, destination, word[0], fitness[p] if exact else np.nan)
-            line = news.migrants[news.counts[1]]
+            _insert_migrant(packed, destination, word[0], fitness[p] if exact else np.nan)
+            line = log.migrants[log.counts[1]]
             line[0], line[1], line[2], line[3] = epoch, source, destination, fitness[p]
-            news.counts[1] += 1
-            if exact and p == begin and fitness[p] < fleet.champion_rms[destination]:
-                _record_champion(fleet, destination, fitness[p], champions[source], news)
+            log.counts[1] += 1
+            if exact and p == begin and fitness[p] < packed.champion_rms[destination]:
+                _record_champion(packed, destination, fitness[p], champions[source], log)
 
 
 @jit_compile
-def _accepts_migrant(fleet: PackedIslands, island: int, word: WordArray, fitness: float) -> bool:
-    """Whether a migrant is fitter than the worst, and new here."""
-    begin, end = fleet.offsets[island], fleet.offsets[island + 1]
-    if not fitness < fleet.fitness[end - 1]:  # nan, not evaluated yet, comes last and is kept
+def _accepts_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> bool:
+    """Return whether a migrant is fitter than the worst individual, and new on the island."""
+    begin, end = packed.offsets[island], packed.offsets[island + 1]
+    if not fitness < packed.fitness[end - 1]:  # nan (not evaluated yet) comes last and stays
         return False
     is_new = True
     for p in range(begin, end):
-        is_new &= not np.all(fleet.chromosomes[p] == word)
+        is_new &= not np.all(packed.chromosomes[p] == word)
     return is_new
 
 
 @jit_compile
-def _insert_migrant(fleet: PackedIslands, island: int, word: WordArray, fitness: float) -> None:
-    """Put a migrant in the place of the worst individual."""
-    begin, end = fleet.offsets[island], fleet.offsets[island + 1]
+def _insert_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> None:
+    """Replace the worst individual by a migrant."""
+    begin, end = packed.offsets[island], packed.offsets[island + 1]
     for d in range(word.size):
-        fleet.chromosomes[end - 1, d] = word[d]
-    fleet.fitness[end - 1] = fitness
-    sort_population(fleet.chromosomes[begin:end], fleet.fitness[begin:end])
+        packed.chromosomes[end - 1, d] = word[d]
+    packed.fitness[end - 1] = fitness
+    sort_population(packed.chromosomes[begin:end], packed.fitness[begin:end])
 
 
 @jit_compile
 def _record_champion(
-    fleet: PackedIslands, island: int, fitness: float, values: FloatArray, news: EvolutionLog
+    packed: PackedIslands, island: int, fitness: float, values: FloatArray, log: EvolutionLog
 ) -> None:
-    """Note that an island's champion has come from another."""
-    search, row = fleet.search[island], news.improvements[news.counts[0]]
-    news.improvement_islands[news.counts[0]] = island
-    news.counts[0] += 1
+    """Record that an island's new champion is a migrant."""
+    search, row = packed.search[island], log.improvements[log.counts[0]]
+    log.improvement_islands[log.counts[0]] = island
+    log.counts[0] += 1
     write_improvement(search, fitness, PHASE_MIGRATION, values, row)
     search.stagnation, search.champion_converged = 0, 0
-    reset_evidence(search, fitness, fleet.champion_rms[island])
-    fleet.champion_rms[island] = fitness
+    reset_evidence(search, fitness, packed.champion_rms[island])
+    packed.champion_rms[island] = fitness
     for d in range(values.size):
-        fleet.champions[island, d] = values[d]
+        packed.champions[island, d] = values[d]

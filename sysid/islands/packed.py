@@ -1,4 +1,4 @@
-"""The islands of a run one behind the other, as compiled code reads and changes them."""
+"""The islands of a run packed into common arrays, which compiled code reads and changes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,17 +15,17 @@ class PackedIslands(NamedTuple):
 
     Attributes
     ----------
-    first : IntArray, shape (I + 1,)
-        Island i has the individuals ``first[i]`` to ``first[i + 1] - 1``.
-    words : WordArray, shape (P, D)
+    offsets : IntArray, shape (I + 1,)
+        Island i has the individuals ``offsets[i]`` to ``offsets[i + 1] - 1``.
+    chromosomes : WordArray, shape (P, D)
     fitness : FloatArray, shape (P,)
     search : SearchArray, shape (I,)
     points : FloatArray, shape (I, D)
-        Up to here, those of `sysid.search.island.Island`.
-    rms : FloatArray, shape (I,)
-        Of each island's best individual so far; ``inf`` before the first evaluation.
+        This array and those above are those of `sysid.search.island.Island`.
+    champion_rms : FloatArray, shape (I,)
+        RMS of each island's best individual so far; ``inf`` before the first evaluation.
     champions : FloatArray, shape (I, D)
-        Its values; arbitrary before the first evaluation.
+        Its parameters; arbitrary before the first evaluation.
     """
 
     offsets: IntArray
@@ -38,17 +38,17 @@ class PackedIslands(NamedTuple):
 
 
 class EvolutionLog(NamedTuple):
-    """What compiled code writes down of the islands of a fleet.
+    """Log that compiled code writes: improvements of the islands, and migrants.
 
     Attributes
     ----------
     improvements : FloatArray, shape (R, VALUES + D)
-    owners : IntArray, shape (R,)
-        The island of each.
+    improvement_islands : IntArray, shape (R,)
+        The island of each improvement.
     migrants : FloatArray, shape (L, 4)
         Epoch, source, destination and fitness of each.
-    written : IntArray, shape (2,)
-        How many improvements and migrants there are.
+    counts : IntArray, shape (2,)
+        Numbers of improvements and of migrants written.
     """
 
     improvements: FloatArray
@@ -58,7 +58,7 @@ class EvolutionLog(NamedTuple):
 
 
 def pack_islands(islands: Sequence[Island]) -> PackedIslands:
-    """Copies of the islands' arrays, one behind the other."""
+    """Copy the arrays of the islands into common ones."""
     champions = np.zeros((len(islands), islands[0].chromosomes.shape[1]))
     for i, island in enumerate(islands):
         if island.history:
@@ -75,31 +75,34 @@ def pack_islands(islands: Sequence[Island]) -> PackedIslands:
 
 
 def unpack_islands(
-    fleet: PackedIslands, news: EvolutionLog, islands: Sequence[Island]
+    packed: PackedIslands, log: EvolutionLog, islands: Sequence[Island]
 ) -> tuple[Island, ...]:
-    """The islands as they are in the fleet, their histories longer by what is new."""
-    better: list[list[Improvement]] = [[] for _ in islands]
-    count = int(news.counts[0])
-    owners, rows = news.improvement_islands[:count].tolist(), news.improvements[:count].tolist()
-    for owner, row in zip(owners, rows, strict=True):
-        better[owner].append(to_improvement(row))
-    ends = fleet.offsets.tolist()
+    """Make islands of the packed arrays, and append the log to their histories."""
+    new_improvements: list[list[Improvement]] = [[] for _ in islands]
+    count = int(log.counts[0])
+    improvement_islands, rows = (
+        log.improvement_islands[:count].tolist(),
+        log.improvements[:count].tolist(),
+    )
+    for index, row in zip(improvement_islands, rows, strict=True):
+        new_improvements[index].append(to_improvement(row))
+    ends = packed.offsets.tolist()
     return tuple(
         Island(
             island.index,
             island.seed,
-            fleet.chromosomes[begin:end],
-            fleet.fitness[begin:end],
-            fleet.search[i, ...],
-            fleet.points[i],
-            (*island.history, *better[i]),
+            packed.chromosomes[begin:end],
+            packed.fitness[begin:end],
+            packed.search[i, ...],
+            packed.points[i],
+            (*island.history, *new_improvements[i]),
         )
         for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))
     )
 
 
 def allocate_log(improvements: int, migrants: int, n: int) -> EvolutionLog:
-    """Room for so many improvements of n parameters and so many migrants."""
+    """Allocate a log for so many improvements of n parameters and so many migrants."""
     return EvolutionLog(
         np.empty((improvements, COLUMN_VALUES + n)),
         np.empty(improvements, dtype=np.int64),
@@ -108,7 +111,10 @@ def allocate_log(improvements: int, migrants: int, n: int) -> EvolutionLog:
     )
 
 
-def list_migrants(news: EvolutionLog) -> tuple[Migrant, ...]:
-    """The migrants that arrived."""
-    rows = news.migrants[: int(news.counts[1])].tolist()
-    return tuple(Migrant(int(at), int(a), int(b), fitness) for at, a, b, fitness in rows)
+def list_migrants(log: EvolutionLog) -> tuple[Migrant, ...]:
+    """List the migrants in a log."""
+    rows = log.migrants[: int(log.counts[1])].tolist()
+    return tuple(
+        Migrant(int(epoch), int(source), int(destination), fitness)
+        for epoch, source, destination, fitness in rows
+    )

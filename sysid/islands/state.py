@@ -1,4 +1,4 @@
-"""The state of a run: a value that can be pickled between any two compiled calls."""
+"""State of a run: a value that can be pickled between any two compiled calls."""
 
 from dataclasses import dataclass
 
@@ -21,14 +21,14 @@ class RunState:
     generation : int
         The last border that all islands have passed.
     epoch : int
-        Exchanges of migrants done.
+        Number of migrations so far.
     migrations : tuple of Migrant
     seconds : float
-        Time computed so far.
-    ended : bool
-        Whether an end condition held at the last border.
+        Computing time so far.
+    has_ended : bool
+        Whether a stopping condition held at the last border.
     is_warm : bool
-        Whether it was given values of an earlier result to begin with.
+        Whether the run started from values of an earlier result.
     """
 
     seed: int
@@ -42,7 +42,7 @@ class RunState:
 
     @property
     def evaluations(self) -> int:
-        """Simulations run by all islands."""
+        """Number of simulations run by all islands."""
         return sum(island.evaluations for island in self.islands)
 
     @property
@@ -57,12 +57,12 @@ class RunState:
         return rms, stack_search(self.islands)
 
     def is_unimproved_since(self, generation: int) -> bool:
-        """Whether the best fitness was found by then, and nothing better after."""
-        most = self.rms * (1.0 + SAME_OPTIMUM)
+        """Return whether no island has improved on the best fitness since a generation."""
+        largest_rms = self.rms * (1.0 + SAME_OPTIMUM)
         return any(
-            one.rms <= most and one.generation <= generation
+            improvement.rms <= largest_rms and improvement.generation <= generation
             for history in self.history
-            for one in history
+            for improvement in history
         )
 
     @property

@@ -1,4 +1,4 @@
-"""When a run has ended at a border: its generations, the target, searches that agree, or rest."""
+"""Stopping rule: all generations, target RMS, agreement of restarts, or all islands at rest."""
 
 from typing import NamedTuple
 
@@ -9,28 +9,26 @@ from sysid.core.types import FloatArray
 from sysid.search.state import SAME_OPTIMUM, SearchArray
 
 _PARTS_OF_EACH, _EXTRA_AGREEMENTS = 2, 2
-_LEAST_SHARE = 1 / 3  # of all searches
-_CONFIRMED_SHARE, _MANY_STARTS = (
-    0.5,
-    2.5,
-)  # of those from random places agree, or there are so many times enough
-_CONFIRMED_SHARE_ROUGH = 2 / 3  # of the searches from random places, where the fitness jumps
-_RETURNED_SHARE_ROUGH = 0.9  # of those from beside the best individual
-_WARM_DIVISOR = 3  # of the searches that agree, a warm start needs one in three
+_LEAST_SHARE = 1 / 3  # of all restarts
+# This share of the random restarts must agree, or there must be so many times the needed number.
+_CONFIRMED_SHARE, _MANY_STARTS = 0.5, 2.5
+_CONFIRMED_SHARE_ROUGH = 2 / 3  # of the random restarts, where the fitness jumps
+_RETURNED_SHARE_ROUGH = 0.9  # of the restarts near the best individual, where the fitness jumps
+_WARM_DIVISOR = 3  # a warm start needs one third of the agreeing restarts
 
 
 class StoppingRule(NamedTuple):
-    """End conditions that are looked at where all islands have got to a border.
+    """Stopping conditions, checked when all islands have reached a border.
 
     Attributes
     ----------
-    generations : int
-    rms : float
-        Target; negative: none.
-    settled : int
-        Searches that agree; 0: they do not end a run.
+    most_generations : int
+    target_rms : float
+        Negative: none.
+    agreed_restarts : int
+        Restarts that must agree; 0: agreement does not end a run.
     is_warm : bool
-        Whether an earlier result stands behind the run.
+        Whether the run started from an earlier result.
     """
 
     most_generations: int
@@ -40,16 +38,16 @@ class StoppingRule(NamedTuple):
 
 
 class RestartCounts(NamedTuple):
-    """What the searches of all islands found, as far as it is the best champion.
+    """Restarts of all islands, and how many of them led to the best champion.
 
     Attributes
     ----------
     independent, confirmed : int
-        Searches that began at new random places, and how many of them led to it.
+        Restarts from random points, and how many of them led to the champion.
     hops, returned : int
-        Searches from beside it, and how many of them led back.
-    has_cliffs : bool
-        Whether one of these has met jumps of the fitness.
+        Restarts near the champion, and how many of them led back.
+    has_discontinuities : bool
+        Whether an island with the best champion has met jumps of the fitness.
     """
 
     independent: int
@@ -61,67 +59,75 @@ class RestartCounts(NamedTuple):
 
 @jit_compile
 def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
-    """Count them over islands with these champions' RMS (I,) and records (I,)."""
+    """Count the restarts of islands from their champions' RMS (I,) and search records (I,)."""
     independent = confirmed = hops = returned = 0
-    has_cliffs, most = False, np.min(rms) * (1.0 + SAME_OPTIMUM)
+    has_discontinuities, largest_rms = False, np.min(rms) * (1.0 + SAME_OPTIMUM)
     for i in range(rms.size):
         independent += search[i].random_starts
-        if rms[i] <= most:
+        if rms[i] <= largest_rms:
             confirmed += search[i].confirmed_starts
             hops += search[i].hop_count
             returned += search[i].returned_hops
-            has_cliffs |= search[i].champion_discontinuities > 0
-    return RestartCounts(independent, confirmed, hops, returned, has_cliffs)
+            has_discontinuities |= search[i].champion_discontinuities > 0
+    return RestartCounts(independent, confirmed, hops, returned, has_discontinuities)
 
 
 @jit_compile
 def has_process_ended(
-    ends: StoppingRule, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
+    rule: StoppingRule, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
 ) -> bool:
-    """Whether one of the conditions holds at the border `generation`.
+    """Return whether one of the stopping conditions holds at the border `generation`.
 
-    `is_old`: nothing better was found in the second half of the generations. It matters behind a
-    warm start alone.
+    `is_old`: the second half of the generations brought no improvement. It matters only for a warm
+    start.
     """
-    if generation >= ends.most_generations or np.min(rms) <= ends.target_rms:
+    if generation >= rule.most_generations or np.min(rms) <= rule.target_rms:
         return True
-    if ends.agreed_restarts > 0 and _restarts_agree(
-        ends.agreed_restarts, ends.is_warm, count_restarts(rms, search), is_old
+    if rule.agreed_restarts > 0 and _restarts_agree(
+        rule.agreed_restarts, rule.is_warm, count_restarts(rms, search), is_old
     ):
         return True
-    # Below the border only those islands stay that have used up their evaluations.
+    # Only islands that have used up their evaluations stay below the border.
     return bool(np.all(search.generation < generation))
 
 
 @jit_compile
-def _restarts_agree(settled: int, is_warm: bool, made: RestartCounts, is_old: bool) -> bool:
-    """Whether searches keep finding the best individual, from random places and from beside it.
+def _restarts_agree(settled: int, is_warm: bool, restarts: RestartCounts, is_old: bool) -> bool:
+    """Return whether restarts, random ones and nearby ones, keep leading to the best individual.
 
-    Had a better one as many ways that lead to it, all of k searches that found the best again and
-    those that found others would have missed it with a probability below exp(-k). So where the
-    fitness around is smooth, those that led to worse ones say nothing against the best, unless
-    they are the most. Where it jumps, a better one nearby may draw few searches beside a wide one
-    that draws many: then nearly all must agree.
-    But what was found from beside the best says little of minima far away. So where fewer than
-    half of those from random places agree, these must be many: at 5 of 14 one search in a hundred
-    ended at twice the least RMS.
-    Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
-    as many from random places, one from beside it (where the fitness jumps, as many) and the
-    second half of the generations have found nothing better. Those from beside it alone would not
-    do: around a false optimum they find nothing better.
+    Smooth fitness: suppose a better optimum attracted as many restarts as the best one. With k
+    restarts that led to the best, all restarts would have missed it with probability below exp(-k).
+    So restarts that led to worse optima do not count against the best, unless they are the
+    majority.
+
+    Fitness with jumps: a better optimum nearby may attract few restarts, next to a wide one that
+    attracts many. Then nearly all restarts must agree.
+
+    Restarts near the best say little about minima far away. So if fewer than half of the random
+    restarts agree, there must be many of them. At 5 of 14, one search in a hundred ended at twice
+    the least RMS.
+
+    A warm start has an earlier result, so a third of the agreeing restarts is enough. It also ends
+    if neither restarts nor the second half of the generations brought an improvement. This takes
+    `settled` random restarts and one nearby restart, or `settled` nearby ones if the fitness jumps.
+    Nearby restarts alone would not do: around a false optimum they bring no improvement.
     """
     if is_warm:
-        beside = settled if made.has_discontinuities else 1
-        if is_old and made.independent >= settled and made.hops >= beside:
+        needed_hops = settled if restarts.has_discontinuities else 1
+        if is_old and restarts.independent >= settled and restarts.hops >= needed_hops:
             return True
         settled = -(-settled // _WARM_DIVISOR)
-    if made.has_discontinuities:
-        every = made.returned >= max(settled, _RETURNED_SHARE_ROUGH * made.hops)
-        return every and made.confirmed >= max(settled, _CONFIRMED_SHARE_ROUGH * made.independent)
-    again, enough = made.confirmed + made.returned, settled + _EXTRA_AGREEMENTS
-    if min(made.confirmed, made.returned) < -(-settled // _PARTS_OF_EACH):
+    if restarts.has_discontinuities:
+        nearly_all_returned = restarts.returned >= max(
+            settled, _RETURNED_SHARE_ROUGH * restarts.hops
+        )
+        return nearly_all_returned and restarts.confirmed >= max(
+            settled, _CONFIRMED_SHARE_ROUGH * restarts.independent
+        )
+    agreed, enough = restarts.confirmed + restarts.returned, settled + _EXTRA_AGREEMENTS
+    if min(restarts.confirmed, restarts.returned) < -(-settled // _PARTS_OF_EACH):
         return False
-    agree = made.confirmed >= max(enough, _CONFIRMED_SHARE * made.independent)
-    if not (is_warm or agree or made.independent >= _MANY_STARTS * enough):
+    is_confirmed = restarts.confirmed >= max(enough, _CONFIRMED_SHARE * restarts.independent)
+    if not (is_warm or is_confirmed or restarts.independent >= _MANY_STARTS * enough):
         return False
-    return again >= max(enough, _LEAST_SHARE * (made.independent + made.hops))
+    return agreed >= max(enough, _LEAST_SHARE * (restarts.independent + restarts.hops))

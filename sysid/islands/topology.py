@@ -1,4 +1,4 @@
-"""Topologies: which island sends its migrants to which."""
+"""Topologies: the directed connections between islands."""
 
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
@@ -10,32 +10,32 @@ MigrationEdge: TypeAlias = tuple[int, int]
 
 
 def list_edges(name: TopologyName, n: int) -> tuple[MigrationEdge, ...]:
-    """All connections of an archipelago of `n` islands, by source and destination."""
+    """List all connections of an archipelago of `n` islands, sorted by source and destination."""
     return tuple(sorted(edge for edge in CONNECTIONS[name](n) if edge[0] != edge[1]))
 
 
 def _connect_next(n: int) -> set[MigrationEdge]:
-    """Each to the next."""
+    """Connect each island to the next."""
     return {(i, (i + 1) % n) for i in range(n)}
 
 
 def _connect_neighbours(n: int) -> set[MigrationEdge]:
-    """Each to both neighbours."""
+    """Connect each island to both neighbours."""
     return {(i, (i + step) % n) for i in range(n) for step in (1, -1)}
 
 
 def _connect_all(n: int) -> set[MigrationEdge]:
-    """Each to all others."""
+    """Connect each island to all others."""
     return {(i, j) for i in range(n) for j in range(n)}
 
 
 def _connect_centre(n: int) -> set[MigrationEdge]:
-    """Island 0 to all others, and they to it."""
+    """Connect island 0 to all others, and these to it."""
     return {edge for i in range(1, n) for edge in ((0, i), (i, 0))}
 
 
 def _connect_none(n: int) -> set[MigrationEdge]:
-    """None: every island searches alone."""
+    """Connect no islands: each searches alone."""
     return set()
 
 

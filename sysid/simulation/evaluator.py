@@ -1,9 +1,8 @@
 """Fitness and predictions of a population, as compiled functions that a search calls.
 
-A result of one individual does not depend on the others: not on how many they are, nor on their
-order, nor on the copies that fill the last lanes.
-
-What compiled code needs to evaluate a population: one tuple of numbers and arrays.
+`Evaluator` holds the numbers and arrays that compiled code needs. The result of an individual does
+not depend on the others: neither on their count and order nor on the copies that fill the last
+SIMD vector.
 """
 
 from typing import NamedTuple
@@ -25,14 +24,14 @@ class Evaluator(NamedTuple):
         Address of the model's kernel (see `sysid.kernels.abi` for its signature).
     template : FloatArray, shape (K,)
         Values of all parameters, fixed ones in place, free ones arbitrary.
-    rows : IntArray, shape (D,)
-        Which entries of `template` the free parameters are.
+    free_rows : IntArray, shape (D,)
+        Entries of `template` that belong to the free parameters.
     lower, upper : FloatArray, shape (D,)
-    log : IntArray, shape (D,)
+    is_log : IntArray, shape (D,)
         1 where the parameter's scale is logarithmic.
-    plans : IntArray, shape (E, 3)
-        Per experiment: where its numbers begin in `ints` and in `floats`, and its first measured
-        value among the M.
+    offsets : IntArray, shape (E, 3)
+        For each experiment: its first entry in `ints`, in `floats`, and among the M measured
+        values.
     ints : IntArray
     floats : FloatArray
     n_work : int
@@ -43,8 +42,8 @@ class Evaluator(NamedTuple):
         Square root of each measured value's weight; 0 where it is not scored or missing.
     measured : FloatArray, shape (M,)
         0 where missing.
-    n_weight : float
-        Number of scored values: J = sqrt(loss / n_weight).
+    n_scored : float
+        Number of scored values: J = sqrt(loss / n_scored).
     """
 
     kernel: int
@@ -68,7 +67,7 @@ _LAST_STEP = HEAD_FIELDS.index("last")
 
 @jit_compile
 def expand_individuals(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """All parameters of (P, D) individuals as the kernel wants them: (K, P rounded up)."""
+    """Expand individuals (P, D) to all parameters in the kernel's layout, (K, P rounded up)."""
     individuals, free = theta.shape
     stride = (individuals + NARROW_LANES - 1) // NARROW_LANES * NARROW_LANES
     full = np.empty((evaluator.template.size, stride))
@@ -107,7 +106,7 @@ def _run_kernels(
 
 @jit_compile
 def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """J of each individual (Eq. 10; smaller is better): (P, D) → (P,), inf where it diverges."""
+    """Compute J of each individual (Eq. 10): (P, D) → (P,), inf if diverged. Smaller is better."""
     loss = _run_kernels(
         evaluator, evaluator.ints, expand_individuals(evaluator, theta), np.empty((0, 1))
     )
@@ -120,7 +119,7 @@ def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 @jit_compile
 def predict_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Simulated value at each measured time: (P, D) → (P, M); not finite where it diverges."""
+    """Simulate the values at the measured times: (P, D) → (P, M), not finite where it diverges."""
     full = expand_individuals(evaluator, theta)
     predictions = np.empty((evaluator.n_measured, full.shape[1]))
     _run_kernels(evaluator, evaluator.ints, full, predictions)
@@ -129,9 +128,9 @@ def predict_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 @jit_compile
 def predict_partially(evaluator: Evaluator, theta: FloatArray, horizon: float) -> FloatArray:
-    """Simulated values (M, P rounded up) of each experiment up to a part of its time.
+    """Simulate the first part of each experiment: values (M, P rounded up).
 
-    The simulation ends `horizon` (0 … 1) of the steps after its beginning, and costs that part.
+    The simulation stops after the share `horizon` (0 … 1) of the steps, and costs that share.
     Values of later samples and in columns from P on are arbitrary.
     """
     ints = evaluator.ints.copy()

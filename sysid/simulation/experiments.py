@@ -1,4 +1,4 @@
-"""Laying out experiments: which recorded channel is which signal, where it lies on the grid."""
+"""Records placed on the simulation grid: channels matched to signals, samples to grid points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,21 +27,21 @@ from sysid.simulation.packing import (
     interpolate_inputs,
 )
 
-# Beyond these, a weight is a mistake, and squares of weighted residuals might not be numbers.
+# Weights outside this range are mistakes. Squares of weighted residuals could overflow.
 _LEAST_WEIGHT, _MOST_WEIGHT = 1e-100, 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridExperiment:
-    """One record laid out for a model.
+    """One record on the grid of a model.
 
     Attributes
     ----------
     grid : Grid
     inputs, outputs, starts : tuple
         In the model's order of inputs, outputs and states.
-    lag : float
-        Largest lag of a state, in integration steps.
+    largest_delay_steps : float
+        Largest delay of a state, in integration steps.
     """
 
     grid: Grid
@@ -54,17 +54,17 @@ class GridExperiment:
 def compute_output_weights(
     model: Model, records: Sequence[Record], weights: Mapping[str, float] | None, skip: int
 ) -> dict[str, float]:
-    """Weight of each output: 1 for one output, else as given or 1 / its standard deviation.
+    """Compute the weight of each output: the setting, or else 1 / its standard deviation.
 
-    With one output a weight would only change the unit of J, and the meaning of a loss scale and
-    a target RMS with it; so none is applied.
+    A single output has weight 1. Another weight would only change the unit of J, and with it the
+    meaning of the loss scale and of the target RMS.
 
     Raises
     ------
     InvalidSettings
         If a weight names no output or is not a number from 1e-100 to 1e100.
     InvalidRecord
-        If an output without a given weight is constant.
+        If an output is constant and `weights` has no entry for it.
     """
     names = [output.name for output in model.outputs]
     for name, weight in (weights or {}).items():
@@ -77,9 +77,9 @@ def compute_output_weights(
             raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a weight; {need}")
     if len(names) == 1:
         return {names[0]: 1.0}
-    given = weights or {}
+    chosen = weights or {}
     return {
-        name: given[name] if name in given else _compute_reciprocal_deviation(name, records, skip)
+        name: chosen[name] if name in chosen else _compute_reciprocal_deviation(name, records, skip)
         for name in names
     }
 
@@ -88,17 +88,17 @@ def _compute_reciprocal_deviation(name: str, records: Sequence[Record], skip: in
     values = np.concatenate(
         [_find_channel(r.outputs, name, "output").values[skip:] for r in records]
     )
-    seen = values[np.isfinite(values)]
-    if not seen.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         raise InvalidRecord(
-            f"output {name!r} has no value after the first {skip} samples, so nothing is left to "
-            "compare with; give a smaller skip, or a longer record"
+            f"output {name!r} has no value after the first {skip} samples, so the fit has no data. "
+            "Use a smaller skip or a longer record"
         )
-    deviation = float(np.std(seen))
+    deviation = float(np.std(finite))
     if deviation == 0.0:
         raise InvalidRecord(
-            f"output {name!r} is constant, so its standard deviation gives no weight; "
-            "give weights for the outputs"
+            f"output {name!r} is constant, so its standard deviation gives no weight. "
+            "Set the weights of the outputs"
         )
     return 1.0 / deviation
 
@@ -113,7 +113,7 @@ def place_on_grid(
     simulates_only: bool = False,
     scored_from: float = -np.inf,
 ) -> GridExperiment:
-    """Lay one record out for a model; samples before `scored_from` (s) are not scored.
+    """Place a record on the grid of a model; samples before `scored_from` (s) are not scored.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def place_on_grid(
 
 
 def replace_outputs(
-    laid: GridExperiment,
+    placed: GridExperiment,
     model: Model,
     record: Record,
     experiment: int,
@@ -153,12 +153,12 @@ def replace_outputs(
     skip: int,
     scored_from: float,
 ) -> GridExperiment:
-    """What `place_on_grid` makes of a record whose inputs and times are those of one laid out before."""
-    outputs, grid = _select_outputs(model, record, (skip, scored_from)), laid.grid
+    """Replace the outputs of a placed experiment; the record has the same inputs and times."""
+    outputs, grid = _select_outputs(model, record, (skip, scored_from)), placed.grid
     since = _find_scoring_starts(model, grid, scored_from)
     rows = {p.name: i for i, p in enumerate(parameters)}
     return replace(
-        laid,
+        placed,
         outputs=tuple(
             _make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs
         ),
@@ -169,7 +169,7 @@ def replace_outputs(
 def _select_outputs(
     model: Model, record: Record, scored: tuple[int, float] | None
 ) -> list[Channel]:
-    """The measured outputs in the model's order; each has samples that count, if any are to."""
+    """Select the measured outputs in the model's order; check their samples if they are scored."""
     outputs = [_find_channel(record.outputs, output.name, "output") for output in model.outputs]
     if scored is not None:
         for channel in outputs:
@@ -181,8 +181,8 @@ def _find_channel(channels: Sequence[Channel], name: str, role: str) -> Channel:
     for channel in channels:
         if channel.name == name:
             return channel
-    known = [channel.name for channel in channels]
-    raise InvalidRecord(f"the record has no {role} {name!r}{suggest_name(name, known)}")
+    names = [channel.name for channel in channels]
+    raise InvalidRecord(f"the record has no {role} {name!r}{suggest_name(name, names)}")
 
 
 def _find_input(record: Record, name: str) -> Channel:
@@ -191,7 +191,7 @@ def _find_input(record: Record, name: str) -> Channel:
     if bad.size:
         raise InvalidRecord(
             f"input {name!r} has no finite value at {channel.times[bad[0]]:g} s "
-            f"(sample {bad[0]}, and {bad.size - 1} more); fill the gap or trim the record"
+            f"(sample {bad[0]}, and {bad.size - 1} more). Fill the gap or trim the record"
         )
     return channel
 
@@ -200,15 +200,15 @@ def _check_scored(channel: Channel, skip: int, scored_from: float) -> None:
     if not np.any(_is_scored(channel, skip, scored_from)):
         later = "" if scored_from == -np.inf else f" and from {scored_from:g} s on"
         raise InvalidRecord(
-            f"output {channel.name!r} has {channel.values.size} samples and none with a value "
-            f"after the first {skip}{later}; nothing is left to compare with"
+            f"output {channel.name!r} has {channel.values.size} samples, but none with a value "
+            f"after the first {skip}{later}. The fit has no data"
         )
 
 
 def _find_scoring_starts(model: Model, grid: Grid, scored_from: float) -> dict[str, float]:
-    """For each output the time (s) from which on its samples are scored.
+    """Find for each output the time (s) from which its samples are scored.
 
-    A recursion that starts at measured values repeats them: they say nothing about the model.
+    A recursion that starts at measured values repeats them, so they say nothing about the model.
     """
     if not is_difference(model):
         return {output.name: scored_from for output in model.outputs}
@@ -238,16 +238,16 @@ def _make_samples(
 
 
 def _interpolate_to_grid(grid: Grid, channel: Channel) -> FloatArray:
-    """The measurement at the grid points."""
+    """Interpolate the measurement to the grid points."""
     return _interpolate_measurement(grid.times, channel)
 
 
 def _interpolate_measurement(times: FloatArray, channel: Channel) -> FloatArray:
-    """The measurement at any times, on a line between its samples; 0 if it has none."""
-    known = np.isfinite(channel.values)
-    if not np.any(known):
+    """Interpolate the measurement linearly to any times; 0 if it has no sample."""
+    is_measured = np.isfinite(channel.values)
+    if not np.any(is_measured):
         return np.zeros(times.size)
-    return np.interp(times, channel.times[known], channel.values[known])
+    return np.interp(times, channel.times[is_measured], channel.values[is_measured])
 
 
 def _make_starts(
@@ -268,12 +268,12 @@ def _make_starts(
 def _read_measured_start(
     model: Model, state: int, grid: Grid, outputs: Sequence[Channel]
 ) -> FloatArray:
-    """First values of a measured state; of its rate, the first difference.
+    """Read the first values of a measured state; the rate of one is its first difference.
 
     Raises
     ------
     InvalidRecord
-        If no output measures the state or what it is the rate of.
+        If no output measures the state or its integral.
     """
     measured = {
         match_plain_state(o.expression): c for o, c in zip(model.outputs, outputs, strict=True)
@@ -287,14 +287,14 @@ def _read_measured_start(
         if equation == PastValue(name, "state") and other.name in measured:
             return _compute_first_slope(measured[other.name])
     raise InvalidRecord(
-        f"state {name!r} is to start at its measured value, but no output measures it or what it "
-        "is the rate of; give its initial value or bounds to estimate it in"
+        f"state {name!r} must start at its measured value, but no output measures it or its "
+        "integral. Set its initial value, or bounds to estimate it"
     )
 
 
 def _compute_first_slope(channel: Channel) -> FloatArray:
-    known = np.isfinite(channel.values)
-    times, values = channel.times[known], channel.values[known]
+    is_measured = np.isfinite(channel.values)
+    times, values = channel.times[is_measured], channel.values[is_measured]
     later = np.flatnonzero(np.diff(times) > 0)
     if later.size == 0:
         return np.zeros(1)

@@ -14,13 +14,11 @@ from sysid.kernels.reads import is_difference
 from sysid.models.model import Model
 
 MOST_STEPS = 20_000_000
-"""Integration steps of one experiment at most."""
+"""Limit on the integration steps of one experiment."""
 
-_JITTER = 0.05  # of a sampling period, that a recursion forgives
-_POINTS_PER_SAMPLE = (
-    4  # grid points in the median distance of irregular samples, for what lies between
-)
-_GRID_TOLERANCE = 0.01  # of a grid step, within which a sample counts as on the point
+_JITTER = 0.05  # of a sampling period: tolerated by a recursion
+_POINTS_PER_SAMPLE = 4  # grid points in the median distance of irregular samples
+_GRID_TOLERANCE = 0.01  # of a grid step: a nearer sample counts as on the point
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +32,12 @@ class Grid:
 
     @property
     def integration_step(self) -> float:
-        """Step of the integration in s; of a recursion, h."""
+        """Integration step in s; for a recursion its period h."""
         return self.step / self.substeps
 
     @property
     def last_step(self) -> int:
-        """Number of the last integration step."""
+        """Index of the last integration step."""
         return (self.points - 1) * self.substeps
 
     @property
@@ -49,26 +47,28 @@ class Grid:
 
     @property
     def duration(self) -> float:
-        """From the first grid point to the last, in s."""
+        """Time from the first grid point to the last, in s."""
         return self.step * (self.points - 1)
 
     def locate_times(self, times: FloatArray) -> FloatArray:
-        """Places of times in grid steps from the start; whole where they are on the grid."""
-        places = (times - self.start) / self.step
-        whole = np.round(places)
-        found: FloatArray = np.where(np.abs(places - whole) < _GRID_TOLERANCE, whole, places)
-        return np.clip(found, 0.0, self.points - 1.0)
+        """Convert times to positions in grid steps; whole numbers where they are on the grid."""
+        positions = (times - self.start) / self.step
+        whole = np.round(positions)
+        snapped: FloatArray = np.where(
+            np.abs(positions - whole) < _GRID_TOLERANCE, whole, positions
+        )
+        return np.clip(snapped, 0.0, self.points - 1.0)
 
 
 def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Grid:
-    """The grid on which a model is compared with an experiment.
+    """Make the grid on which a model is compared with an experiment.
 
     Raises
     ------
     InvalidRecord
-        If a recursion is to be compared with irregular samples, or there are too few of them.
+        If a recursion meets irregular samples, or the samples are too few.
     InvalidSettings
-        If the grid would be too long.
+        If the grid is too long.
     """
     if is_difference(model):
         return _make_sample_grid(outputs, model.solver.substeps)
@@ -83,29 +83,29 @@ def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel
 
 
 def locate_samples(grid: Grid, model: Model, channel: Channel) -> FloatArray:
-    """Places of an output's samples on the grid; a recursion's are whole."""
+    """Locate the samples of an output on the grid; whole numbers for a recursion."""
     if not is_difference(model):
         return grid.locate_times(channel.times)
-    places = (channel.times - grid.start) / grid.step
-    whole: FloatArray = np.round(places)
-    worst = int(np.argmax(np.abs(places - whole)))
-    if abs(places[worst] - whole[worst]) > _JITTER:
+    positions = (channel.times - grid.start) / grid.step
+    whole: FloatArray = np.round(positions)
+    worst = int(np.argmax(np.abs(positions - whole)))
+    if abs(positions[worst] - whole[worst]) > _JITTER:
         raise InvalidRecord(
             f"output {channel.name!r} is not sampled regularly: sample {worst} at "
-            f"{channel.times[worst]:g} s is off the period of {grid.step:g} s; a difference "
-            "equation needs regular samples: resample the record or use a differential model"
+            f"{channel.times[worst]:g} s is off the period of {grid.step:g} s. A difference "
+            "equation needs regular samples. Resample the record or use a differential model"
         )
     if np.any(np.diff(whole) < 1):
-        again = int(np.argmax(np.diff(whole) < 1)) + 1
+        repeated = int(np.argmax(np.diff(whole) < 1)) + 1
         raise InvalidRecord(
-            f"output {channel.name!r} has two samples at {channel.times[again]:g} s; "
-            "a difference equation needs one"
+            f"output {channel.name!r} has two samples at {channel.times[repeated]:g} s. "
+            "A difference equation needs one"
         )
     return whole
 
 
 def is_on_grid(places: FloatArray) -> bool:
-    """Whether each sample has a grid point of its own."""
+    """Return whether each sample has its own grid point."""
     return bool(np.all(places == np.round(places)) and np.all(np.diff(places) > 0))
 
 
@@ -118,12 +118,12 @@ def _make_sample_grid(outputs: Sequence[Channel], substeps: int) -> Grid:
 
 
 def _choose_simulation_step(outputs: Sequence[Channel]) -> float:
-    """The outputs' period; a part of it where their samples lie anywhere between its multiples."""
+    """Choose the outputs' period, or a fraction of it where their samples are irregular."""
     period = _find_output_period(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     for channel in outputs:
-        places = (channel.times - first) / period
-        if np.any(np.abs(places - np.round(places)) > _JITTER):
+        positions = (channel.times - first) / period
+        if np.any(np.abs(positions - np.round(positions)) > _JITTER):
             return period / _POINTS_PER_SAMPLE
     return period
 
@@ -132,16 +132,16 @@ def _find_output_period(outputs: Sequence[Channel]) -> float:
     periods = [p for p in (_estimate_period(channel) for channel in outputs) if p is not None]
     if not periods:
         raise InvalidRecord(
-            f"output {outputs[0].name!r} has samples at one time only; need two times or more"
+            f"output {outputs[0].name!r} has samples at one time only. Need two times or more"
         )
     return min(periods)
 
 
 def _estimate_period(channel: Channel) -> float | None:
-    """Sampling period; of irregular samples the median distance.
+    """Estimate the sampling period; for irregular samples the median distance.
 
-    Times are often written with few digits, which makes every distance, and so their median, a
-    little wrong: over 20,000 samples it adds up to whole periods. The mean over all is right.
+    Times are often written with few digits, so each distance and their median are a little wrong.
+    Over 20,000 samples the error adds up to whole periods. The mean over all samples is right.
     """
     median = estimate_sampling_period(channel)
     if median is None:
@@ -158,6 +158,6 @@ def _check_length(steps: float) -> None:
     if steps > MOST_STEPS:
         raise InvalidSettings(
             "/model/solver/step",
-            f"the simulation would take {steps:.3g} steps, and may take {MOST_STEPS:g}; "
-            "give a longer step or cut the record",
+            f"the simulation needs {steps:.3g} steps, but the limit is {MOST_STEPS:g}. "
+            "Set a longer step or cut the record",
         )

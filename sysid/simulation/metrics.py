@@ -1,4 +1,4 @@
-"""How well a simulation agrees with a measurement."""
+"""Agreement of a simulation with a measurement: RMS and fit in percent."""
 
 from dataclasses import dataclass
 
@@ -8,14 +8,14 @@ from sysid.core.types import FloatArray
 
 
 def rms(residual: FloatArray) -> float:
-    """√mean e² (Eq. 10), in the residual's unit."""
+    """Compute √mean e² (Eq. 10) in the residual's unit."""
     return float(np.sqrt(np.mean(np.square(residual))))
 
 
 def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
-    """100 (1 - ‖y - ŷ‖ / ‖y - mean y‖): 100 is perfect, 0 as good as the mean.
+    """Compute 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖): 100 is perfect, 0 as good as the mean.
 
-    ``nan`` for a constant measurement, against which no fit can be told.
+    ``nan`` for a constant measurement, for which the ratio is undefined.
     """
     spread = float(np.linalg.norm(measured - np.mean(measured)))
     if spread == 0.0:
@@ -27,8 +27,7 @@ def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
 class ChannelMetrics:
     """Agreement of one output of one experiment, over its scored samples.
 
-    `span` is from the least to the largest measured value: an estimate holds for amplitudes such
-    as these.
+    `span` holds the least and the largest measured value. The estimate holds for such amplitudes.
     """
 
     experiment: int
@@ -47,7 +46,7 @@ class Metrics:
     Attributes
     ----------
     rms : float
-        J of Eq. 10: with one output, unweighted in its unit; with several, weighted.
+        J of Eq. 10: unweighted, in the output's unit, for one output; weighted for several.
     unit : str
     fit_percent : float
         Over all scored samples, each output of each experiment about its own mean, weighted.

@@ -1,4 +1,4 @@
-"""The numbers of one experiment as a kernel reads them (see `sysid.kernels.layout`)."""
+"""An experiment packed into two arrays that a kernel reads (see `sysid.kernels.layout`)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,12 +24,12 @@ from sysid.models.delays import check_record_length
 from sysid.models.model import Model
 from sysid.simulation.grid import Grid, is_on_grid
 
-_HISTORY_SLACK = 512  # rows of history besides those that lags reach back: how often they are moved
+_HISTORY_SLACK = 512  # rows of history beyond the largest delay: they are moved so often
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputSamples:
-    """Measured samples of one output: places on the grid, values (0: missing), weights."""
+    """Measured samples of one output: positions on the grid, values (0: missing), weights."""
 
     places: FloatArray
     values: FloatArray
@@ -40,7 +40,7 @@ class OutputSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateStart:
-    """How a state starts: given first values, and the row of theta if it is estimated."""
+    """Start of a state: its first values, and its row of theta if it is estimated."""
 
     first_values: FloatArray
     row: int = -1
@@ -48,7 +48,7 @@ class StateStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedExperiment:
-    """What a kernel gets for one experiment."""
+    """One experiment as a kernel reads it."""
 
     ints: IntArray
     floats: FloatArray
@@ -58,12 +58,14 @@ class PackedExperiment:
 def find_largest_delays(
     model: Model, kind: str, parameters: Mapping[str, Interval], grid: Grid
 ) -> dict[str, float]:
-    """Largest lag of each lagged signal of a kind, in integration steps, inside the bounds.
+    """Find the largest delay of each delayed signal of a kind, in integration steps.
+
+    The delays are bounded by the bounds of the parameters.
 
     Raises
     ------
     RecordTooShort
-        If a lag may be as long as the record.
+        If a delay can be as long as the record.
     """
     largest: dict[str, float] = {}
     step = grid.integration_step
@@ -80,20 +82,22 @@ def find_largest_delays(
 def interpolate_inputs(
     model: Model, channels: Sequence[Channel], parameters: Mapping[str, Interval], grid: Grid
 ) -> list[FineInput]:
-    """The inputs between their samples, as far back as the lags may reach."""
+    """Interpolate the inputs, as far back as the largest delays reach."""
     reach = find_largest_delays(model, "input", parameters, grid)
     back = find_furthest_offset(model)
     mean: Literal["around", "after"] = "after" if is_difference(model) else "around"
     averaged = find_averaged_inputs(model)
-    laid = []
+    fine_inputs = []
     for quantity, channel in zip(model.inputs, channels, strict=True):
         name = quantity.name
-        lag = reach.get(name, 0.0) + back + 1
-        how = mean if name in averaged else None
-        laid.append(
-            interpolate_input(channel, grid.start, grid.integration_step, grid.last_step, lag, how)
+        delay_steps = reach.get(name, 0.0) + back + 1
+        averaging = mean if name in averaged else None
+        fine_inputs.append(
+            interpolate_input(
+                channel, grid.start, grid.integration_step, grid.last_step, delay_steps, averaging
+            )
         )
-    return laid
+    return fine_inputs
 
 
 def pack_experiment(
@@ -103,33 +107,37 @@ def pack_experiment(
     inputs: Sequence[FineInput],
     outputs: Sequence[OutputSamples],
     starts: Sequence[StateStart],
-    lag: float,
+    largest_delay_steps: float,
     scale: float,
 ) -> PackedExperiment:
-    """Lay out one experiment.
+    """Pack one experiment into the arrays of a kernel.
 
     Parameters
     ----------
-    lag : float
-        Largest lag of a state, in integration steps.
+    largest_delay_steps : float
+        Largest delay of a state, in integration steps.
     scale : float
         Scale of the soft-l1 loss.
     """
-    page = _ArrayBuilder(ExperimentLayout.from_model(model))
-    cap = ceil(lag)  # a lag rounded to whole steps may exceed its bound by part of one
+    builder = _ArrayBuilder(ExperimentLayout.from_model(model))
+    cap = ceil(
+        largest_delay_steps
+    )  # a delay rounded to whole steps may exceed its bound by part of one
     reach = cap + find_furthest_offset(model) + 5
     rows = max(min(grid.last_step + reach + 3, 2 * reach + _HISTORY_SLACK), 2 * reach + 3)
-    page.ints[:3] = [grid.last_step, reach, rows]
-    page.floats[:3] = [grid.integration_step, cap, scale]
+    builder.ints[:3] = [grid.last_step, reach, rows]
+    builder.floats[:3] = [grid.integration_step, cap, scale]
     for i, start in enumerate(starts):
-        page.floats[page.layout.locate_initial(i)] = start.first_values[0]
-        page.write_entries("state", i, row=start.row, given=page.add_floats(start.first_values))
+        builder.floats[builder.layout.locate_initial(i)] = start.first_values[0]
+        builder.write_entries(
+            "state", i, row=start.row, given=builder.add_floats(start.first_values)
+        )
     for i, signal in enumerate(inputs):
-        place = page.add_floats(signal.values)
-        page.write_entries(
+        offset = builder.add_floats(signal.values)
+        builder.write_entries(
             "input",
             i,
-            zero=place + signal.start_index,
+            zero=offset + signal.start_index,
             points=signal.points_per_step,
             begin=signal.begin,
             end=signal.end,
@@ -138,15 +146,17 @@ def pack_experiment(
     first = 0
     for i, samples in enumerate(outputs):
         add = _pack_grid_samples if variant.on_grid else _pack_scattered_samples
-        add(page, i, samples, grid, first)
-        page.write_entries("output", i, first=first, grid=page.add_floats(samples.grid_values))
+        add(builder, i, samples, grid, first)
+        builder.write_entries(
+            "output", i, first=first, grid=builder.add_floats(samples.grid_values)
+        )
         first += samples.places.size
     n_work = max(len(list_states_with_history(model)) * rows * LANES, 1)
-    return PackedExperiment(*page.build_arrays(), n_work)
+    return PackedExperiment(*builder.build_arrays(), n_work)
 
 
 class _ArrayBuilder:
-    """The two arrays, growing behind their heads."""
+    """The two arrays of an experiment; values are appended behind their heads."""
 
     def __init__(self, layout: ExperimentLayout) -> None:
         self.layout = layout
@@ -158,70 +168,70 @@ class _ArrayBuilder:
 
     def write_entries(self, kind: str, number: int, **fields: int) -> None:
         """Write entries of a state, an input or an output into the head."""
-        place = getattr(self.layout, f"locate_{kind}")
+        locate = getattr(self.layout, f"locate_{kind}")
         for field, value in fields.items():
-            self.ints[place(number, field)] = value
+            self.ints[locate(number, field)] = value
 
     def add_ints(self, values: IntArray) -> int:
-        """Append whole numbers; gives their place."""
+        """Append integers and return their offset."""
         self._more_ints.append(values)
         self._n_ints += values.size
         return self._n_ints - values.size
 
     def add_floats(self, values: FloatArray) -> int:
-        """Append numbers; gives their place."""
+        """Append floats and return their offset."""
         self._more_floats.append(values)
         self._n_floats += values.size
         return self._n_floats - values.size
 
     def build_arrays(self) -> tuple[IntArray, FloatArray]:
-        """Both arrays as a whole."""
+        """Build both arrays."""
         ints = np.concatenate([np.array(self.ints, dtype=np.int64), *self._more_ints])
         return ints, np.concatenate([np.array(self.floats), *self._more_floats])
 
 
 def _pack_grid_samples(
-    page: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
+    builder: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
 ) -> None:
-    """Dense arrays over the grid points: row of the prediction or -1, value, weight."""
+    """Pack dense arrays over the grid points: row of the prediction or -1, value, weight."""
     points = samples.places.astype(np.int64)
     rows = np.full(grid.points, -1, dtype=np.int64)
     rows[points] = first + np.arange(points.size)
     values, weights = np.zeros(grid.points), np.zeros(grid.points)
     values[points], weights[points] = samples.values, samples.weights
-    page.write_entries(
+    builder.write_entries(
         "output",
         i,
-        samples=page.add_ints(rows),
-        measured=page.add_floats(values),
-        weight=page.add_floats(weights),
+        samples=builder.add_ints(rows),
+        measured=builder.add_floats(values),
+        weight=builder.add_floats(weights),
     )
 
 
 def _pack_scattered_samples(
-    page: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
+    builder: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
 ) -> None:
-    """Per grid interval (n - 1, n]: the bounds of its samples and their positions inside it."""
+    """Pack for each grid interval (n - 1, n] the bounds of its samples and their positions."""
     interval = np.ceil(samples.places)
     fraction = samples.places - (interval - 1.0)
-    bounds_ = np.searchsorted(interval, np.arange(grid.points + 1), side="left")
-    page.write_entries(
+    interval_bounds = np.searchsorted(interval, np.arange(grid.points + 1), side="left")
+    builder.write_entries(
         "output",
         i,
-        samples=page.add_ints(bounds_.astype(np.int64)),
-        fraction=page.add_floats(fraction),
-        measured=page.add_floats(samples.values),
-        weight=page.add_floats(samples.weights),
+        samples=builder.add_ints(interval_bounds.astype(np.int64)),
+        fraction=builder.add_floats(fraction),
+        measured=builder.add_floats(samples.values),
+        weight=builder.add_floats(samples.weights),
     )
 
 
 def are_on_grid(outputs: Sequence[OutputSamples]) -> bool:
-    """Whether every output has its samples on grid points of their own."""
+    """Return whether each sample of each output has its own grid point."""
     return all(is_on_grid(samples.places) for samples in outputs)
 
 
 def has_weights(outputs: Sequence[OutputSamples], grid: Grid, on_grid: bool) -> bool:
-    """Whether some weight is not 1; a grid point without a sample has weight 0."""
+    """Return whether some weight is not 1; a grid point without a sample has weight 0."""
     return any(
         bool(np.any(samples.weights != 1.0)) or (on_grid and samples.places.size != grid.points)
         for samples in outputs

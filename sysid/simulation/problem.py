@@ -1,4 +1,4 @@
-"""A problem: a model, the records it is to explain, and the fitness of a population on them."""
+"""A problem: a model, its records, and the fitness of a population of candidates on them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,31 +35,31 @@ _ReduceResult = tuple[Callable[..., "Problem"], tuple[Any, ...]]
 class Problem:
     """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
 
-    Make one with `Problem.build` or `Problem.from_settings`. Pickling sends what it was built
-    from, since the address of compiled code means nothing in another process.
+    Create it with `Problem.build` or `Problem.from_settings`. Pickling sends the arguments of its
+    construction, because the address of compiled code is valid in one process only.
 
     Attributes
     ----------
     model : Model
-        With tied parameters replaced by what they are tied to.
+        With tied parameters replaced by their expressions.
     untied_model : Model
-        The model that the problem was built from.
+        The model before the ties were replaced.
     records : tuple of Record
     settings : FitSettings
     all_parameters : tuple of Parameter
-        K: the model's, then the estimated initial states, named ``x(0)`` in the first experiment
-        and ``x(0)[2]`` in the second.
-    space : tuple of Parameter
-        D: those of them that are free.
+        K: the model's, then the estimated initial states. Their names are ``x(0)`` in the first
+        experiment and ``x(0)[2]`` in the second.
+    free_parameters : tuple of Parameter
+        D: the free ones among them.
     ties : mapping of str to Expression
-        What each tied parameter is, in terms of free and fixed ones.
+        Each tied parameter in terms of free and fixed ones.
     evaluator : Evaluator
         The problem as compiled code sees it.
-    experiments : tuple of Experiment
+    experiments : tuple of GridExperiment
     output_weights : mapping of str to float
-        Weight of each output, as given or found from the records.
+        Weight of each output, from the settings or computed from the records.
     simulates_only : bool
-        Whether every parameter is fixed, and nothing is compared with the records.
+        Whether every parameter is fixed and nothing is compared with the records.
     """
 
     model: Model
@@ -87,16 +87,18 @@ class Problem:
         skip: int = 0,
         scored_from: Sequence[float] | None = None,
     ) -> "Problem":
-        """A problem from the fields of `FitSettings`; raises as `from_settings` does."""
-        since = None if scored_from is None else tuple(scored_from)
-        settings = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip, since)
+        """Build a problem from the fields of `FitSettings`; raises as `from_settings` does."""
+        scoring_starts = None if scored_from is None else tuple(scored_from)
+        settings = FitSettings(
+            parameters or {}, prediction, loss or Loss(), weights, skip, scoring_starts
+        )
         return cls.from_settings(model, records, settings)
 
     @classmethod
     def from_settings(
         cls, model: Model, records: Sequence[Record], settings: FitSettings
     ) -> "Problem":
-        """Lay the records out for the model and compile it.
+        """Place the records on the grid of the model and compile it.
 
         Raises
         ------
@@ -107,25 +109,33 @@ class Problem:
         """
         records = tuple(records)
         if model.rule is not None:
-            raise InvalidSettings("/model/terms", "the terms are not selected yet; see `selected`")
+            raise InvalidSettings("/model/terms", "the terms are not selected yet. See `selected`")
         if not records:
-            raise InvalidRecord("there is no record to compare the model with; need one or more")
-        since = (-np.inf,) * len(records) if settings.scored_from is None else settings.scored_from
-        if len(since) != len(records):
+            raise InvalidRecord("there is no record to compare the model with. Need one or more")
+        scoring_starts = (
+            (-np.inf,) * len(records) if settings.scored_from is None else settings.scored_from
+        )
+        if len(scoring_starts) != len(records):
             raise InvalidSettings(
                 "/scored_from",
-                f"found {len(since)} times for {len(records)} records; need one each",
+                f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
-        everything = override_parameters(
+        all_parameters = override_parameters(
             (*model.parameters, *build_initial_parameters(model, len(records))), settings.parameters
         )
-        ties = resolve_ties(model, everything)
+        ties = resolve_ties(model, all_parameters)
         tied = apply_ties(model, ties)
-        check_delays(tied, everything)
+        check_delays(tied, all_parameters)
         per_output = compute_output_weights(tied, records, settings.weights, settings.skip)
         experiments = tuple(
             place_on_grid(
-                tied, record, e, everything, per_output, settings.skip, scored_from=since[e]
+                tied,
+                record,
+                e,
+                all_parameters,
+                per_output,
+                settings.skip,
+                scored_from=scoring_starts[e],
             )
             for e, record in enumerate(records)
         )
@@ -134,9 +144,9 @@ class Problem:
             untied_model=model,
             records=records,
             settings=settings,
-            all_parameters=everything,
-            free_parameters=tuple(parameter for parameter in everything if parameter.is_free),
-            evaluator=_build_evaluator(tied, experiments, everything, settings),
+            all_parameters=all_parameters,
+            free_parameters=tuple(parameter for parameter in all_parameters if parameter.is_free),
+            evaluator=_build_evaluator(tied, experiments, all_parameters, settings),
             experiments=experiments,
             output_weights=per_output,
             ties=ties,
@@ -145,7 +155,7 @@ class Problem:
     def rebuild(
         self, *, model: Model | None = None, records: Sequence[Record] | None = None, **changes: Any
     ) -> "Problem":
-        """The problem of another model, of other records, or with changed fields of its settings.
+        """Build the problem again with another model, other records or changed settings.
 
         Raises as `from_settings` does.
         """
@@ -216,13 +226,13 @@ class Problem:
         )
 
     def predict(self, theta: FloatArray) -> FloatArray:
-        """Simulated values at the measured times, (P, D) → (P, M)."""
+        """Simulate the values at the measured times, (P, D) → (P, M)."""
         return predict_population(
             self.evaluator, _check_population(theta, len(self.free_parameters))
         )
 
     def split_by_output(self, values: FloatArray) -> list[dict[str, FloatArray]]:
-        """Values (M,) as one array for each output of each experiment."""
+        """Split values (M,) into one array for each output of each experiment."""
         parts: list[dict[str, FloatArray]] = []
         first = 0
         for experiment in self.experiments:
@@ -240,7 +250,7 @@ class Problem:
 
     @cached_property
     def scored_rows(self) -> IntArray:
-        """Which of the M measured values enter J."""
+        """Indices of the M measured values that enter J."""
         return np.flatnonzero(self.evaluator.weight > 0)
 
     @property
@@ -250,12 +260,14 @@ class Problem:
 
     @cached_property
     def n_steps(self) -> int:
-        """Steps of integration, or of the recursion, that a simulation takes."""
-        return sum(one.grid.points * one.grid.substeps for one in self.experiments)
+        """Steps of a simulation: of the integration or of the recursion."""
+        return sum(
+            experiment.grid.points * experiment.grid.substeps for experiment in self.experiments
+        )
 
     @cached_property
     def output_scale(self) -> float:
-        """J of a simulation that gives each output's mean: what a model should stay well below."""
+        """J of a simulation that returns each output's mean; a good model is well below."""
         total = 0.0
         for measured, weight in self._list_channels(self.evaluator.measured):
             scored = weight > 0
@@ -265,7 +277,7 @@ class Problem:
         return sqrt(total / max(self.n_scored, 1))
 
     def evaluate_metrics(self, theta: FloatArray) -> Metrics:
-        """Agreement of one individual (D,) with the records; what `skip` leaves out is not in."""
+        """Compute the agreement of one individual (D,) with the scored samples of the records."""
         simulated = self.predict(np.atleast_2d(theta))[0]
         return compute_metrics(self, simulated)
 
@@ -277,14 +289,14 @@ class Problem:
 
 
 def compute_metrics(problem: Problem, simulated: FloatArray) -> Metrics:
-    """Agreement of simulated values (M,) with the records of a problem."""
+    """Compute the agreement of simulated values (M,) with the records of a problem."""
     weight = problem.evaluator.weight
     error = weight * (problem.evaluator.measured - simulated)
-    one = len(problem.model.outputs) == 1
+    has_one_output = len(problem.model.outputs) == 1
     with np.errstate(all="ignore"):  # a diverged simulation has an infinite residual
         channels = tuple(_compute_channel_metrics(problem, simulated))
         scored = weight > 0
-        total = rms((error / np.where(scored, weight, 1.0) if one else error)[scored])
+        total = rms((error / np.where(scored, weight, 1.0) if has_one_output else error)[scored])
         scale = problem.output_scale
         fit = 100.0 * (1.0 - rms(error[scored]) / scale) if scale > 0 else float("nan")
     return Metrics(total, problem.unit, fit, channels)
@@ -293,16 +305,16 @@ def compute_metrics(problem: Problem, simulated: FloatArray) -> Metrics:
 def compute_reference_rms(
     problem: Problem, simulated: Sequence[Sequence[FloatArray]], records: Sequence[Record]
 ) -> float:
-    """J of simulated outputs against other values at the same samples, such as noise-free ones.
+    """Compute J of simulated outputs against other values, such as noise-free ones.
 
     Parameters
     ----------
     simulated : sequence of sequence of FloatArray
         By experiment and output, as `Identification.simulated`.
     records : sequence of Record
-        As many, of the same channels and times as those of the problem.
+        As many as in the problem, with the same channels and times.
     """
-    one, errors = len(problem.model.outputs) == 1, []
+    has_one_output, errors = len(problem.model.outputs) == 1, []
     for part, outputs, record in zip(
         problem.split_by_output(problem.evaluator.weight), simulated, records, strict=True
     ):
@@ -310,13 +322,13 @@ def compute_reference_rms(
             zip(part, outputs, strict=True), record.outputs, strict=True
         ):
             scored = part[name] > 0
-            weight = 1.0 if one else part[name][scored]
+            weight = 1.0 if has_one_output else part[name][scored]
             errors.append(weight * (channel.values - values)[scored])
     return rms(np.concatenate(errors))
 
 
 def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
-    found = []
+    channels = []
     parts = zip(
         problem.split_by_output(problem.evaluator.measured),
         problem.split_by_output(simulated),
@@ -328,7 +340,7 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
             scored = weight[output.name] > 0
             if np.any(scored):
                 y, computed = measured[output.name][scored], model[output.name][scored]
-                found.append(
+                channels.append(
                     ChannelMetrics(
                         experiment,
                         output.name,
@@ -339,11 +351,11 @@ def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[Ch
                         (float(np.min(y)), float(np.max(y))),
                     )
                 )
-    return found
+    return channels
 
 
 def build_simulation_problem(model: Model, record: Record) -> Problem:
-    """A problem that only simulates: every parameter is fixed, and nothing is compared."""
+    """Build a problem that only simulates: all parameters are fixed and nothing is compared."""
     weights = {output.name: 1.0 for output in model.outputs}
     experiment = place_on_grid(model, record, 0, model.parameters, weights, 0, simulates_only=True)
     settings = FitSettings(weights=weights)
@@ -373,7 +385,7 @@ def _build_evaluator(
     loss = settings.loss
     one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"
     variant = KernelVariant(one_step, is_robust, on_grid, weighted)
-    laid = [
+    packed = [
         pack_experiment(
             model, variant, e.grid, e.inputs, e.outputs, e.starts, e.largest_delay_steps, loss.scale
         )
@@ -390,10 +402,10 @@ def _build_evaluator(
         lower=np.array([p.lower for p in free], dtype=np.float64),
         upper=np.array([p.upper for p in free], dtype=np.float64),
         is_log=np.array([p.scale == "log" for p in free], dtype=np.int64),
-        offsets=_locate_experiments(laid, experiments),
-        ints=np.concatenate([one.ints for one in laid]),
-        floats=np.concatenate([one.floats for one in laid]),
-        n_work=max(one.n_work for one in laid),
+        offsets=_locate_experiments(packed, experiments),
+        ints=np.concatenate([experiment.ints for experiment in packed]),
+        floats=np.concatenate([experiment.floats for experiment in packed]),
+        n_work=max(experiment.n_work for experiment in packed),
         n_measured=weight.size,
         weight=weight,
         measured=np.concatenate([s.values for s in samples]),
@@ -402,12 +414,12 @@ def _build_evaluator(
 
 
 def _locate_experiments(
-    laid: Sequence[PackedExperiment], experiments: Sequence[GridExperiment]
+    packed_experiments: Sequence[PackedExperiment], experiments: Sequence[GridExperiment]
 ) -> Any:
-    """Where each experiment's numbers and its measured values begin."""
+    """Compute where each experiment's numbers and its measured values begin."""
     lengths = [
-        (one.ints.size, one.floats.size, sum(s.places.size for s in e.outputs))
-        for one, e in zip(laid, experiments, strict=True)
+        (packed.ints.size, packed.floats.size, sum(s.places.size for s in e.outputs))
+        for packed, e in zip(packed_experiments, experiments, strict=True)
     ]
     ends = np.cumsum(np.array(lengths, dtype=np.int64), axis=0)
     return np.ascontiguousarray(np.vstack([np.zeros((1, 3), dtype=np.int64), ends[:-1]]))
@@ -418,14 +430,14 @@ def _check_population(theta: FloatArray, free: int) -> FloatArray:
     if values.ndim != 2 or values.shape[1] != free:
         raise InvalidSettings(
             "/parameters",
-            f"candidates have shape {values.shape}; need (P, {free}), one column for each free "
+            f"candidates have shape {values.shape}. Need (P, {free}), one column for each free "
             "parameter",
         )
     return values
 
 
 def compute_record_progress(problem: Problem) -> FloatArray:
-    """Part of its experiment (0 … 1) that has to be simulated for each of the M measured values."""
+    """Compute the share of its experiment (0 … 1) that each measured value (M,) requires."""
     return np.concatenate(
         [
             np.ceil(samples.places) / max(experiment.grid.points - 1, 1)

@@ -1,4 +1,4 @@
-"""Parameters to and from the unit interval."""
+"""Conversion of parameters to and from the unit interval."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from sysid.simulation.evaluator import Evaluator
 
 @jit_compile
 def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
-    """Physical values of places in [0, 1]: (P, D) → (P, D)."""
+    """Convert positions in [0, 1] to physical values: (P, D) → (P, D)."""
     theta = np.empty(places.shape)
     for d in range(places.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]
@@ -24,7 +24,7 @@ def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
 
 @jit_compile
 def to_unit(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
-    """Places of physical values, the inverse of `from_unit`; values out of bounds go to the bound."""
+    """Convert physical values to positions, the inverse of `from_unit`; clipped to the bounds."""
     places = np.empty(theta.shape)
     for d in range(theta.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]
@@ -38,9 +38,9 @@ def to_unit(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 
 AT_BOUND = 1e-6
-"""Of the interval: an estimate nearer to its end than that lies at its bound."""
+"""Share of the interval: an estimate nearer to a bound counts as at the bound."""
 
 
 def is_at_bounds(places: FloatArray) -> tuple[BoolArray, BoolArray]:
-    """Whether each place in [0, 1] lies at the lower end, and whether at the upper one."""
+    """Return which positions in [0, 1] are at the lower end, and which at the upper one."""
     return np.asarray(places < AT_BOUND), np.asarray(places > 1.0 - AT_BOUND)

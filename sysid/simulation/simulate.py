@@ -1,4 +1,4 @@
-"""Free run of a model with known parameters: inputs in, outputs out."""
+"""Simulation of a model with given parameter values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from sysid.simulation.problem import build_simulation_problem
 def simulate(
     model: Model, inputs: Sequence[Channel], values: Mapping[str, float], *, times: FloatArray
 ) -> Recording:
-    """Outputs of a model at given times.
+    """Simulate the outputs of a model at some times.
 
     Parameters
     ----------
@@ -27,11 +27,11 @@ def simulate(
     inputs : sequence of Channel
         One for each input of the model, of the same name; others are ignored.
     values : mapping of str to float
-        Every parameter, inside or outside its bounds, and initial values such as ``x(0)`` where
-        the model does not fix them (where it does, they replace its own). One that the model fixes
-        or ties to others may be left out.
+        Every parameter, inside or outside its bounds, and initial values such as ``x(0)``. Initial
+        values that the model fixes are optional and replace its own. Parameters that the model
+        fixes or ties to others are optional.
     times : FloatArray, shape (N,)
-        Seconds, not decreasing; regular for a difference equation, whose period they give.
+        Seconds, not decreasing. For a difference equation they are regular and set its period.
 
     Returns
     -------
@@ -43,11 +43,11 @@ def simulate(
     InvalidSettings
         If a value is missing, unknown or not finite.
     InvalidRecord, RecordTooShort
-        If an input is missing or the times are too short for the model's lags.
+        If an input is missing or the times are too short for the model's delays.
     """
     _check_values(model, values)
     values = complete_values(model, values)
-    known = tuple(
+    fixed_parameters = tuple(
         _fix_parameter(parameter, values[parameter.name]) for parameter in model.parameters
     )
     initial = tuple(
@@ -55,23 +55,27 @@ def simulate(
         for start, state in zip(model.initial, model.states, strict=True)
     )
     if times.ndim != 1 or times.size < 2:
-        raise InvalidRecord(f"times have shape {times.shape}; need two times or more")
+        raise InvalidRecord(f"times have shape {times.shape}. Need two times or more")
     missing = np.full(times.size, np.nan)
     outputs = tuple(Channel(o.name, times, missing, o.unit) for o in model.outputs)
     problem = build_simulation_problem(
-        replace(model, parameters=known, initial=initial), Record(tuple(inputs), outputs)
+        replace(model, parameters=fixed_parameters, initial=initial), Record(tuple(inputs), outputs)
     )
-    found = problem.split_by_output(problem.predict(np.empty((1, 0)))[0])[0]
-    return Recording(tuple(replace(c, values=found[c.name].copy()) for c in outputs))
+    simulated = problem.split_by_output(problem.predict(np.empty((1, 0)))[0])[0]
+    return Recording(tuple(replace(c, values=simulated[c.name].copy()) for c in outputs))
 
 
 def complete_values(model: Model, values: Mapping[str, float]) -> dict[str, float]:
-    """The values, and those of fixed and tied parameters that are not among them."""
-    fixed = {one.name: one.fixed for one in model.parameters if one.fixed is not None}
-    known = {**fixed, **values}
-    free = [replace(p, tied=None) if p.name in known else p for p in model.parameters]
-    ties = {name: value_of(tie, known) for name, tie in resolve_ties(model, free).items()}
-    return {**ties, **known}
+    """Add the values of fixed and tied parameters that are missing."""
+    fixed = {
+        parameter.name: parameter.fixed
+        for parameter in model.parameters
+        if parameter.fixed is not None
+    }
+    available = {**fixed, **values}
+    free = [replace(p, tied=None) if p.name in available else p for p in model.parameters]
+    ties = {name: value_of(tie, available) for name, tie in resolve_ties(model, free).items()}
+    return {**ties, **available}
 
 
 def _check_values(model: Model, values: Mapping[str, float]) -> None:
@@ -92,7 +96,7 @@ def _check_values(model: Model, values: Mapping[str, float]) -> None:
 
 
 def _fix_parameter(parameter: Parameter, value: float) -> Parameter:
-    """The parameter fixed at a value, which may lie outside its bounds."""
+    """Fix a parameter at a value, which may lie outside its bounds."""
     value = float(value)
     lower, upper = min(parameter.lower, value), max(parameter.upper, value)
     return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear", tied=None)
@@ -105,5 +109,5 @@ def _fix_initial(start: InitialState, state: str, values: Mapping[str, float]) -
     if isinstance(start, FixedInitial):
         return start
     raise InvalidSettings(
-        f"/parameters/{name}", f"a value is missing: the model does not fix where {state!r} starts"
+        f"/parameters/{name}", f"a value is missing. The model does not fix where {state!r} starts"
     )
