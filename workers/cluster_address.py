@@ -31,20 +31,20 @@ def check_address(address: str) -> None:
         return
     if "://" in address:
         raise ClusterUnavailable(
-            f"the Ray address {address!r} is one of Ray Client, which is not used: run the "
-            "dispatcher on a machine of the cluster, and give the address of its head as host:port"
+            f"the Ray address {address!r} is one of Ray Client, which is not supported. Run the "
+            "dispatcher inside the cluster, and give the address of its head as host:port."
         )
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 2**16:
         raise ClusterUnavailable(
-            f"the Ray address {address!r} is none: write host:port of the cluster's head, such as "
-            "10.0.0.5:6379, or auto for the cluster of this machine"
+            f"the Ray address {address!r} is invalid: write host:port of the cluster's head, such "
+            "as 10.0.0.5:6379, or auto for the cluster of this machine"
         )
     try:
         socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
     except OSError as error:
         raise ClusterUnavailable(
-            f"no Ray cluster answers at {address} ({error.strerror or error}); is its head "
+            f"no Ray cluster answers at {address} ({error.strerror or error}). Is its head "
             "running, and is this its address?"
         ) from error
     if not has_token():
@@ -70,7 +70,7 @@ def explain_failure(address: str | None, error: BaseException) -> str:
         return f"Ray could not be started: {text}"
     if isinstance(error, ConnectionError):
         return (
-            f"the Ray cluster at {address} is there but does not let us in; its token is another "
-            f"one, most likely: {TOKEN_HINT}"
+            f"the Ray cluster at {address} answers, but refuses the connection. Most likely its "
+            f"token is a different one: {TOKEN_HINT}"
         )
     return f"the Ray cluster at {address} could not be joined: {text}"

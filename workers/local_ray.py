@@ -106,8 +106,8 @@ def make_folder() -> Path:
         folder.mkdir(mode=0o700)  # fails for whatever is there, so that it is ours and new
     except OSError as error:
         raise ClusterUnavailable(
-            f"Ray's folder {folder} cannot be made ({error.strerror}): remove it if it is there, "
-            "or set TMPDIR to a folder of your own"
+            f"Ray's folder {folder} cannot be made ({error.strerror}). Remove it if it exists, "
+            "or set TMPDIR to a folder of your own."
         ) from error
     return folder
 

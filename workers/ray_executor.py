@@ -177,7 +177,7 @@ class RayExecutor:
         except errors.TaskCancelledError as error:
             raise PackCancelled("cancelled") from error
         except errors.GetTimeoutError as error:
-            raise ClusterLost("Ray does not hand out a finished result") from error
+            raise ClusterLost("Ray does not deliver a finished result") from error
         except errors.RayTaskError as error:
             raise PackFailed(str(error)) from error
         except errors.RayError as error:  # crashed, out of memory, node or object lost
@@ -283,8 +283,8 @@ def _require_same_program(found: Sequence[str]) -> None:
     others = set(found) - {compute_fingerprint(Path(__file__).parent)}
     if others:
         raise ClusterUnavailable(
-            "some of the Ray workers have another version of lagid or its libraries than the "
-            "dispatcher, or machines of another kind: results would depend on where they are made"
+            "some Ray workers differ from the dispatcher in the version of lagid, in its "
+            "libraries or in the kind of machine. Results would depend on where they are computed."
         )
 
 

@@ -117,7 +117,7 @@ class PidControl:
                 raise InvalidSettings(f"/{name}", _describe_not_finite(value))
             if value is not None and self.limit is not None:
                 raise InvalidSettings(
-                    f"/{name}", "the limit ± is given too; give that or lower and upper"
+                    f"/{name}", "the limit ± is given too; use either that, or lower and upper"
                 )
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise InvalidSettings(

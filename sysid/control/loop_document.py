@@ -88,9 +88,9 @@ class LoopDocumentBuilder:
         ):
             raise InvalidSettings(
                 "/output",
-                f"output {self.output.name!r} contains the input {self.input.name!r} itself, so "
-                "the controller would depend on its own present value (an algebraic loop); "
-                "control another output, or give a transport with a time constant",
+                f"output {self.output.name!r} contains the input {self.input.name!r} itself. "
+                "The controller would depend on its own present value (an algebraic loop). "
+                "Control another output, or give a transport with a time constant.",
             )
         return self._build_document(None, self._replace_plant_input)
 
@@ -240,7 +240,7 @@ class LoopDocumentBuilder:
         right = "a smaller N" if name == "derivative_filter" else "a longer one"
         return (
             f"{told} {time:.4g} s, too short for steps of {sampling:.4g} s even if each is "
-            f"divided into {_MAX_SUBSTEPS}; give {right}, or a shorter sampling period"
+            f"divided into {_MAX_SUBSTEPS}. Give {right}, or a shorter sampling period."
         )
 
 

@@ -74,7 +74,7 @@ def compute_margins(identified: IdentifiedModel, control: PidControl) -> Margins
         If the model is not linear, or a recursion.
     """
     if is_difference(identified.model):
-        raise NotLinear("margins are of models in the differential form; this one is a recursion")
+        raise NotLinear("margins need a model in the differential form; this one is a recursion")
     signals = (control.input, control.output)
     pairs = compute_transfer_functions(identified).pairs
     [pair] = [one for one in pairs if (one.input, one.output) == signals]

@@ -94,7 +94,7 @@ def measure_step_response(
     """
     later = times >= at
     if np.count_nonzero(later) < 2:
-        raise InvalidRecord(f"the record has no two samples after the step at {at:g} s")
+        raise InvalidRecord(f"the record has fewer than two samples after the step at {at:g} s")
     height = after - before
     if height == 0:
         raise InvalidRecord(f"the reference does not change at {at:g} s")

@@ -193,7 +193,7 @@ def compute_transfer_functions(identified: IdentifiedModel) -> TransferFunctions
     linear = to_linear_form(identified, period)
     if len(model.states) > MAX_STATES:
         raise NotLinear(
-            f"the model has {len(model.states)} states; transfer functions are written of up to "
+            f"the model has {len(model.states)} states; transfer functions are written for up to "
             f"{MAX_STATES}"
         )
     matrix, columns = _build_equations(identified, linear)
@@ -222,8 +222,8 @@ def _find_integration_step(identified: IdentifiedModel) -> float | None:
         return None
     if identified.sample_time is None:
         raise NotLinear(
-            "the model is a recursion and the sampling period of its data is not known, so its "
-            "transfer function has none"
+            "the model is a recursion and the sampling period of its data is unknown, so it has "
+            "no transfer function; give the sampling period"
         )
     return identified.sample_time / identified.model.solver.substeps
 

@@ -129,7 +129,7 @@ def tune_controller(
     """
     if closed_loop_time_constant is not None and rule != "simc":
         raise InvalidSettings(
-            "/tuning/closed_loop_time_constant", f"rule {rule!r} has none; leave it out"
+            "/tuning/closed_loop_time_constant", f"rule {rule!r} has no such setting; leave it out"
         )
     factors = factor_transfer_function(identified, input, output, transport)
     process = factors.reduce_order(2 if controller == "PID" and rule == "simc" else 1)
@@ -148,8 +148,8 @@ def tune_controller(
 
 def _describe_impossible_gain(found: float, process: ProcessModel) -> str:
     return (
-        f"the rule gives a gain of {found:g}, which no controller can have; the process has a gain "
-        f"of {process.gain:g} and a dead time of {process.delay:g} s"
+        f"the rule gives a gain of {found:g}, which no controller can have. The process has a gain "
+        f"of {process.gain:g} and a dead time of {process.delay:g} s."
     )
 
 
@@ -187,8 +187,8 @@ def factor_transfer_function(
     """
     if is_difference(identified.model):
         raise _make_refusal(
-            "a tuning rule needs a model in the differential form; this one is a recursion, so "
-            "give gain, integral_time and derivative_time yourself"
+            "a tuning rule needs a model in the differential form, and this one is a recursion. "
+            "Give gain, integral_time and derivative_time yourself."
         )
     try:
         pairs = compute_transfer_functions(identified).pairs
@@ -211,7 +211,7 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
     if zeros.size:
         where = ", ".join(f"{zero:.4g}" for zero in np.sort_complex(zeros))
         raise _make_refusal(
-            f"the model has a zero at s = {where}; the rules are of models without one"
+            f"the model has a zero at s = {where}; the rules need a model without zeros"
         )
     scale = max((abs(pole) for pole in poles), default=0.0)
     integrators = [
@@ -219,13 +219,13 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
     ]
     others = [pole for pole in poles if abs(pole) > _INTEGRATOR_TOLERANCE * scale and pole != 0]
     if len(integrators) > 1:
-        raise _make_refusal("the model integrates twice; the rules are of models that do so once")
+        raise _make_refusal("the model integrates twice; the rules allow one integrator")
     if any(pole.real > 0 for pole in others):
-        raise _make_refusal("the model is unstable by itself; the rules are of stable models")
+        raise _make_refusal("the model is unstable by itself; the rules need a stable model")
     if any(abs(pole.imag) > _REAL_POLE_TOLERANCE * abs(pole) for pole in others):
         raise _make_refusal(
-            "the model oscillates by itself (a pair of complex poles); the rules are of models "
-            "with real time constants"
+            "the model oscillates by itself (a pair of complex poles); the rules need real time "
+            "constants"
         )
     times = [float(1.0 / abs(pole)) for pole in others]
     # What is left of numerator and denominator at low frequencies, s of the integrator apart.
@@ -233,7 +233,7 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
     if transport.time_constant > 0:
         times.append(transport.time_constant)
     if not times and not integrators:
-        raise _make_refusal("the model has no time constant; the rules are of models with one")
+        raise _make_refusal("the model has no time constant; the rules need at least one")
     ordered = tuple(sorted(times, reverse=True))
     return TransferFactors(gain, delay + transport.delay, ordered, bool(integrators))
 
@@ -241,7 +241,7 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
 def _require_single_delay(quasi: QuasiPolynomial, fault: str) -> tuple[float, list[float]]:
     parts = group_by_delay(quasi)
     if len(parts) > 1:
-        raise _make_refusal(f"{fault}; the rules know one between input and output")
+        raise _make_refusal(f"{fault}; the rules allow one between input and output")
     delay, powers = parts[0]
     return delay, powers
 
@@ -273,7 +273,7 @@ def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float 
     if wanted is None and theta == 0.0:
         raise InvalidSettings(
             "/tuning/closed_loop_time_constant",
-            "is missing; the model has no dead time to take instead, so give it in s",
+            "is missing; the model has no dead time to use instead, so give it in s",
         )
     tau = theta if wanted is None else wanted
     if not (isfinite(tau) and tau > 0):
@@ -305,7 +305,7 @@ def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float 
 def _tune_amigo(process: ProcessModel, controller: ControllerKind) -> Tuning:
     theta, t, rate = process.delay, process.time_constant, process.initial_slope
     if theta == 0.0:
-        raise _make_refusal("AMIGO needs a dead time, and the model has none; take rule 'simc'")
+        raise _make_refusal("AMIGO needs a dead time, and the model has none; use rule 'simc'")
     ratio = theta / t  # 0 of an integrating process
     if controller == "PI":
         part = 0.35 - ratio / (1.0 + ratio) ** 2

@@ -153,7 +153,7 @@ def _write_header(identified: IdentifiedModel, stem: str) -> str:
     lines = [
         *describe_model(identified),
         "",
-        f"{stem}_identified() gives the values that were found.",
+        f"{stem}_identified() returns the identified values.",
         f"{stem}_simulate() runs the model freely; link with -lm.",
     ]
     told = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
@@ -209,7 +209,7 @@ def _write_simulate_comment(program: GeneratedProgram) -> str:
         ("Output", program.output_names, model.outputs),
     ):
         lines += [f"{kind} {names[q.name]}: {q.name}, {describe_unit(q.unit)}." for q in signals]
-    lines += ["Gives 0; 1 if n, the times or a lag cannot be used; 2 if memory is short."]
+    lines += ["Returns 0; 1 if n, the times or a time lag cannot be used; 2 if memory is short."]
     told = "\n".join(f" * {escape_c_comment(line)}" for line in lines)
     return f"/*\n{told}\n */"
 

@@ -53,10 +53,10 @@ def _describe_hold(identified: IdentifiedModel, name: str) -> str:
     if hold == "zero":
         return f"Input {name} is held from each sample to the next."
     if hold == "first":
-        return f"Input {name} goes on a straight line from each sample to the next."
+        return f"Input {name} is interpolated linearly between its samples."
     return (
-        f"Input {name} was band-limited between its samples; here it goes on a straight line, "
-        "so give it resampled to a period short enough for that."
+        f"Input {name} was band-limited between its samples; here it is interpolated linearly. "
+        "Give it resampled to a period short enough for that."
     )
 
 

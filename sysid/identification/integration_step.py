@@ -56,8 +56,8 @@ def warn_integration_step(
         return []
     if is_late is not None and is_late():
         return [
-            "with half the integration step the output moves by enough to move an estimate by its "
-            "standard error; the time was over, so what they would be was not looked for"
+            "half the integration step changes the output enough to move an estimate by its "
+            "standard error. The time limit left no new fit with that step."
         ]
     error = error[weight > 0]
     end = (
@@ -73,8 +73,8 @@ def warn_integration_step(
         return []
     substeps = problem.model.solver.substeps
     return [
-        f"the integration step is too long for these estimates: with half of it {', '.join(told)}; "
-        f"give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
+        f"the integration step is too long for these estimates: with half of it {', '.join(told)}. "
+        f"Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
     ]
 
 

@@ -192,9 +192,9 @@ def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> 
     if noise.unresolved_times:
         found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
         return (
-            "noise_model auto keeps squares, though the residuals drift and the model does not "
-            "forget where it began: ar1 would have a correlation time of "
-            f"{found}, and the record is not {_MIN_RECORD_TIMES:g} times as long",
+            "noise_model auto keeps least squares, although the residuals drift and the model "
+            f"integrates. With ar1 the noise would have a correlation time of {found}. "
+            f"The record is not {_MIN_RECORD_TIMES:g} times as long.",
         )
     if noise.least_squares_theta is None:
         return ()
@@ -207,8 +207,8 @@ def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> 
     metrics = problem.evaluate_metrics(np.asarray(noise.least_squares_theta))
     unit = format_unit(metrics.unit)
     return (
-        "noise_model auto chose ar1: the residuals of squares are not white, and the model does "
-        "not forget where it began, as a drive or a tank (it integrates), so that errors of a "
-        f"moment stay in all later outputs; squares gave {squares}, RMS {metrics.rms:.4g}{unit}; "
-        "to have them, use loss: {noise_model: white}",
+        "noise_model auto selected ar1: the least-squares residuals are autocorrelated and the "
+        "model integrates, as a drive or a tank does. Plain least squares gave "
+        f"{squares}, RMS {metrics.rms:.4g}{unit}. "
+        "To get these, use loss: {noise_model: white}",
     )

@@ -54,9 +54,9 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
         return []
     what, them = ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
     return [
-        f"{what} an input from before the record, which was not recorded: its first value is "
-        f"taken to have stood there; without {them} {', '.join(told)}: give the input before the "
-        "record (trim a longer recording, or put rows with an empty output before it), or skip: "
+        f"{what} an input from before the record, which was not recorded. Its first value is "
+        f"assumed there. Without {them} {', '.join(told)}. Give the input before the record "
+        "(trim a longer recording, or put rows with an empty output before it), or skip: "
         f"{max(int(np.count_nonzero(one)) for one in parts)}"
     ]
 

@@ -40,14 +40,14 @@ _WHITENESS_LEVEL = (
 _ROUNDING_SHARE = 1e-9  # of the output: below, the residual is rounding and has no optimum
 
 _STDERR_MEANINGS: Mapping[NoiseColour, str] = {
-    "white": "the standard errors are too small",
-    "first-order": "the standard errors are those of the noise model",
-    "coloured": "the standard errors allow for the colour of the residuals, not for what the model "
-    "lacks",
-    "drifting": "the residuals drift over the whole record, so the standard errors are too small",
+    "white": "The standard errors are too small.",
+    "first-order": "The standard errors are those of the noise model.",
+    "coloured": "The standard errors allow for the colour of the residuals, not for missing "
+    "dynamics.",
+    "drifting": "The residuals drift over the whole record, so the standard errors are too small.",
 }
 
-_NOISE_MODEL_SUGGESTION = "; if it is the noise that is coloured, use loss: {noise_model: ar1}"
+_NOISE_MODEL_SUGGESTION = " If the noise is coloured, use loss: {noise_model: ar1}"
 
 
 def collect_warnings(
@@ -62,7 +62,9 @@ def collect_warnings(
     found = []
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
-        found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
+        found.append(
+            f"the RMS error {rms:.4g} is above the safe limit {limit:g}, so the model is not valid"
+        )
     found += list_mixed_unit_warnings(problem.model, problem.records)
     found += list_time_unit_warnings(problem.model)
     found += _warn_active_bounds(analysis)
@@ -82,8 +84,8 @@ def collect_warnings(
         found += _warn_correlations(analysis.uncertainty, analysis.estimates, lagged)
     if analysis.is_cut_short:
         found.append(
-            "the time was over, so minima beside the estimate were not looked for: where the loss "
-            "is rough the intervals are too narrow"
+            "the time limit left no search for minima near the estimate. Where the loss is rough, "
+            "the intervals are too narrow."
         )
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING_SHARE * problem.output_scale:
         found.append(_warn_not_optimal(algorithm, analysis.possible_gain))
@@ -101,7 +103,7 @@ def _warn_active_bounds(analysis: Analysis) -> list[str]:
     first, *others = analysis.active_bounds
     more = f", and {', '.join(map(str, others))}" if others else ""
     cures = " and ".join(one.advice for one in analysis.active_bounds)
-    return [f"the data pull {first}{more}: {cures}, unless nature sets it there"]
+    return [f"the data pull {first}{more}. To widen: {cures}, unless it is a physical limit."]
 
 
 def _warn_held_inputs(problem: Problem) -> list[str]:
@@ -118,8 +120,8 @@ def _warn_held_inputs(problem: Problem) -> list[str]:
         if one.hold == "first" and _HELD_SHARE <= np.mean(np.diff(one.values) == 0) < 1
     }
     return [
-        f"input {name!r} stays constant between jumps, but is read as straight between its "
-        f"samples, which moves a lag by about half a sample; if it was held, use hold: "
+        f"input {name!r} looks piecewise constant, but is interpolated linearly. This shifts an "
+        f"estimated time lag by about half a sample. If the input was held, use hold: "
         f"{{{name}: zero}}"
         for name in sorted(names)
     ]
@@ -134,10 +136,10 @@ def _warn_early_response(problem: Problem) -> list[str]:
         if alone := find_unprompted_output(record):
             where = f" in experiment {number}" if len(problem.records) > 1 else ""
             found.append(
-                f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where} although no "
-                "input has moved yet: if the record begins with the step itself, the lag comes out "
-                "wrong, since an input is taken to have stood at its first value all the time "
-                "before; put some rows of the input at rest before the record"
+                f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where}, before any "
+                "input. If the record begins with the step itself, the estimated time lag is "
+                "wrong: the input is assumed constant before the record. Put some rows of the "
+                "input at rest before the record."
             )
     return found
 
@@ -148,8 +150,8 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
         return []
     names = ", ".join(output.name for output in problem.model.outputs)
     return [
-        f"no output ({names}) is a state by itself, so predictions one step ahead are those of the "
-        "free run; for another start of every step write an output as a state, outputs: {y: x}"
+        f"no output ({names}) is a state by itself, so one-step predictions equal the free run. "
+        "To start each step from the measured output, write it as a state: outputs: {y: x}."
     ]
 
 
@@ -165,8 +167,8 @@ def _warn_constant_outputs(problem: Problem) -> list[str]:
         if np.ptp(values) == 0.0:
             unit = format_unit(output.unit)
             found.append(
-                f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it tells nothing of "
-                "the dynamics, and no fit % can be given"
+                f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it contains no "
+                "dynamics, and the fit % is undefined"
             )
     return found
 
@@ -283,8 +285,8 @@ def _warn_correlations(
                     else f", {alike:.3f} if the residuals were white"
                 )
                 found.append(
-                    f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix a "
-                    "combination of them, and the lag is less than two of its standard errors"
+                    f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix only a "
+                    "combination of them. The time lag is less than two of its standard errors."
                 )
             elif abs(r) > _STRONG_CORRELATION:
                 found.append(
@@ -321,23 +323,22 @@ def _warn_coloured_residuals(
     advises = may_be_noise and colour in ("coloured", "drifting") and not depends
     if lagged and uncertainty and (tests.data, colour) == ("validation", "white"):
         return [
-            "the residuals on the validation data are not white, while those on the estimation "
-            "data may as well be white: the validation data show what the estimation data do not "
-            "tell, either dynamics that are not in the model or values that are known within their "
-            "standard errors only; estimate from data that cover both"
+            "the residuals are consistent with white noise on the estimation data, but not on the "
+            "validation data. Either dynamics are missing from the model, or parameters are known "
+            "too roughly. Estimate from data that cover both."
         ]
     if lagged:
         suggestion = _NOISE_MODEL_SUGGESTION if advises else ""
         return [
-            f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
-            f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order "
-            f"of the model, and {_STDERR_MEANINGS[colour]}{suggestion}"
+            f"the residuals are not white (on the {tests.data} data): dynamics are missing from "
+            f"the model. The estimate of {', '.join(sorted(lagged))} depends on the order of the "
+            f"model. {_STDERR_MEANINGS[colour]}{suggestion}"
         ]
     if not advises:
         return []
     return [
-        f"the residuals are not white (on the {tests.data} data), and no input tells them: squares "
-        f"give slow noise too much weight{_NOISE_MODEL_SUGGESTION}"
+        f"the residuals are not white (on the {tests.data} data), and no input explains them. "
+        f"Least squares gives slow noise too much weight.{_NOISE_MODEL_SUGGESTION}"
     ]
 
 
@@ -346,9 +347,9 @@ def warn_time_limit(is_cut_short: bool) -> tuple[str, ...]:
     if not is_cut_short:
         return ()
     return (
-        "the time was over before least squares had ended from the champions of all islands: the "
-        "estimate is the best found until then, and need not be the optimum; give more seconds, "
-        "or a shorter record",
+        "the time limit ended least squares before all islands' champions were refined. The "
+        "estimate is the best so far and need not be the optimum. Allow more seconds, or use a "
+        "shorter record.",
     )
 
 
@@ -362,15 +363,17 @@ def warn_noise_model(
     notes = []
     if found:
         notes.append(
-            "estimates and standard errors are those under first-order noise with a correlation "
-            f"time of {', '.join(found)}; squares alone would give a smaller RMS"
+            "estimates and standard errors assume first-order noise with a correlation time of "
+            f"{', '.join(found)}. Least squares alone would give a smaller RMS."
         )
     elif is_complete:
-        notes.append("the residuals may as well be white, so the noise model changes nothing")
+        notes.append(
+            "the residuals are consistent with white noise, so the noise model changes nothing"
+        )
     if not is_complete:
         notes.append(
-            "the noise model was not estimated to its end: it needs the method 'improved' with "
-            "refinement, and more simulations than the budget or the time left"
+            "the noise model was not estimated completely. It needs the method 'improved' with "
+            "refinement, and more simulations than budget and time allowed."
         )
     return tuple(notes)
 
@@ -390,7 +393,7 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
         ]
         if blind and all(float(np.ptp(one)) == 0.0 for one in values):
             found.append(
-                f"input {quantity.name!r} is constant, so it excites nothing; these data leave "
+                f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
                 f"unidentified: {blind}"
             )
     return found
@@ -399,7 +402,7 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
 def _warn_not_optimal(algorithm: GeneticAlgorithm, gain: float) -> str:
     methods = {get_island_settings(algorithm, i).method for i in range(algorithm.n_islands)}
     text = (
-        "the estimate is not a local optimum: one least-squares step promises to remove "
-        f"{100 * gain:.0f} % of the squared error, so the standard errors are a rough guide"
+        "the estimate is not a local optimum: one least-squares step would remove "
+        f"{100 * gain:.0f} % of the squared error, so the standard errors are rough"
     )
     return text if "improved" in methods else f"{text} ({', '.join(sorted(methods))}: as found)"

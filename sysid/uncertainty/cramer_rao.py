@@ -62,7 +62,9 @@ def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
     """
     odd = [name for name, weight in problem.output_weights.items() if weight != 1.0]
     if odd:
-        raise InvalidSettings(f"/weights/{odd[0]}", "the floor is that of outputs of weight 1")
+        raise InvalidSettings(
+            f"/weights/{odd[0]}", "the Cramér–Rao bound needs weight 1 for every output"
+        )
     found = compute_sensitivities(problem, theta)
     scale = compute_physical_scale(problem, theta)
     powers = find_scalings(problem.model, problem.all_parameters)

@@ -79,7 +79,7 @@ def _make_fixed_or_tied_estimate(
     value, slope = _linearise_tie(problem, tree, known.theta, known.scale)
     blind = known.null_directions @ (slope * known.scale)
     if np.linalg.norm(blind) > _NULL_SHARE * np.linalg.norm(slope * known.scale):
-        why = known.reason or "the data do not tell what it is tied to"
+        why = known.reason or "the data do not determine what it is tied to"
         return _make_estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
     error = sqrt(max(float(slope @ known.covariance @ slope), 0.0))
     quantile = float(np.max(known.t_quantile[slope != 0.0], initial=0.0))
@@ -113,11 +113,13 @@ def _explain_status(
         )
         if blind:
             return f"only a combination with other parameters has an effect on the output{others}"
-        return f"the data say little of it apart from a combination with other parameters{others}"
+        return (
+            f"the data say little about it apart from a combination with other parameters{others}"
+        )
     if blind:
         return "the output does not change with it"
     return {
-        "unidentifiable": "the data say little of it: its standard error is as large as its range",
+        "unidentifiable": "the data say little about it: its standard error is as large as its range",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")
 

@@ -113,8 +113,8 @@ def compute_profile(
     if problem.loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
-            f"profiles are of plain squares, not of those under {problem.loss.noise_model}; fit "
-            "with the noise model 'white', or use the standard errors",
+            f"profiles are of plain squares, not of the noise model {problem.loss.noise_model}. Fit "
+            "with the noise model 'white', or use the standard errors.",
         )
     if points < _MIN_POINTS:
         raise InvalidSettings("/points", f"found {points}; need {_MIN_POINTS} or more")
@@ -140,7 +140,7 @@ def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
         raise InvalidRecord("the simulation diverges at the estimate, so it has no profile")
     if found.rms <= _ROUNDING_RMS * problem.output_scale:
         raise InvalidRecord(
-            "the simulation equals the records but for rounding; a profile needs residuals"
+            "the simulation equals the records up to rounding; a profile needs residuals"
         )
     return found
 

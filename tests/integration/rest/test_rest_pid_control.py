@@ -177,7 +177,7 @@ def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(served: Served) -> 
     assert metrics["swing"] > 1.0
     # A relay around a lag with dead time swings at about its ultimate period, 4 L and less.
     assert 1.2 < metrics["swing_period"] < 2.6
-    assert any("keeps swinging and does not settle" in note for note in bounded["notes"])
+    assert any("oscillates and does not settle" in note for note in bounded["notes"])
     assert not any("it decays" in note for note in bounded["notes"])
 
 
@@ -185,8 +185,8 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
     border = simulated(served, gain=1.0, integral_time=1.0)["margins"]["gain_margin"]
     hardly = simulated(served, gain=0.999 * border, integral_time=1.0)
     assert hardly["margins"]["is_stable"]
-    [note] = [one for one in hardly["notes"] if "keeps swinging" in one]
-    assert note.endswith("; by its transfer function it decays, too slowly for this record")
+    [note] = [one for one in hardly["notes"] if "oscillates and does not settle" in one]
+    assert note.endswith(". By its transfer function it decays, but too slowly for this record")
 
 
 @pytest.mark.parametrize(
@@ -201,10 +201,14 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
         ({"tracking_time": 0}, "/control/tracking_time", "above 0"),
         ({"lower": 1.0, "upper": -1.0}, "/control/upper", "found -1, and 1 as lower limit"),
         ({"limit": 1.0, "lower": 0.0}, "/control/lower", "the limit ± is given too"),
-        ({"gain": None}, "/control/gain", "is missing; give it, or a rule as tuning"),
-        ({"tuning": {}}, "/control/gain", "leave it out, or leave out tuning"),
-        ({"tuning": {}, "gain": 0.0, "integral_time": None}, "/control/gain", "leave it out"),
-        ({"tuning": {}, "gain": None}, "/control/integral_time", "the rule of tuning chooses"),
+        ({"gain": None}, "/control/gain", "is missing. Give it, or give a tuning rule as 'tuning'"),
+        ({"tuning": {}}, "/control/gain", "Leave it out, or leave out 'tuning'"),
+        ({"tuning": {}, "gain": 0.0, "integral_time": None}, "/control/gain", "Leave it out"),
+        (
+            {"tuning": {}, "gain": None},
+            "/control/integral_time",
+            "the tuning rule chooses this value",
+        ),
         ({"tuning": {"rule": "ziegler"}}, "/control/tuning/rule", "simc"),
         ({"tuning": {"controller": "PD"}}, "/control/tuning/controller", "PID"),
         (
@@ -223,7 +227,7 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
         ),
         ({"derivative_time": 1e-6}, "/control/derivative_filter", "too short for steps of 0.02"),
         ({"integraltime": 1.0}, "/control/integraltime", "integral_time"),
-        ({"gain": 1e30}, "/control/gain", "the loop runs away"),
+        ({"gain": 1e30}, "/control/gain", "with which the loop diverges"),
     ],
 )
 def test_what_cannot_control_is_told_where_it_is(
@@ -274,7 +278,7 @@ def test_a_rule_for_a_recursion_or_without_dead_time_is_refused(served: Served) 
     path = f"/v1/runs/{served.lag}:simulate"
     [fault] = refused(served.server.post(path, json=body), 422, "invalid")
     assert fault["pointer"] == "/control/tuning/closed_loop_time_constant"
-    assert "no dead time to take instead" in fault["detail"]
+    assert "no dead time to use instead" in fault["detail"]
 
 
 def test_the_command_line_tells_controller_rule_and_margins(
@@ -306,5 +310,5 @@ def test_the_command_line_tells_controller_rule_and_margins(
     ):
         assert part in text, text
     text = told(gain=3.0, limit=1.5)
-    assert "keeps swinging" in text
+    assert "oscillates and does not settle" in text
     assert "gain margin" not in text

@@ -88,11 +88,11 @@ def test_a_true_model_that_misses_in_another_range_is_not_said_to_lack_dynamics(
     )
     assert found.residual_tests is not None
     assert found.residual_tests.data == "validation"
-    assert told(found, "those on the estimation data may as well be white")
+    assert told(found, "consistent with white noise on the estimation data, but not on the")
     assert not told(found, "standard errors are too small")
     poor = response(parse_model(SECOND), steps(), L=0.1)
     lacking = identify(model, record(steps(), poor), QUICK, validation=[record(steps(), poor)])
-    assert told(lacking, "not white (on the validation data): something of the dynamics is not in")
+    assert told(lacking, "not white (on the validation data): dynamics are missing from")
 
 
 def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:
@@ -140,13 +140,13 @@ def test_an_estimate_that_the_integration_step_has_made_is_told(
     found = identify(coarse, Record((inlet,), (noisy,)))
     assert told(found, "the integration step is too long for these estimates") == too_long
     if too_long:
-        assert told(found, "give the model solver: {substeps: 4}")
+        assert told(found, "Give the model solver: {substeps: 4}")
 
 
 @pytest.mark.parametrize("level", [0.0, 3.0])
 def test_a_constant_output_is_told(level: float) -> None:
     found = identify(parse_model(FIRST), record(steps(), np.full(N, level)), QUICK)
-    assert told(found, f"output 'y' is constant ({level:g}): it tells nothing of the dynamics")
+    assert told(found, f"output 'y' is constant ({level:g}): it contains no dynamics")
     moving = np.where(np.arange(N) == 7, level + 0.1, level)
     assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")
 

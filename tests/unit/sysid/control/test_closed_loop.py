@@ -375,7 +375,7 @@ def test_a_response_that_is_far_off_late_or_slow_does_not_run_away(
 
 
 def test_metrics_need_a_step_that_was_recorded() -> None:
-    with pytest.raises(InvalidRecord, match="no two samples after"):
+    with pytest.raises(InvalidRecord, match="fewer than two samples after"):
         measure_step_response(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
     with pytest.raises(InvalidRecord, match="does not change"):
         measure_step_response(TIMES, TIMES, at=1.0, before=1.0, after=1.0)

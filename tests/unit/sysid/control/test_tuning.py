@@ -285,7 +285,7 @@ def test_what_a_rule_cannot_take_is_told() -> None:
         tune_controller(recursion, "u", "y")
     with pytest.raises(NotLinear, match="this one is a recursion"):
         compute_margins(recursion, PidControl("u", "y", 1.0))
-    with pytest.raises(InvalidSettings, match="no dead time to take instead") as caught:
+    with pytest.raises(InvalidSettings, match="no dead time to use instead") as caught:
         tune_controller(chain(1.0), "u", "y")
     assert caught.value.pointer == "/tuning/closed_loop_time_constant"
     with pytest.raises(InvalidSettings, match="above 0 s"):

@@ -22,7 +22,7 @@ from tests.searching import example
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])
 APART = np.array([0.25, 0.6, 5.6, 1.3])
 LIMITED = GeneticAlgorithm(population=32, generations=3, islands=2, stop=Stop(seconds=100.0))
-SAID = "the time was over before least squares had ended"
+SAID = "the time limit ended least squares before"
 
 
 def asked(late_after: int) -> Callable[[], bool]:

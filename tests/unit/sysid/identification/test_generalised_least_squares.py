@@ -163,7 +163,7 @@ def test_white_residuals_leave_everything_as_it_is() -> None:
     )
     assert [replace(one) for one in found.estimates] == list(plain.estimates)
     assert not found.correlation_times
-    assert any("may as well be white" in text for text in found.warnings)
+    assert any("consistent with white noise" in text for text in found.warnings)
 
 
 def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_out() -> None:
@@ -192,7 +192,7 @@ def test_a_budget_that_does_not_suffice_is_told_and_kept() -> None:
     settings = replace(SMALL, stop=Stop(evaluations=130, settled=None))
     found = identify(load_model(GAIN), record(3), settings, loss=AR1, skip=1)
     assert found.evaluations <= 130
-    assert any("not estimated to its end" in text for text in found.warnings)
+    assert any("not estimated completely" in text for text in found.warnings)
 
 
 def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
@@ -205,7 +205,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     monkeypatch.setattr("sysid.identification.deadline._STEPS_AFTER_DEADLINE", 30 * problem.n_steps)
     late = conclude_run(problem, timed, replace(state, seconds=100.0))
     soon = conclude_run(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
-    said = "not estimated to its end"
+    said = "not estimated completely"
     assert [any(said in one for one in found.warnings) for found in (whole, soon, late)] == [
         False,
         True,
@@ -254,7 +254,7 @@ def advised(u: FloatArray, y: FloatArray) -> list[str]:
 def test_slow_noise_is_told_with_its_remedy_also_without_a_lag() -> None:
     u = np.random.default_rng([3, 1]).choice([-1.0, 1.0], N)
     (text,) = advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, POLE, 3))
-    assert "no input tells them" in text
+    assert "no input explains them" in text
     assert not advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, 0.0, 3))
 
 

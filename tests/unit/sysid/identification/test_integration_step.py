@@ -54,9 +54,9 @@ def test_a_small_error_of_the_step_is_told_where_the_noise_is_smaller() -> None:
     exact, nothing = fitted(finer(model, FINE), "fopdt", record)
     assert nothing == []
     assert note.startswith("the integration step is too long for these estimates: with half of it ")
-    assert note.endswith("give the model solver: {substeps: 8}")
+    assert note.endswith("Give the model solver: {substeps: 8}")
     told = {}
-    for part in note.split("with half of it ")[1].split(", give")[0].split("away"):
+    for part in note.split("with half of it ")[1].split(". Give")[0].split("away"):
         name, _, rest = part.strip(", ").partition(" = ")
         if " instead of " in rest:
             told[name] = float(rest.split()[0])

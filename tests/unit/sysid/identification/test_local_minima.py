@@ -120,7 +120,7 @@ def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.Monke
     problem = example()
     algorithm = GeneticAlgorithm(generations=20, stop=Stop(seconds=1e9))
     state = advance_run(problem, algorithm, begin_run(problem, algorithm, 1))
-    said = "minima beside the estimate were not looked for"
+    said = "the time limit left no search for minima near the estimate"
     in_time = conclude_run(problem, algorithm, replace(state, seconds=0.0))
     late = conclude_run(problem, algorithm, replace(state, seconds=1e9))
     assert not any(said in text for text in in_time.warnings)

@@ -199,7 +199,7 @@ def test_a_drift_as_slow_as_the_record_is_left_to_squares() -> None:
     assert ar1.correlation_times["y"] > STEP * N / 5
     assert auto.estimates == white.estimates
     (note,) = set(auto.warnings) ^ set(white.warnings)
-    assert note.startswith("noise_model auto keeps squares")
+    assert note.startswith("noise_model auto keeps least squares")
     assert f"a correlation time of y {ar1.correlation_times['y']:.3g} s" in note
 
 

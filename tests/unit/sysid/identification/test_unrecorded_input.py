@@ -118,4 +118,4 @@ def test_a_result_warns() -> None:
     )
     record = part.to_record({"u": "u"}, {"y": "y"})
     found = identify(FOPDT, record, GeneticAlgorithm(generations=80), parameters=BOUNDS)
-    assert any("its first value is taken to have stood there" in one for one in found.warnings)
+    assert any("Its first value is assumed there" in one for one in found.warnings)
