@@ -31,8 +31,8 @@ if TYPE_CHECKING:  # the compiler comes with these, and most requests never need
 _REST_TOLERANCE = 0.02  # of a step: what moves or differs by less is at rest
 _LIMIT_TOLERANCE = 1e-9  # of the limit
 _START_ADVICE = (
-    "the measures tell of how it settles too, not of the step alone; give the states' starts, "
-    "such as x(0), or a later step"
+    "the step metrics include its settling. Give the initial states, such as x(0), "
+    "or a later step time"
 )
 
 
@@ -93,8 +93,8 @@ def simulate_closed_loop(
     notes = [] if tuning is None or used.has_derivative_action else list(_describe_tuning(tuning))
     if loop.controller_delay_steps:
         notes.append(
-            f"the output answers at once, so the controller acts {step:.4g} s late, as a sampled "
-            "one does"
+            f"the output responds without delay. The controller therefore acts {step:.4g} s late, "
+            "as a sampled controller does"
         )
     told = _to_controller_out(used, command.values)
     notes += [
@@ -117,11 +117,13 @@ def find_control_faults(model: Model, control: ControlIn) -> Iterator[FieldError
             yield FieldError(f"/control/{role}", detail)
     if control.tuning is None:
         if control.gain is None:
-            yield FieldError("/control/gain", "is missing; give it, or a rule as tuning")
+            yield FieldError(
+                "/control/gain", "is missing. Give it, or give a tuning rule as 'tuning'"
+            )
         return
     for name in ("gain", "integral_time", "derivative_time"):
         if getattr(control, name) != ControlIn.model_fields[name].default:
-            detail = "the rule of tuning chooses this; leave it out, or leave out tuning"
+            detail = "the tuning rule chooses this value. Leave it out, or leave out 'tuning'"
             yield FieldError(f"/control/{name}", detail)
 
 
@@ -132,8 +134,8 @@ def check_transport_delay(control: ControlIn | None, duration: float) -> None:
         if delay >= duration:
             raise InvalidRequest.from_fault(
                 "/control/transport/delay",
-                f"found {delay:g} s; the simulation lasts {duration:g} s, give more samples or a "
-                "shorter delay",
+                f"found {delay:g} s, but the simulation lasts {duration:g} s. Give more samples "
+                "or a shorter delay",
             )
 
 
@@ -258,12 +260,12 @@ def _check_loop_finite(
         if margins is not None and margins.is_stable:
             raise InvalidRequest.from_fault(
                 "/sample_time",
-                f"{detail}: the loop is stable, but steps of {step:.4g} s are too long to simulate "
-                "it; give a smaller sample_time",
+                f"{detail}. The loop is stable, but steps of {step:.4g} s are too long to "
+                "simulate it. Give a smaller sample_time",
             ) from None
         raise InvalidRequest.from_fault(
             "/control/tuning" if is_tuned else "/control/gain",
-            f"found {gain:g}; with it the loop runs away: {detail}; choose a smaller "
+            f"found {gain:g}, with which the loop diverges: {detail}. Choose a smaller "
             "gain, a longer integral_time, a limit, or another sign",
         ) from None
 
@@ -302,7 +304,7 @@ def _describe_start(
     band, earlier = _REST_TOLERANCE * abs(step.amplitude), output.values[times < step.time]
     if earlier.size:
         if np.ptp(earlier[-max(earlier.size // 4, 2) :]) > band:
-            yield f"{output.name} still moves when the reference steps: {_START_ADVICE}"
+            yield f"{output.name} still moves when the reference steps, so {_START_ADVICE}"
         return
     start = float(output.values[0])
     if abs(start - step.offset) <= band:
@@ -310,7 +312,7 @@ def _describe_start(
     unit = plain_unit(output.unit)
     yield (
         f"{output.name} starts at {start:.4g}{unit} with a reference of {step.offset:.4g}{unit} "
-        f"before the step: unless the loop rests there, {_START_ADVICE}"
+        f"before the step. Unless the loop rests there, {_START_ADVICE}"
     )
 
 
@@ -322,12 +324,16 @@ def _describe_stability(
         unit = plain_unit(metrics.unit)
         decays = margins is not None and margins.is_stable and not controller.saturated_percent
         yield (
-            f"{metrics.output} keeps swinging and does not settle: {metrics.swing:.4g}{unit} from "
-            f"peak to peak, every {metrics.swing_period:.4g} s"
-            + ("; by its transfer function it decays, too slowly for this record" if decays else "")
+            f"{metrics.output} oscillates and does not settle: {metrics.swing:.4g}{unit} peak to "
+            f"peak, period {metrics.swing_period:.4g} s"
+            + (
+                ". By its transfer function it decays, but too slowly for this record"
+                if decays
+                else ""
+            )
         )
     if margins is not None and not margins.is_stable:
         yield (
-            "the loop is unstable (by its transfer function, without the limits of the "
-            "controller): choose a smaller gain, a longer integral_time, or another sign"
+            "the loop is unstable (by its transfer function, without the controller's limits). "
+            "Choose a smaller gain, a longer integral_time, or another sign"
         )

@@ -130,8 +130,8 @@ def _describe_early_inputs(model: Model, given: Sequence[Channel], period: float
     if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
         return []
     return [
-        f"{first.name} is given from {float(first.times[0]):.6g} s on: there the states start, not "
-        "at t = 0, with the values that are told for it"
+        f"{first.name} begins at {float(first.times[0]):.6g} s. The initial states apply there, "
+        "not at t = 0"
     ]
 
 
@@ -146,7 +146,7 @@ def _choose_sample_time(
     period = body.sample_time or known
     if period is None:
         raise InvalidRequest.from_fault(
-            "/sample_time", "is missing, and the run's data do not tell one; give it in s"
+            "/sample_time", "is missing, and the run's data do not give one. Give it in s"
         )
     form = stored.model.form
     if form == "differential" or known is None or abs(period / known - 1) < 1e-3:
@@ -154,12 +154,12 @@ def _choose_sample_time(
     if form == "polynomial":
         raise InvalidRequest.from_fault(
             "/sample_time",
-            f"found {period:g} s; the terms of this polynomial are samples of {known:g} s: "
-            "leave it out",
+            f"found {period:g} s, but the terms of this polynomial are samples at {known:g} s. "
+            "Leave it out",
         )
     return period, [
-        f"the model is a recursion that was identified at {known:.6g} s; at {period:.6g} s it is "
-        "another approximation"
+        f"the model is a recursion identified at a sample time of {known:.6g} s. At "
+        f"{period:.6g} s it is another approximation"
     ]
 
 
@@ -265,11 +265,11 @@ def _find_input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError
             detail = f"the model has no input {name!r}{suggest_name(name, known)}"
             yield FieldError(f"/inputs/{name}", detail)
         elif name == controlled:
-            yield FieldError(f"/inputs/{name}", "the controller gives this input; leave it out")
+            yield FieldError(f"/inputs/{name}", "the controller computes this input. Leave it out")
     for name in known:
         if name not in body.inputs and name != controlled:
             yield FieldError(
                 f"/inputs/{name}",
-                f"give input {name!r}, such as "
+                f"input {name!r} is missing. Give a signal, such as "
                 '{"kind": "step", "amplitude": 1}, or close the loop with "control"',
             )

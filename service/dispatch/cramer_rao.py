@@ -56,8 +56,8 @@ IRRELEVANT_FIELDS = (
 )
 MOST_PROBLEMS = 64
 LEFT_OUT_NOTE = (
-    f"the sweep poses more than {MOST_PROBLEMS} problems: the first {MOST_PROBLEMS} have floors "
-    "and values to tell errors from, the others none"
+    f"the sweep has more than {MOST_PROBLEMS} different problems. Only the first {MOST_PROBLEMS} "
+    "have Cramér–Rao bounds and reference values"
 )
 MOST_WORK = 10_000_000
 """Samples to simulate for the floors of one job: below a second in most models."""
@@ -123,15 +123,15 @@ class _BoundsMaker:
         try:
             entry["reference"] = retry_transient(partial(self._read_reference, cell))
             if entry["reference"] is None:
-                return {**entry, "note": "no run succeeded whose values errors could be told from"}
+                return {**entry, "note": "no run succeeded, so there is no reference for errors"}
             spec = self._source.build_specification(cell).problem
             return {**entry, **self._compute_bounds(spec, entry["reference"]["values"])}
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
-            _log.warning("%s: no floor: %s", self._job.id, error)
-            return {**entry, "note": f"there is no floor: {error}"}
+            _log.warning("%s: no Cramér–Rao bound: %s", self._job.id, error)
+            return {**entry, "note": f"no Cramér–Rao bound: {error}"}
         except Exception as error:  # noqa: BLE001 - the results are there; a floor is not worth them
-            _log.exception("%s: no floor", self._job.id)
-            return {**entry, "note": f"there is no floor: internal error: {type(error).__name__}"}
+            _log.exception("%s: no Cramér–Rao bound", self._job.id)
+            return {**entry, "note": f"no Cramér–Rao bound: internal error: {type(error).__name__}"}
 
     def _read_reference(self, cell: Mapping[str, Any]) -> Document | None:
         with self._database.read_session() as session:
@@ -152,7 +152,7 @@ class _BoundsMaker:
     def _compute_bounds(self, spec: ProblemSpec, values: Mapping[str, float]) -> Document:
         model = parse_model(spec.model)
         if model.rule is not None:
-            return {"note": "there is no floor: the model selects its terms by the data"}
+            return {"note": "no Cramér–Rao bound: the model selects its terms from the data"}
         records = {key: self._source.load_records(key) for key in spec.record_keys}
         problem = Problem.build(
             model,
@@ -163,10 +163,10 @@ class _BoundsMaker:
         )
         unknown = [name for name in problem.free_names if name not in values]
         if unknown:
-            return {"note": f"there is no floor: no value of {', '.join(unknown)} is known"}
+            return {"note": f"no Cramér–Rao bound: the value of {', '.join(unknown)} is unknown"}
         work = problem.n_scored * (2 * len(problem.free_parameters) + 1)
         if work > self._left:
-            return {"note": "there is no floor: the records are too long to compute it here"}
+            return {"note": "no Cramér–Rao bound: the records are too long"}
         self._left -= work
         theta: FloatArray = np.array([values[name] for name in problem.free_names])
         with use_one_thread():
@@ -179,7 +179,7 @@ def _to_bounds_document(found: CramerRaoBound) -> Document:
         for name, value in zip(found.names, found.stderr.tolist(), strict=True)
     }
     untold = [name for name, value in stderr.items() if value is None]
-    note = f"the data tell nothing of {', '.join(untold)} alone: no floor" if untold else ""
+    note = f"no Cramér–Rao bound: the data do not determine {', '.join(untold)}" if untold else ""
     return {"stderr": stderr, "rms": to_finite(found.response_rms), "note": note}
 
 

@@ -175,7 +175,7 @@ class Dispatcher:
         _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
 
     def _drop_lost_job(self, recorder: RunRecorder, error: LeaseLost) -> None:
-        _log.warning("stop at once: %s", error)
+        _log.warning("the job is dropped: %s", error)
         self._lost.add(recorder.lease)
         self._leases.forget_lease(recorder.lease)
         recorder.is_stopped = True
@@ -213,7 +213,7 @@ class Dispatcher:
                 recorder.cancel_job if recorder.is_stopped else partial(recorder.finish_job, floors)
             )
         except LeaseLost as error:
-            _log.warning("its end was not written: %s", error)
+            _log.warning("the end of the job was not written: %s", error)
         self._leases.forget_lease(lease)
 
     def _release_jobs(self, *, lost: bool = False) -> None:

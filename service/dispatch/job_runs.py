@@ -108,7 +108,7 @@ class JobRuns:
                 retry_transient(partial(self._forget_progress, fresh))
                 yield from self._to_coming_runs([(row, states.pop(row.id)) for row in rows])
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
-            _log.warning("no more runs: %s", error)
+            _log.warning("no more runs are read: %s", error)
 
     def _iterate_in_order(self) -> Iterator[list[Run]]:
         rows = self._read_next_rows(-1)

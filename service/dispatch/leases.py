@@ -135,7 +135,7 @@ class HeldLeases:
                     partial(self._release_lease, lease, lost=lost, beside_others=worked)
                 )
             except LeaseLost:
-                _log.info("%s was no longer ours", lease.job_id)
+                _log.info("%s belongs to another dispatcher", lease.job_id)
             self.forget_lease(lease)
 
     def _release_lease(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:

@@ -210,7 +210,7 @@ class RunRecorder:
             session.refresh(job)
             complaint = self._summarise_failures(job.n_failed, job.n_runs)
             if self._n_known:
-                text = f"{self._n_known} of {job.n_runs} runs had been computed before: reused"
+                text = f"{self._n_known} of {job.n_runs} runs were taken over from earlier runs"
                 queue.append_event(self.lease, "log", {"message": text})
             if job.n_failed == job.n_runs:
                 queue.finish_job(self.lease, JobState.FAILED, complaint)

@@ -106,7 +106,7 @@ class Supervisor:
                 lived > LIVED_SECONDS and (code < 0 or code == RESTART_EXIT_CODE)
             )
             pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, LONGEST_PAUSE_SECONDS)
-            _log.warning("the dispatcher ended with %d; a new one in %.1f s", code, pause)
+            _log.warning("the dispatcher exited with code %d. It restarts in %.1f s", code, pause)
             self._stopping.wait(pause)
 
     def _spawn_child(self) -> "subprocess.Popen[bytes] | None":
@@ -161,7 +161,9 @@ def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:
         if not is_stopped(child.pid):
             awake = time.monotonic()
         elif time.monotonic() - awake > STOPPED_SECONDS:
-            _log.warning("the dispatcher was stopped for %g s: it is killed", STOPPED_SECONDS)
+            _log.warning(
+                "the dispatcher was stopped (SIGSTOP) for %g s and is killed", STOPPED_SECONDS
+            )
             child.kill()
 
 

@@ -152,14 +152,14 @@ def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
             continue
         n = count_values(axis)
         if axis.labels is not None and len(axis.labels) != n:
-            found = f"found {len(axis.labels)} labels for {n} values; need one each"
+            found = f"found {len(axis.labels)} labels for {n} values; need one label per value"
             yield FieldError(f"{place}/labels", found)
         yield from _find_axis_label_faults(axis, place)
         if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
             yield FieldError(
                 f"{place}/zip",
-                f"axes of zip {axis.zip!r} step together: found {n} values beside "
-                f"{lengths[axis.zip]}; need as many",
+                f"axes of zip {axis.zip!r} step together, but have {lengths[axis.zip]} and {n} "
+                "values; need equal numbers",
             )
 
 
@@ -174,8 +174,8 @@ def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]
             ):
                 yield FieldError(
                     f"{place}/labels/{position}",
-                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable characters "
-                    "without quotation marks and backslashes",
+                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable "
+                    "characters without quotation marks and backslashes",
                 )
                 return  # the other positions mostly have the same names
 

@@ -159,8 +159,8 @@ class JobChecker:
             if first != pointer:
                 yield FieldError(
                     pointer,
-                    f"{reference!r} is the same recording as {name!r} at {first}; "
-                    "name another, or leave it out",
+                    f"{reference!r} is the same recording as {name!r} at {first}. "
+                    "Name another, or leave it out",
                 )
 
     def _find_unit_faults(self, body: JobBody, model: Model) -> Iterator[FieldError]:
@@ -185,8 +185,8 @@ class JobChecker:
                 else:
                     yield FieldError(
                         "/validation/fraction",
-                        f"found {kept!r}: one part of a record of {piece.samples} samples would "
-                        "be empty",
+                        f"found {kept!r}: with {piece.samples} samples, one part of the record "
+                        "would be empty",
                     )
 
     def _find_term_count_faults(self, body: JobBody, model: Model) -> list[FieldError]:
@@ -246,8 +246,8 @@ def _check_sample_count(parameters: tuple[Parameter, ...], samples: int) -> Iter
     if 0 < samples < free:
         yield FieldError(
             "/datasets",
-            f"the records have {samples} scored samples in all for {free} free parameters; need "
-            "at least as many samples, or fix some of the parameters",
+            f"the records have {samples} scored samples for {free} free parameters. Give at "
+            "least as many samples, or fix some parameters",
         )
 
 
@@ -256,12 +256,12 @@ def _find_freedom_faults(
 ) -> Iterator[FieldError]:
     free = [one for one in parameters if one.is_free]
     if not free:
-        yield FieldError("/parameters", "every parameter is fixed; leave one free")
+        yield FieldError("/parameters", "every parameter is fixed. Leave at least one free")
     if population * len(free) > MOST_GENES:
         yield FieldError(
             "/algorithm/population",
-            f"found {population} individuals of {len(free)} free parameters; need at most "
-            f"{MOST_GENES // len(free)}, so that the population fits into memory",
+            f"found {population} individuals with {len(free)} free parameters. At most "
+            f"{MOST_GENES // len(free)} individuals fit into memory",
         )
 
 

@@ -40,7 +40,7 @@ class RecordLength:
             return None
         # Where an irregular record is cut is not known here: its whole length is asked for.
         duration = self.duration if self.period is None else (left - 1) * self.period
-        return RecordLength(duration, left, self.period, "of the part for estimation: ")
+        return RecordLength(duration, left, self.period, "estimation part: ")
 
 
 def list_signals(model: Model) -> tuple[list[str], list[str]]:
@@ -114,8 +114,8 @@ def find_length_faults(
     if (piece.samples - 1 - skip) * substeps < model.memory:
         yield FieldError(
             pointer,
-            f"{piece.part}the record has {piece.samples} samples; the model's memory "
-            f"({model.memory}) and 'skip' ({skip}) need more",
+            f"{piece.part}the record has {piece.samples} samples, too few for the model's memory "
+            f"({model.memory}) and 'skip' ({skip})",
         )
 
 
@@ -167,7 +167,7 @@ def find_setting_conflicts(body: JobBody) -> list[FieldError]:
     collect_faults(to_algorithm, found, body["algorithm"])
     collect_faults(to_loss, found, body["loss"])
     if body["prediction"] == "one-step" and body["loss"]["noise_model"] == "ar1":
-        detail = "ar1 is for free runs; predictions one step ahead contain the noise"
+        detail = "ar1 needs prediction: simulation. One-step predictions already contain the noise"
         found.append(FieldError("/loss/noise_model", detail))
     return found
 

@@ -68,7 +68,7 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
     except RowNotFound:
         raise InvalidRequest.from_fault(
             pointer,
-            f"there is no reference {named!r}{_suggest_name(session, named)}; accept a run "
+            f"there is no reference {named!r}{_suggest_name(session, named)}. Accept a run "
             "under this name first",
         ) from None
     return _get_succeeded_run(session, latest.run_id, pointer)
@@ -77,17 +77,17 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
 def _check_name(name: str) -> None:
     """Refuse names that could not be told from a run, or from the parts of a path."""
     if not 1 <= len(name) <= MOST_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        wanted = f"1 to {MOST_NAME_CHARACTERS} printable characters, no blank at an end"
+        wanted = f"1 to {MOST_NAME_CHARACTERS} printable characters without outer blanks"
     elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
         wanted = (
-            f"one that does not begin with {RUN_PREFIX!r} (a run's id does) or {REFERENCE_PREFIX!r}"
+            f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"
         )
     elif "/" in name or not name.strip("."):
         wanted = "one without '/', and not of dots only"
     else:
         return
     raise InvalidRequest.from_fault(
-        "{name}", f"the name in the path: found {name!r:.120}; need {wanted}"
+        "{name}", f"the name in the path is {name!r:.120}; need {wanted}"
     )
 
 
@@ -102,8 +102,8 @@ def _check_model(session: Session, name: str, run: Run) -> None:
     if not have_same_equations(before, new):
         raise InvalidRequest.from_fault(
             "/run",
-            f"run {run.id} is of the model {new.name!r}, and {name!r} stands for runs of another, "
-            f"{before.name!r} (now {latest.run_id}); accept it under a name of its own",
+            f"run {run.id} has the model {new.name!r}, but {name!r} stands for the model "
+            f"{before.name!r} (now run {latest.run_id}). Accept it under another name",
         )
 
 
@@ -114,7 +114,7 @@ def _get_succeeded_run(session: Session, run_id: str, pointer: str) -> Run:
         raise InvalidRequest.from_fault(pointer, str(error)) from None
     if run.state is not JobState.SUCCEEDED or run.estimates is None:
         raise InvalidRequest.from_fault(
-            pointer, f"run {run_id} is {run.state.value}; need one that succeeded"
+            pointer, f"run {run_id} is {run.state.value}; need a run that succeeded"
         )
     return run
 

@@ -204,7 +204,7 @@ def is_valid_x(value: float) -> bool:
 def _check_x(value: float) -> float:
     if not is_valid_x(value):
         raise PydanticCustomError(
-            "place", "need 0, or a size from 1e-100 to 1e100; write x in another unit"
+            "place", "need 0, or a magnitude from 1e-100 to 1e100. Write x in another unit"
         )
     return value
 
@@ -250,7 +250,9 @@ class IdentificationIn(Body):
     skip: int = Field(default=0, ge=0)
     algorithm: AlgorithmIn = AlgorithmIn()
     priority: int = Field(default=0, ge=-100, le=100)
-    reuse: bool = Field(default=True, description="take results of runs that were computed before")
+    reuse: bool = Field(
+        default=True, description="take over results of earlier runs with the same specification"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -292,9 +294,10 @@ class ProgressOut(Answer):
     runs: int
     finished: int
     failed: int
-    reused: int = Field(default=0, description="taken over from runs that were computed before")
+    reused: int = Field(default=0, description="runs taken over from earlier runs")
     best_rms: float | None = Field(
-        default=None, description="of the best run; of runs on other data or noise it tells nothing"
+        default=None,
+        description="of the best run. Not comparable between runs on other data or noise",
     )
     evaluations: int = 0
     generation: int = 0
@@ -311,13 +314,13 @@ class JobOut(Answer):
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
-    attempt: int = Field(description="how often it was begun, when it was resumed as well")
+    attempt: int = Field(description="number of starts, resumptions included")
     error: str | None = None
     model: str
     priority: int
     progress: ProgressOut
     rms_unit: str | None = Field(
-        default=None, description="of the best RMS; σ: of several outputs together"
+        default=None, description="unit of the best RMS; σ for several weighted outputs"
     )
     request: dict[str, Any] | None = None
 
@@ -350,4 +353,6 @@ class ReferenceOut(Answer):
     at: datetime
     labels: dict[str, Any] = Field(default={})
     estimates: dict[str, dict[str, float | None]] = Field(default={})
-    history: list[AcceptanceOut] = Field(default=[], description="the 1,000 before, latest first")
+    history: list[AcceptanceOut] = Field(
+        default=[], description="the previous acceptances (at most 1,000), latest first"
+    )

@@ -131,15 +131,14 @@ def check_limits(session: Session, job: Job, settings: Settings) -> None:
     open_now = count_unfinished(session, job.project_id)
     if open_now.jobs > settings.max_open_jobs:
         raise QuotaExceeded(
-            f"{open_now.jobs - 1} jobs of the project wait or run, and at most "
-            f"{settings.max_open_jobs} may; submit this one when some have ended, or cancel some"
+            f"{open_now.jobs - 1} jobs of the project are queued or running; at most "
+            f"{settings.max_open_jobs} may be. Cancel some, or submit this job later"
         )
     if open_now.runs > settings.max_open_runs:
         left = job.n_runs - job.n_done
         raise QuotaExceeded(
-            f"{open_now.runs - left} runs of the project are not done, and this job has {left} "
-            f"more; at most {settings.max_open_runs} may be open; submit it when some have ended, "
-            "or cancel some"
+            f"{open_now.runs - left} runs of the project are not done, and this job adds {left}. "
+            f"At most {settings.max_open_runs} may be open. Cancel some, or submit this job later"
         )
 
 

@@ -30,7 +30,7 @@ from sysid.models.model import Model
 def find_trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
     """Labels that are missing or no numbers, what the model or the reference does not have."""
     if job.warm_start == PREVIOUS and not job.sweep.axes:
-        yield FieldError("/warm_start", "'previous' needs a sweep; this job has one run")
+        yield FieldError("/warm_start", "'previous' needs a sweep, but this job has one run")
     if job.trend is None:
         return
     yield from _find_label_faults(job, job.trend.x)
@@ -53,10 +53,10 @@ def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
     named = [(n, labels) for n, labels in axes if any(x in one for one in labels)]
     if not named:
         known = sorted({name for _, labels in axes for one in labels for name in one})
-        there = f"there are {', '.join(known)}" if known else "no axis has labels"
+        there = f"The labels are {', '.join(known)}" if known else "No axis has labels"
         yield FieldError(
             "/trend/x",
-            f"no run has a label {x!r}{suggest_name(x, known)}; {there}; give an axis "
+            f"no run has a label {x!r}{suggest_name(x, known)}. {there}. Give an axis "
             f'"labels": [{{"{x}": …}}, …], one for each value',
         )
     for n, labels in named:
@@ -64,10 +64,10 @@ def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
             value = one.get(x)
             if not isinstance(value, float | int):
                 found = f"found {one[x]!r}" if x in one else "it is missing"
-                needed = "a number here"
+                needed = "a number"
             elif not is_valid_x(value):
                 found = f"found {value!r}"
-                needed = f"0, or a size from {LEAST_X:g} to {MOST_X:g}"
+                needed = f"0, or a magnitude from {LEAST_X:g} to {MOST_X:g}"
             else:
                 continue
             yield FieldError(
@@ -101,7 +101,10 @@ def find_job_faults(
         n_runs = count_runs(body, groups)
         if n_runs > most_runs:
             found.append(
-                FieldError("/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job")
+                FieldError(
+                    "/sweep/axes",
+                    f"the sweep has {n_runs} runs; a job may have at most {most_runs}",
+                )
             )
         else:
             steps = build_axis_groups(body.sweep.axes, groups)
@@ -133,7 +136,7 @@ def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[Fiel
                     yield FieldError(
                         f"/sweep/axes/{number}/values/{position}",
                         f"{name!r} at {body.trend.x} = {x} is the same recording as {before[1]!r} "
-                        f"at {body.trend.x} = {before[0]}: one of them is another file",
+                        f"at {body.trend.x} = {before[0]}. Give a different file for one of them",
                     )
 
 
@@ -154,7 +157,7 @@ def _find_value_faults(
             continue
         if n_wrong == MOST_FAULTY_VALUES:
             yield FieldError(
-                "", f"{MOST_FAULTY_VALUES} values of axes are told; the rest is not looked at"
+                "", f"{MOST_FAULTY_VALUES} faulty axis values are reported. The rest is not checked"
             )
             return
         found = list(_find_position_faults(checker, document, step, known))

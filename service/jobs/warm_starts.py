@@ -48,8 +48,8 @@ def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
     if have_same_equations(theirs, model):
         return ""
     return (
-        f"run {run.id} is of another model, {theirs.name!r}, whose equations are not those of "
-        f"{model.name!r}; need a run of {model.name!r}"
+        f"run {run.id} has another model: the equations of {theirs.name!r} differ from those of "
+        f"{model.name!r}. Give a run of {model.name!r}"
     )
 
 
@@ -63,16 +63,17 @@ def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
     if missing:
         theirs = load_run(session, run.id).requested_model
         return (
-            f"run {run.id} of {theirs.name!r} is of another model: "
-            f"it has the parameters {_join_names(known)}, "
-            f"{model.name!r} has {_join_names(names)}; need a run with {_join_names(missing)}"
+            f"run {run.id} of {theirs.name!r} has another model: "
+            f"its parameters are {_join_names(known)}, "
+            f"those of {model.name!r} are {_join_names(names)}. "
+            f"Give a run with {_join_names(missing)}"
         )
     for one in model.parameters:
         unit = known[one.name]["unit"] if one.name in known else one.unit
         if unit != one.unit:
             return (
-                f"run {run.id} is of another model: {one.name} is in {unit}, in {model.name!r} "
-                f"it is in {one.unit}"
+                f"run {run.id} has another model: {one.name} is in {unit} there, but in {one.unit} "
+                f"in {model.name!r}"
             )
     return ""
 

@@ -18,7 +18,7 @@ ResultDocument = Mapping[str, Any]
 _DATA_DIFFERENCES = {
     "datasets": "other datasets",
     "outputs": "other measured channels as outputs",
-    "validation": "other data kept for validation",
+    "validation": "other validation data",
     "skip": "another number of skipped samples",
     "noise": "other added noise",
 }
@@ -60,7 +60,7 @@ def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
             continue
         if stored.run.result is None:
             state = stored.run.state.value
-            detail = f"run {name!r} is {state}; only runs with a result are compared"
+            detail = f"run {name!r} is {state}. Only runs with a result can be compared"
             faults.append(FieldError(pointer, detail))
             continue
         found.append(stored)
@@ -91,8 +91,8 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
             faults.append(
                 FieldError(
                     f"/runs/{number}",
-                    f"run {one.run.id!r} has {' and '.join(apart)} than {candidates[0].run.id!r}; "
-                    "only runs on the same data compare",
+                    f"run {one.run.id!r} has {' and '.join(apart)} than {candidates[0].run.id!r}. "
+                    "Only runs on the same data can be compared",
                 )
             )
     if faults:
@@ -202,16 +202,16 @@ def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
     """What keeps numbers of the table from being compared."""
     if len({one.body["prediction"] for one in ordered}) > 1:
         yield (
-            "some runs predict one step ahead and some simulate: "
-            "their RMS, fits and criteria do not compare"
+            "some runs predict one step ahead and others simulate. "
+            "Their RMS, fits and criteria do not compare"
         )
     losses = ({**one.body["loss"], "noise_model": read_noise_model(one.result)} for one in ordered)
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
-        yield "the runs were fitted with different losses, which favour each its own measure"
+        yield "the runs were fitted with different losses. Each loss favours its own measure"
     if len({one.result["criteria"]["samples"] for one in ordered}) > 1:
         yield (
-            "the runs scored different numbers of samples: AIC and BIC do not compare "
-            "(recursions do not score the samples they start from; the same skip for all helps)"
+            "the runs scored different numbers of samples, so AIC and BIC do not compare. "
+            "Recursions do not score their initial samples. Give all runs the same skip"
         )
 
 

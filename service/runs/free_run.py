@@ -124,14 +124,14 @@ def _find_channel_faults(
         if wanted not in recorded:
             yield FieldError(
                 f"/channels/{name}",
-                f"{row.name!r} has no channel {wanted!r}{suggest_name(wanted, recorded)}; it has "
+                f"{row.name!r} has no channel {wanted!r}{suggest_name(wanted, recorded)}. It has "
                 f"{', '.join(recorded)}",
             )
     if row.n_samples > MOST_SAMPLES:
         yield FieldError(
             "/dataset",
-            f"{row.name!r} has {row.n_samples} samples; at most {MOST_SAMPLES} are simulated for "
-            "a request: derive a shorter one with 'trim' or 'resample'",
+            f"{row.name!r} has {row.n_samples} samples; a request may have at most "
+            f"{MOST_SAMPLES}. Derive a shorter dataset with 'trim' or 'resample'",
         )
 
 
@@ -165,8 +165,8 @@ def _read_records(store: ObjectStore, row: Dataset, channels: SignalChannels) ->
     if len(records) > MOST_RECORDS:
         raise InvalidRequest.from_fault(
             "/dataset",
-            f"{row.name!r} has {len(records)} segments; at most {MOST_RECORDS} are simulated for a "
-            "request: derive a recording of some of them with 'select' or 'trim'",
+            f"{row.name!r} has {len(records)} segments; a request may have at most "
+            f"{MOST_RECORDS}. Derive a dataset with fewer segments with 'select' or 'trim'",
         )
     return records
 
@@ -239,8 +239,9 @@ def _refine_starts(problem: "Problem", simulations: int) -> FloatArray:
     if work > MOST_WORK:
         raise InvalidRequest.from_fault(
             "/dataset",
-            f"{len(problem.free_parameters)} starts are to be found on {problem.evaluator.n_measured} "
-            f"measured values: their product may be {MOST_WORK:.3g}; derive a shorter recording",
+            f"{len(problem.free_parameters)} initial states are free on "
+            f"{problem.evaluator.n_measured} measured values. Their product may be at most "
+            f"{MOST_WORK:.3g}. Derive a shorter recording",
         )
     middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
     found = refine_candidates(problem, [middle], simulations)[0]
@@ -256,8 +257,8 @@ def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun
     if not isfinite(metrics.rms):
         raise InvalidRequest.from_fault(
             "/dataset",
-            f"over {row.name!r} the simulation of {run_id} diverges: the recording goes beyond "
-            "what the model was identified for",
+            f"the simulation of {run_id} diverges on {row.name!r}. The recording exceeds the "
+            "range that the model was identified on",
         )
     names = [one.name for one in problem.model.outputs]
     return FreeRun(

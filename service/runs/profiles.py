@@ -55,12 +55,13 @@ def compute_profiles(
     if work > MOST_WORK:
         raise InvalidRequest.from_fault(
             "/parameters",
-            f"{len(names)} profiles of {body.points} points are too much for this run: samples "
-            f"times parameters, points and profiles is {work:.3g}; need at most {MOST_WORK:.3g}. "
+            f"{len(names)} profiles of {body.points} points are too much work for this run. "
+            f"Samples × parameters × points × profiles is {work:.3g}; need at most "
+            f"{MOST_WORK:.3g}. "
             "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
     if not _profile_lock.acquire(blocking=False):
-        raise Conflict("another profile is being computed; ask again when it is done")
+        raise Conflict("another profile is being computed. Ask again when it is done")
     try:
         found = list(_profile_parameters(problem, theta, names, body.points))
     finally:
@@ -91,8 +92,9 @@ def _profile_parameters(
         if not found.is_complete:
             raise InvalidRequest.from_fault(
                 "/parameters",
-                f"the profiles took more than {LIMIT_SECONDS:g} s and were stopped at {name!r}; ask for "
-                "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.compute_profile",
+                f"the profiles took more than {LIMIT_SECONDS:g} s and were stopped at {name!r}. "
+                "Ask for fewer parameters or points, or use "
+                "sysid.uncertainty.profile_likelihood.compute_profile",
             )
         others = [free for free in problem.free_names if free != name]
         yield ProfileOut.from_source(

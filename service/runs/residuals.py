@@ -178,4 +178,4 @@ def _read_inputs(
     try:
         return [record.inputs for record in stored.read_datasets(session, store, names)], ""
     except (SysidError, ServiceError, StorageError) as error:
-        return [], f"the inputs are not to be had any more, so independence is not tested: {error}"
+        return [], f"the inputs cannot be read any more, so independence is not tested: {error}"

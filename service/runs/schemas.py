@@ -35,7 +35,7 @@ class RunOut(Answer):
     valid: bool | None = None
     rms: float | None = None
     rms_unit: str | None = Field(
-        default=None, description="told of a single run; σ: of several outputs together"
+        default=None, description="given for a single run; σ for several weighted outputs"
     )
     evaluations: int = 0
     generations: int = 0
@@ -43,7 +43,7 @@ class RunOut(Answer):
     progress: float
     error: str | None = None
     reused_from: str | None = Field(
-        default=None, description="the run that was computed before with the same specification"
+        default=None, description="the earlier run with the same specification"
     )
     created_at: datetime
     started_at: datetime | None = None

@@ -35,16 +35,16 @@ class StoredBounds:
             return
         kinds = {(one["reference"] or {}).get("kind") for one in self.problems}
         if "truth" in kinds:
-            yield "errors of parameters are from the true values"
+            yield "parameter errors are differences from the true values"
         if "estimate" in kinds:
             yield (
-                "the true values are not known: errors of parameters are from the estimate of the "
-                "best run with the least noise, and floors are those at that estimate"
+                "the true values are unknown. Parameter errors and Cramér–Rao bounds refer to the "
+                "estimate of the best run with the least noise"
             )
         if any(_is_measured_record(one["reference"] or {}) for one in self.problems):
             yield (
-                "σ = 0 is the record as it was measured, to which no noise was added; it is run "
-                "for that estimate even where it was not asked for"
+                "σ = 0 is the measured record without added noise. It is always run, because it "
+                "gives that estimate"
             )
         yield from dict.fromkeys(one["note"] for one in self.problems if one["note"])
         if self._note:

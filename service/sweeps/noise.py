@@ -95,13 +95,15 @@ def submit_noise_sweep(
 
 def _grid_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
     if "method" in body.algorithm.model_fields_set:
-        yield FieldError("/algorithm/method", "the sweep takes its methods from 'methods'")
+        yield FieldError(
+            "/algorithm/method", "the sweep takes its methods from 'methods'. Leave this out"
+        )
     count = len(body.sigma) * body.replicates * len(body.methods)
     if count > most_runs:
         yield FieldError(
             "/replicates",
             f"{len(body.sigma)} σ × {body.replicates} replicates × {len(body.methods)} methods "
-            f"are {count} runs; at most {most_runs} a job",
+            f"are {count} runs; a job may have at most {most_runs}",
         )
 
 

@@ -21,15 +21,15 @@ def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldErro
     if len(names) > 1:
         yield FieldError(
             "/relative",
-            f"the model has the outputs {', '.join(names)}, and σ is one number for all; "
-            "give σ in their unit, with relative: false",
+            f"the model has the outputs {', '.join(names)}, but σ is one number for all. "
+            "Give σ in their unit, with relative: false",
         )
     count = sum(row.n_samples * row.n_channels for row in rows)
     if count > MOST_READ_VALUES:
         yield FieldError(
             "/relative",
-            f"the datasets have {count} values in all, and at most {MOST_READ_VALUES} are read to find "
-            "what σ is relative to; give σ in the output's unit, with relative: false",
+            f"the datasets have {count} values; at most {MOST_READ_VALUES} are read to compute "
+            "the output's standard deviation. Give σ in the output's unit, with relative: false",
         )
 
 
@@ -61,7 +61,7 @@ def compute_spread(
     if not found > 1e-12 * largest:
         raise InvalidRequest.from_fault(
             "/relative",
-            f"the output {channel!r} does not vary (its standard deviation is {found:g}), so "
-            "that there is nothing σ could be relative to; give σ in its unit",
+            f"the output {channel!r} does not vary (standard deviation {found:g}), so σ cannot "
+            "be relative to it. Give σ in its unit, with relative: false",
         )
     return found

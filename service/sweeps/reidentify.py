@@ -32,7 +32,12 @@ def submit_reidentification(
     job = build_job(body, order)
     faults = []
     if body.warm_start == "reference" and body.reference is None:
-        faults.append(FieldError("/warm_start", "'reference' needs one: name the reference too"))
+        faults.append(
+            FieldError(
+                "/warm_start",
+                "'reference' needs the field 'reference'. Name a run or an accepted reference",
+            )
+        )
     try:
         if not faults:
             return jobs.submit_job(database, job, settings, key)

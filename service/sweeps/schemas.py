@@ -23,7 +23,7 @@ def _check_distinct(found: list[Any]) -> list[Any]:
     seen: set[Any] = set()
     for one in found:
         if one in seen:
-            raise PydanticCustomError("distinct", "{one} is there twice", {"one": str(one)})
+            raise PydanticCustomError("distinct", "{one} is given twice", {"one": str(one)})
         seen.add(one)
     return found
 
@@ -64,7 +64,7 @@ class NoiseSweepIn(IdentificationIn):
         if (self.truth is None) == (self.datasets is None):
             raise PydanticCustomError(
                 "one_of",
-                "give either 'truth' (true parameters and an input, to simulate) or 'datasets'",
+                "give either 'truth' (true parameters and inputs to simulate) or 'datasets'",
             )
         return self
 
@@ -115,14 +115,14 @@ class ParameterSummaryOut(Answer):
     unit: str
     value: list[float] = Field(description="quantiles of the estimates")
     stderr: float | None = Field(
-        description="median standard error: the Cramér–Rao floor where the runs reach the optimum"
+        description="median standard error: the Cramér–Rao bound where runs reach the optimum"
     )
-    reference: float | None = Field(default=None, description="what errors are told against")
+    reference: float | None = Field(default=None, description="value that errors refer to")
     error: list[float] | None = Field(
         default=None, description="quantiles of estimate minus reference"
     )
     floor: float | None = Field(
-        default=None, description="Cramér–Rao floor: least standard deviation under the added noise"
+        default=None, description="Cramér–Rao bound: least standard deviation under the added noise"
     )
 
 
@@ -133,18 +133,18 @@ class GroupOut(Answer):
     runs: int
     succeeded: int
     failed: int
-    success_rate: float = Field(description="runs that succeeded with a valid model, of those over")
+    success_rate: float = Field(description="fraction of finished runs that gave a valid model")
     sigma: float | None = Field(
-        default=None, description="of the noise added, where all have the same"
+        default=None, description="of the added noise, if all runs have the same"
     )
     evaluations: float | None = Field(description="mean")
     seconds: float | None = Field(description="mean compute time")
     rms: list[float] | None = Field(description="quantiles, in the output's unit")
     rms_noise_free: list[float] | None = Field(
-        default=None, description="quantiles of the RMS against the records before noise was added"
+        default=None, description="quantiles of the RMS against the records without added noise"
     )
     rms_floor: float | None = Field(
-        default=None, description="that of estimates at the Cramér–Rao floor: σ√(r/n)"
+        default=None, description="RMS of estimates at the Cramér–Rao bound: σ√(r/n)"
     )
     fit_percent: dict[str, list[float] | None]
     parameters: list[ParameterSummaryOut]
@@ -176,9 +176,9 @@ class SummaryOut(Answer):
     quantiles: list[float]
     groups: list[GroupOut]
     runs: int = 0
-    reused: int = Field(default=0, description="runs taken over from ones computed before")
+    reused: int = Field(default=0, description="runs taken over from earlier runs")
     rms_unit: str | None = Field(
-        default=None, description="of each RMS; σ: of several outputs together"
+        default=None, description="unit of each RMS; σ for several weighted outputs"
     )
     references: list[ErrorReferenceOut] = Field(default=[])
     notes: list[str] = Field(default=[], description="what the numbers mean")

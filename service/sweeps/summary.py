@@ -34,8 +34,8 @@ RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
 SUCCESS_NOTE = "a run succeeds if it ends with a finite simulation"
 SAFE_LIMIT_NOTE = "a run succeeds if it ends with an RMS within the safe limit"
 BOUND_NOTE = (
-    "floors are Cramér–Rao bounds of the added noise alone; bounds on the parameters and a search "
-    "that stops early may hold errors below them"
+    "floors are Cramér–Rao bounds for the added noise alone. Parameter bounds or an early stop of "
+    "the search can keep errors below them"
 )
 
 
@@ -68,7 +68,7 @@ def summarise_job(
     found = get_groups(session, job, keys, quantities, MOST_GROUPS)
     if len(found) > MOST_GROUPS:
         raise InvalidRequest.from_fault(
-            "?by", f"gives more than {MOST_GROUPS} groups; name fewer axes, such as no seed"
+            "?by", f"gives more than {MOST_GROUPS} groups. Name fewer axes, for example no seed"
         )
     return SummaryOut(
         job=job.id,
@@ -108,7 +108,7 @@ def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
     for name in dict.fromkeys(by):
         if name not in paths and name not in labels:
             known = [*paths, *sorted(labels)]
-            there = f"; there are {', '.join(known)}" if known else "; the job has no axes"
+            there = f". The names are {', '.join(known)}" if known else ". The job has no axes"
             raise InvalidRequest.from_fault(
                 "?by", f"the job has no axis or label {name!r}{suggest_name(name, known)}{there}"
             )

@@ -38,13 +38,13 @@ class BatchReference:
         if self.trends:
             return ""
         if self.x is not None and self.x in places:
-            return f"{self.why_no_trend}: compared with the reference run only"
+            return f"{self.why_no_trend}, so the batch is compared with the reference run only"
         where = (
             f"the reference run has no label {x!r}"
             if self.x is None
-            else f"the reference run is at {x} = {self.x:g}, where this batch has none"
+            else f"the reference run is at {x} = {self.x:g}, where this batch has no run"
         )
-        return f"{where}, and {self.why_no_trend}: nothing to compare with"
+        return f"{where}, and {self.why_no_trend}. The batch is compared with nothing"
 
 
 def compare_with_reference(

@@ -38,22 +38,22 @@ def describe_noise_models(
     whitened = [f"{at:g}" for at, models in found.items() if "ar1" in models]
     where = f"{x} = {', '.join(whitened)}" if whitened else "the reference run"
     if whitened and reference == "ar1":
-        where += " and of the reference run"
+        where += " and the reference run"
     return (
-        f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and "
-        "fits do not compare, and where the model lacks dynamics the estimates differ, too; "
-        "loss: {noise_model: white} has all of squares"
+        f"estimates of {where} use the noise model ar1, others use least squares. Their RMS and "
+        "fits do not compare. If the model lacks dynamics, the estimates differ too. "
+        "With loss: {noise_model: white} all points use least squares"
     )
 
 
 def _describe_points(one: TrendQuantity) -> Iterator[str]:
     without = [f"{point.x:g}" for point in one.points if point.estimate is None]
     if without:
-        yield f"no standard error at {', '.join(without)}: the laws leave this out"
+        yield f"no standard error at {', '.join(without)}, so the laws leave it out"
     if one.between_runs is not None and one.between_runs > 1:
         yield (
-            f"runs of one label differ by {one.between_runs:.2g} times what their standard errors say; "
-            "the errors shown hold that"
+            f"runs of one label differ by {one.between_runs:.2g} times their standard errors. "
+            "The errors shown include this scatter"
         )
 
 
@@ -64,32 +64,32 @@ def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
     if chosen.birge_ratio > BIRGE_LIMIT:
         yield (
             f"the points scatter about the law by {chosen.birge_ratio:.2g} times their errors "
-            "(Birge ratio); band and intervals are wider by that"
+            "(Birge ratio). Band and intervals are widened by this factor"
         )
     if all(law.kind != "power" for law in fitted.laws):
         wrong = [f"{x:g}" for x in _list_used_x(one) if not x > 0]
         yield "no power law: " + (
-            f"it needs x above 0, found {', '.join(wrong)}"
+            f"it needs x > 0, found {', '.join(wrong)}"
             if wrong
-            else "these points do not determine one"
+            else "these points do not determine it"
         )
     _, (_, value, error) = chosen.coefficients
     if error > abs(value):
         name = "slope" if chosen.kind == "line" else "exponent"
         yield (
-            f"the {name} of the chosen law, {value:.2g}, is smaller than its error, {error:.2g}: "
-            "the points tell no dependence on x, and the law is no more than their mean"
+            f"the {name} of the chosen law, {value:.2g}, is smaller than its error, {error:.2g}. "
+            "The points show no dependence on x"
         )
 
 
 def _describe_predictions(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
     outside = [f"{at.x:g}" for at in fitted.predictions if at.is_outside]
     if outside:
-        yield f"{', '.join(outside)} is outside the measured range: an extrapolation"
+        yield f"{', '.join(outside)} is outside the measured range, so this is an extrapolation"
     used = _list_used_x(one)
     beyond = [f"{at.x:g}" for at in fitted.predictions if not at.x > 0]
     if beyond and used and min(used) > 0:
-        yield f"{', '.join(beyond)} is not above 0, as all that was measured is"
+        yield f"{', '.join(beyond)} is not above 0, unlike all measured points"
     for at in fitted.predictions:
         yield from _compare_with_bounds(one, at)
 
@@ -106,7 +106,7 @@ def _compare_with_bounds(one: TrendQuantity, at: TrendPoint) -> Iterator[str]:
     if not lower <= at.value <= upper and at.value == at.value:
         yield (
             f"{at.value:.4g}{unit}, predicted at {at.x:g}, is outside the bounds of {one.name} "
-            f"({limits}): the law does not hold there"
+            f"({limits}). The law does not hold there"
         )
     elif at.lower < lower or at.upper > upper:
         yield f"the interval at {at.x:g} reaches beyond the bounds of {one.name} ({limits})"

@@ -31,9 +31,10 @@ class TrendPoint:
 
 @dataclass(frozen=True, slots=True)
 class TrendQuantity:
-    """A parameter or an onset delay over the labels; `between` as of `sysid.trends.trend.pool_estimates`.
+    """A parameter or an onset delay over the labels.
 
-    `bounds` are the widest of its runs.
+    `between_runs` is the scatter of `sysid.trends.trend.pool_estimates`. `bounds` are the widest of
+    its runs.
     """
 
     name: str

@@ -21,12 +21,14 @@ class DriftOut(Answer):
     """How far an estimate is from what a reference says."""
 
     kind: Literal["run", "trend"] = Field(
-        description="against the reference run, or against what the trend of its job predicts"
+        description="against the reference run, or against the prediction of its job's trend"
     )
     expected: float
     difference: float
     z: float = Field(description="in standard errors of the difference")
-    limit: float = Field(description="size of z from which on it is told as drifted")
+    limit: float = Field(
+        description="magnitude of z beyond which the estimate is flagged as drifted"
+    )
     drifted: bool
 
 
@@ -41,9 +43,11 @@ class PointOut(Answer):
     stderr: Finite
     runs: list[str]
     status: str
-    is_used: bool = Field(description="whether the laws go through it")
+    is_used: bool = Field(description="whether the laws are fitted to it")
     studentised: Finite = Field(default=None, description="deleted residual")
-    p_value: float | None = Field(default=None, description="Bonferroni's, of being no outlier")
+    p_value: float | None = Field(
+        default=None, description="Bonferroni-corrected p-value of the outlier test"
+    )
     is_outlier: bool = False
     drifts: list[DriftOut] = Field(default=[])
 
@@ -65,9 +69,9 @@ class LawOut(Answer):
     coefficients: list[CoefficientOut]
     chi_squared: float
     degrees: int
-    birge: float = Field(description="√(χ²/ν); errors are multiplied by it where it is above 1")
+    birge: float = Field(description="Birge ratio √(χ²/ν). If above 1, errors are multiplied by it")
     aic: float
-    aicc: Finite = Field(description="null with too few points for it")
+    aicc: Finite = Field(description="null with too few points")
 
 
 class LawPointOut(Answer):
@@ -89,7 +93,7 @@ class QuantityOut(Answer):
     kind: Literal["parameter", "onset delay"]
     points: list[PointOut]
     between_runs: float | None = Field(
-        description="how many stated errors runs of one label differ by; null without such runs"
+        description="scatter of runs of one label, in stated errors. Null without such runs"
     )
     laws: list[LawOut]
     reason: str = Field(default="", description="why there is no law")
@@ -117,8 +121,8 @@ class TrendOut(Answer):
     x: str
     reference: str | None = Field(default=None, description="run that the batch is compared with")
     reference_x: float | None = None
-    reference_names: list[str] = Field(default=[], description="under which it was accepted")
+    reference_names: list[str] = Field(default=[], description="names under which it was accepted")
     places: list[BatchLabelOut]
     quantities: list[QuantityOut]
-    missing: int = Field(default=0, description="runs that failed or are not over")
+    missing: int = Field(default=0, description="runs that failed or have not ended")
     notes: list[str] = Field(default=[])

@@ -123,7 +123,7 @@ def _place_row(place: dict[str, Any], quantities: list[QuantityDocument], style:
 def _prediction_row(one: QuantityDocument, at: dict[str, Any], style: Style) -> PredictionRow:
     name, x = str(one["name"]), style.label(at["x"])
     if at["value"] is None or at["lower"] is None:
-        return PredictionRow(name, x, DASH, DASH, "the law has no value here")
+        return PredictionRow(name, x, DASH, DASH, "the law is not defined here")
     interval = style.between.join(style.number(at[end]) for end in ("lower", "upper"))
     unit = style.unit(one["unit"])
     remark = "extrapolated" if at["is_outside"] else ""
@@ -160,7 +160,7 @@ def format_limits(quantities: list[QuantityDocument]) -> str:
             against = "the reference's trend" if drift["kind"] == "trend" else "the reference run"
             found.setdefault(f"{drift['limit']:.1f} against {against}", {})[one["name"]] = None
     told = "; ".join(f"{limit} ({', '.join(names)})" for limit, names in found.items())
-    return f"drift is flagged where z, in standard errors, is beyond {told}" if told else ""
+    return f"drift is flagged where z, in standard errors, exceeds {told}" if told else ""
 
 
 def format_reference(trend: dict[str, Any]) -> str:
@@ -196,6 +196,6 @@ def list_notes(trend: dict[str, Any]) -> list[str]:
             by_text.setdefault(text, []).append(f"{place['x']:g}")
     found += [f"{trend['x']} {', '.join(at)}: {text}" for text, at in by_text.items()]
     if trend["missing"]:
-        found.append(f"{trend['missing']} runs failed or are not over: they are not in the table")
+        found.append(f"{trend['missing']} runs failed or have not ended. They are not in the table")
     limits = format_limits(trend["quantities"])
     return [*found, *trend["notes"], *([limits] if limits else [])]

@@ -56,7 +56,7 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
     job = JobRepository(session).get(job_id)
     if not has_trend(job):
         raise Conflict(
-            f'{job.id} has no trend; submit it with "trend": {{"x": …}}, the name of a label'
+            f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
     asked = job.spec["trend"]
     places, found = _collect_quantities(session, job)
@@ -95,7 +95,7 @@ def _collect_quantities(
 ) -> tuple[dict[float, list[TrendRow]], list[TrendQuantity]]:
     if job.n_runs > MOST_RUNS:
         raise InvalidRequest.from_fault(
-            "", f"{job.id} has {job.n_runs} runs; a trend is made of at most {MOST_RUNS}"
+            "", f"{job.id} has {job.n_runs} runs; a trend may have at most {MOST_RUNS}"
         )
     asked = job.spec["trend"]
     places = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), asked["x"])
@@ -128,8 +128,8 @@ def _explain_missing_trend(theirs: Job, x: str) -> str:
         return f"the trend of its job is over {theirs.spec['trend']['x']!r}"
     if theirs.n_runs > MOST_RUNS:
         return (
-            f"the reference batch {theirs.id} has {theirs.n_runs} runs, and a trend is made of at "
-            f"most {MOST_RUNS}"
+            f"the reference batch {theirs.id} has {theirs.n_runs} runs (a trend may have at most "
+            f"{MOST_RUNS})"
         )
     return ""
 

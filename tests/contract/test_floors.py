@@ -109,7 +109,7 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
     monkeypatch.setattr(cramer_rao, "cramer_rao_bound", broken)
     (job,) = carried_out(place, place.submit(**NOISY))
     assert job.state is JobState.SUCCEEDED
-    assert any("there is no floor: internal error" in one for one in notes(job))
+    assert any("no Cramér–Rao bound: internal error" in one for one in notes(job))
 
 
 def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatch):

@@ -63,7 +63,7 @@ def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
         )
     with place.database.read() as session:
         told = [one.data.get("message") for one in EventRepository(session).list_latest(job, 20)]
-    assert "3 of 5 runs had been computed before: reused" in told
+    assert "3 of 5 runs were taken over from earlier runs" in told
     assert place.job(job).evaluations == sum(run.evaluations for run in after)
     assert place.job(job).n_done == 5
 

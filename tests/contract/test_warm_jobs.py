@@ -150,8 +150,8 @@ def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
     open_job = place.submit()
     (waiting,) = place.runs(open_job)
     for warm, model, said in [
-        (waiting.id, "fopdt", "is queued; need one that succeeded"),
-        (first.id, "sopdt", "is of another model: it has the parameters K, T, L"),
+        (waiting.id, "fopdt", "is queued; need a run that succeeded"),
+        (first.id, "sopdt", "has another model: its parameters are K, T, L"),
     ]:
         with pytest.raises(InvalidRequest) as caught:
             place.submit(warm_start=warm, model=model, parameters={})

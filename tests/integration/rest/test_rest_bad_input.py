@@ -73,7 +73,7 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     (
         {"validation": {"fraction": 0.9}, "parameters": {"L": {"upper": 5}}},
         "/datasets/0",
-        "part for estimation: the record lasts 2.9 s",
+        "estimation part: the record lasts 2.9 s",
     ),
     ({"validation": {"fraction": 0.9}, "skip": 30}, "/datasets/0", "30 samples"),
     ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
@@ -90,12 +90,12 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"parameters": {"K": {"tied": 2}}}, "/parameters/K/tied", "found 2"),
     ({"parameters": {"L": {"tied": "T - 20"}}}, "/parameters", "as small as"),
     ({"parameters": {"K": {"tied": "T", "lower": 0}}}, "/parameters/K", "leave out 'lower'"),
-    ({"skip": 297, "model": FEW}, "/datasets", "3 scored samples in all for 4 free parameters"),
+    ({"skip": 297, "model": FEW}, "/datasets", "3 scored samples for 4 free parameters"),
     ({"model": {**POLYNOMIAL, "terms": ["y(k-1)", "u(k-"]}}, "/model/terms/1", "expression ends"),
     (
         {"parameters": {name: {"fixed": 1} for name in ("K", "T", "L", "y0", "x(0)")}},
         "/parameters",
-        "leave one free",
+        "Leave at least one free",
     ),
 ]
 

@@ -98,7 +98,7 @@ def test_fewer_scored_samples_than_parameters_are_refused(
     body = {"model": FIRST, "datasets": [stored(client, recording())], **fields}
     (fault,) = refused(client.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == "/datasets"
-    assert "2 scored samples in all for 3 free parameters" in fault["detail"]
+    assert "2 scored samples for 3 free parameters" in fault["detail"]
 
 
 @pytest.mark.parametrize(

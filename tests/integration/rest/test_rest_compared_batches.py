@@ -76,7 +76,7 @@ def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: Serve
     assert found["reference_names"] == ["tube"]
     page = served.server.get(f"/jobs/{found['job']}").text
     assert "Compared with &#39;tube&#39; (length_m = 8)" in page
-    assert "drift is flagged where z, in standard errors, is beyond" in page
+    assert "drift is flagged where z, in standard errors, exceeds" in page
 
 
 def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> None:
@@ -103,8 +103,8 @@ def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
     found = against(served, label="bore_mm")
     (note,) = found["notes"]
     assert note == (
-        "the reference run has no label 'bore_mm', and the trend of its job is over 'length_m': "
-        "nothing to compare with"
+        "the reference run has no label 'bore_mm', and the trend of its job is over 'length_m'. "
+        "The batch is compared with nothing"
     )
 
 
@@ -125,7 +125,7 @@ def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: Served) 
     (fault,) = refused(served.server.put("/v1/references/tube", json={"run": run}), 422, "invalid")
     assert fault["pointer"] == "/run"
     assert "'fopdt'" in fault["detail"]
-    assert "'tube' stands for runs of another, 'tube'" in fault["detail"]
+    assert "'tube' stands for the model 'tube'" in fault["detail"]
     assert served.server.get("/v1/references/tube").json()["run"] != run
     assert served.server.put("/v1/references/lag", json={"run": run}).status_code == 200
 
@@ -140,7 +140,9 @@ def test_a_batch_is_not_begun_at_or_compared_with_a_run_of_another_model(served:
         )
         (fault,) = refused(answer, 422, "invalid")
         assert fault["pointer"] == "/reference"
-        assert "another model, 'fopdt', whose equations are not those of 'tube'" in fault["detail"]
+        assert (
+            "another model: the equations of 'fopdt' differ from those of 'tube'" in fault["detail"]
+        )
 
 
 def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_model(

@@ -36,7 +36,9 @@ def test_a_job_beyond_the_limit_is_refused_leaves_nothing_and_gets_in_later(
     limited: TestClient,
 ) -> None:
     first, second = (limited.post("/v1/jobs", json=body()).json()["id"] for _ in range(2))
-    assert "2 jobs of the project wait or run, and at most 2 may" in refusal(limited, json=body())
+    assert "2 jobs of the project are queued or running; at most 2 may" in refusal(
+        limited, json=body()
+    )
     assert {job["id"] for job in limited.get("/v1/jobs").json()["items"]} == {first, second}
     limited.post(f"/v1/jobs/{first}:cancel")
     assert limited.post("/v1/jobs", json=body()).status_code == 202
@@ -47,7 +49,7 @@ def test_a_sweep_with_more_runs_than_may_be_open_is_refused_with_the_counts(
 ) -> None:
     assert limited.post("/v1/jobs", json=body(10)).status_code == 202
     told = refusal(limited, json=body(3))
-    assert "10 runs of the project are not done, and this job has 3 more; at most 12" in told
+    assert "10 runs of the project are not done, and this job adds 3. At most 12" in told
     assert limited.post("/v1/jobs", json=body(2)).status_code == 202
 
 

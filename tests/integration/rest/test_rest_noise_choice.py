@@ -126,7 +126,7 @@ def trend_notes(served: Served, datasets: list[str], **more: Any) -> list[str]:
 
 def test_a_trend_tells_which_of_its_runs_are_of_another_noise_model(served: Served) -> None:
     (note,) = trend_notes(served, [served.tank, served.quiet])
-    assert "estimates of level = 1 are of the noise model ar1 and others of squares" in note
+    assert "estimates of level = 1 use the noise model ar1, others use least squares" in note
     assert "loss: {noise_model: white}" in note
     assert not trend_notes(served, [served.tank, served.quiet], loss={"noise_model": "white"})
     assert not trend_notes(served, [served.tank])

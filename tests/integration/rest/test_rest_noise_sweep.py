@@ -311,7 +311,7 @@ def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> Non
         (
             {"replicates": 25_001},
             "/replicates",
-            "2 σ × 25001 replicates × 2 methods are 100004 runs; at most 100000 a job",
+            "2 σ × 25001 replicates × 2 methods are 100004 runs; a job may have at most 100000",
         ),
         ({"datasets": ["steps"]}, "", "either 'truth'"),
         ({"truth": None}, "", "either 'truth'"),
@@ -363,4 +363,4 @@ def test_the_limit_of_the_settings_is_that_of_the_sweep(tmp_path: Path) -> None:
     app = create_app(settings_of(tmp_path, max_runs_per_job=7))
     with TestClient(app, raise_server_exceptions=False) as server:
         (fault,) = refused(server.post(URL, json=BODY), 422, "invalid")
-    assert "8 runs; at most 7" in fault["detail"]
+    assert "8 runs; a job may have at most 7" in fault["detail"]

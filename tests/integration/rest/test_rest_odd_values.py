@@ -118,7 +118,7 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
     ]
     assert faults[-1] == {
         "pointer": "",
-        "detail": "200 values of axes are told; the rest is not looked at",
+        "detail": "200 faulty axis values are reported. The rest is not checked",
     }
     axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "fopdt"]
     assert len(refused(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201

@@ -219,7 +219,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     monkeypatch.setattr("service.datasets.recordings.load_recording", lost)
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
-    assert "not to be had any more" in asked["note"]
+    assert "cannot be read any more" in asked["note"]
 
 
 def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:

@@ -128,7 +128,7 @@ def test_that_states_start_where_an_earlier_input_does_is_told(served: Served) -
     assert at_zero["notes"] == []
     assert at_zero["outputs"][0]["values"][0] == pytest.approx(6.0)
     [note] = early["notes"]
-    assert note.startswith("u is given from -2 s on: there the states start")
+    assert note.startswith("u begins at -2 s. The initial states apply there")
     gone = np.exp(-2.0 / early["parameters"]["T"])
     assert early["outputs"][0]["values"][0] == pytest.approx(5.0 + gone, rel=1e-4)
 
@@ -252,7 +252,7 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
             "/control/reference/time",
             "outside the simulation, from 0 to 6 s",
         ),
-        ({"inputs": {"P_a": STEP}}, "/inputs/P_a", "the controller gives this input"),
+        ({"inputs": {"P_a": STEP}}, "/inputs/P_a", "the controller computes this input"),
         ({"inputs": {"u": STEP}}, "/inputs/u", "no input 'u'"),
         ({"control": None}, "/inputs/P_a", "give input 'P_a'"),
         ({"parameters": {"Fc": 1.0}}, "/parameters/Fc", "did you mean 'F_c'"),
@@ -261,7 +261,7 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
         (
             {"control": {**CONTROL, "transport": {"delay": 7}}},
             "/control/transport/delay",
-            "found 7 s; the simulation lasts 6 s",
+            "found 7 s, but the simulation lasts 6 s",
         ),
     ],
 )
@@ -288,7 +288,7 @@ def test_a_simulation_that_diverges_is_told_with_its_time(served: Served) -> Non
         served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
     )
     assert faults[0]["pointer"] == "/control/gain"
-    assert "found 1e+30; with it the loop runs away" in faults[0]["detail"]
+    assert "found 1e+30, with which the loop diverges" in faults[0]["detail"]
     assert "diverges at t =" in faults[0]["detail"]
 
 

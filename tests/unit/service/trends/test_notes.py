@@ -33,7 +33,7 @@ def test_a_prediction_inside_needs_no_note() -> None:
 @pytest.mark.parametrize(
     ("at", "said"),
     [
-        (-3.0, "-3 is not above 0, as all that was measured is"),
+        (-3.0, "-3 is not above 0, unlike all measured points"),
         (-3.0, "-0.005 s, predicted at -3, is outside the bounds of L (0 to 1 s)"),
         (600.0, "1.201 s, predicted at 600, is outside the bounds of L (0 to 1 s)"),
         (-0.5, "the interval at -0.5 reaches beyond the bounds of L (0 to 1 s)"),
@@ -49,13 +49,13 @@ def test_an_onset_delay_is_not_below_zero() -> None:
 
 def test_why_there_is_no_power_law_is_noted() -> None:
     told = noted([0.0, *LINE[0]], [0.001, *LINE[1]], [])
-    assert "no power law: it needs x above 0, found 0" in told
+    assert "no power law: it needs x > 0, found 0" in told
     assert "power law" not in noted(*LINE, [])
 
 
 @pytest.mark.parametrize("y", [[0.02, 0.021, 0.02, 0.021], [0.021, 0.02, 0.0205, 0.0205]])
 def test_a_law_that_tells_no_dependence_is_noted(y: list[float]) -> None:
-    assert "the points tell no dependence on x" in noted(LINE[0], y, [])
+    assert "The points show no dependence on x" in noted(LINE[0], y, [])
 
 
 def test_a_constant_whose_power_law_is_chosen_is_noted_by_its_exponent() -> None:
