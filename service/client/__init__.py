@@ -1,4 +1,4 @@
-"""HTTP client of the service; loads neither NumPy nor Ray, and httpx only with a client."""
+"""HTTP client of the service. It loads neither NumPy nor Ray, and httpx only with a client."""
 
 from typing import TYPE_CHECKING, Any
 

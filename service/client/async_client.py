@@ -1,4 +1,4 @@
-"""The asynchronous twin of the client."""
+"""The asynchronous client of the service; the counterpart of `Client`."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -12,14 +12,14 @@ from service.client import calls
 from service.client.calls import Document, RestCall, ServerUnreachable
 
 BLOCK_BYTES = 1 << 20
-"""Bytes of a file that are read at once."""
+"""Size of the blocks in which a file is read."""
 
 
 class AsyncClient:
-    """The service from an asynchronous program; methods as those of `Client`, with ``await``.
+    """Asynchronous client of the service; its methods are those of `Client`, with ``await``.
 
-    Parameters and errors are those of `Client`. `runs` and `events` are gone through with
-    ``async for``.
+    Parameters and errors are those of `Client`. `runs` and `events` are iterated with ``async
+    for``.
     """
 
     def __init__(
@@ -49,25 +49,25 @@ class AsyncClient:
         await self._http.aclose()
 
     async def send(self, call: RestCall, *, stream: bool = False) -> httpx.Response:
-        """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = calls.plan_pauses(call, self._retries)
+        """Send one call and raise its errors. The caller reads and closes a stream."""
+        pauses = calls.plan_pauses(call, self._retries)
         while True:
-            answer = await self._send_once(call, stream)
-            pause = calls.choose_pause(answer, left)
+            response = await self._send_once(call, stream)
+            pause = calls.choose_pause(response, pauses)
             if pause is None:
-                return calls.raise_for_problem(answer)
+                return calls.raise_for_problem(response)
             await asyncio.sleep(pause)
 
     async def _send_once(self, call: RestCall, stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
         request = self._http.build_request(**call.request(content, stream=stream))
         try:
-            answer = await self._http.send(request, stream=stream)
-            if not answer.is_success:
-                await answer.aread()
+            response = await self._http.send(request, stream=stream)
+            if not response.is_success:
+                await response.aread()
         except httpx.TransportError as error:
             raise ServerUnreachable(self.url, error) from error
-        return answer
+        return response
 
     async def _fetch_document(self, call: RestCall) -> Document:
         document: Document = (await self.send(call)).json()
@@ -93,7 +93,7 @@ class AsyncClient:
         segments: str | None = None,
         sample_time: float | None = None,
     ) -> Document:
-        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        """Store a recording (CSV or MCAP) from a file or from bytes."""
         return await self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     async def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
@@ -108,40 +108,40 @@ class AsyncClient:
         return await self._fetch_document(calls.DERIVE(dataset, json=body))
 
     async def datasets(self) -> list[Document]:
-        """All datasets, newest first."""
+        """List all datasets, newest first."""
         return await self._fetch_list(calls.DATASETS())
 
     async def dataset(self, name: str) -> Document:
-        """One dataset by id."""
+        """Fetch one dataset by its id."""
         return await self._fetch_document(calls.DATASET(name))
 
     async def signals(self, dataset: str, max_points: int = 1000) -> Document:
-        """Signals of a dataset, reduced to at most so many points a channel."""
+        """Fetch the signals of a dataset, reduced to at most `max_points` points per channel."""
         return await self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
 
     async def lineage(self, dataset: str) -> Document:
-        """What a dataset was made from, and what was made from it."""
+        """Fetch the lineage of a dataset: its sources, and everything made from it."""
         return await self._fetch_document(calls.LINEAGE(dataset))
 
     async def content(self, dataset: str) -> bytes:
-        """A dataset as an MCAP file."""
+        """Download a dataset as an MCAP file."""
         return (await self.send(calls.CONTENT(dataset))).content
 
     # ---- models
     async def models(self) -> list[Document]:
-        """Catalogue and own models."""
+        """List the built-in models and those of users."""
         return await self._fetch_list(calls.MODELS())
 
     async def model(self, name: str) -> Document:
-        """One model with its document."""
+        """Fetch one model with its document."""
         return await self._fetch_document(calls.MODEL(name))
 
     async def add_model(self, document: Mapping[str, Any]) -> Document:
-        """Store an own model; a changed document becomes its next version."""
+        """Store a user model; a changed document becomes its next version."""
         return await self._fetch_document(calls.ADD_MODEL(json=document))
 
     async def check_model(self, document: Mapping[str, Any]) -> Document:
-        """Whether a model document can be used, with every error and its column."""
+        """Check a model document; every error has its column."""
         return await self._fetch_document(calls.CHECK_MODEL(json=document))
 
     # ---- jobs
@@ -172,15 +172,15 @@ class AsyncClient:
     async def jobs(
         self, limit: int | None = None, state: Sequence[str] | None = None
     ) -> list[Document]:
-        """Jobs, newest first: all, or at most `limit`, or those in some states."""
+        """List jobs, newest first: all, at most `limit`, or those in some states."""
         return await self._fetch_list(calls.JOBS(state=state), limit)
 
     async def job(self, name: str) -> Document:
-        """One job with its state and progress."""
+        """Fetch one job with its state and progress."""
         return await self._fetch_document(calls.JOB(name))
 
     async def cancel(self, job: str) -> Document:
-        """Cancel a job; what it has found so far stays."""
+        """Cancel a job; its results so far stay."""
         return await self._fetch_document(calls.CANCEL(job))
 
     async def resume(self, job: str) -> Document:
@@ -192,7 +192,7 @@ class AsyncClient:
         return await self._fetch_document(calls.CLONE(job))
 
     async def report(self, job: str) -> str:
-        """The report of a job, as HTML."""
+        """Fetch the report of a job, as HTML."""
         return (await self.send(calls.REPORT(job))).text
 
     async def wait(
@@ -202,7 +202,7 @@ class AsyncClient:
         *,
         poll: float = calls.POLL_SECONDS,
     ) -> Document:
-        """Wait until a job has ended; `progress` hears its state at every look."""
+        """Wait until a job has ended; `progress` is called with its state at every poll."""
         while True:
             state = await self.job(job)
             if progress is not None:
@@ -212,7 +212,7 @@ class AsyncClient:
             await asyncio.sleep(poll)
 
     async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
-        """Events of a job as they come, until its end; `after` is the id of the last one known."""
+        """Yield the events of a job until its end; `after` is the id of the last event received."""
         parser = calls.EventParser()
         stream = await self.send(calls.build_event_stream(job, after), stream=True)
         async with aclosing(stream):
@@ -224,27 +224,27 @@ class AsyncClient:
     def runs(
         self, job: str, *, at_most: int | None = None, **filters: Any
     ) -> AsyncIterator[Document]:
-        """All runs of a job, or the first `at_most` that the filters leave."""
+        """List all runs of a job, or the first `at_most` that pass the filters."""
         return self._iterate_items(calls.RUNS(job, **filters), at_most)
 
     async def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
-        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        """Fetch quantiles over the values of axes or labels, by default over all axes but seeds."""
         return await self._fetch_document(calls.SUMMARY(job, by=by))
 
     async def trend(self, job: str) -> Document:
-        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift."""
         return await self._fetch_document(calls.TREND(job))
 
     async def run(self, name: str) -> Document:
-        """One run's result."""
+        """Fetch the result of one run."""
         return await self._fetch_document(calls.RUN(name))
 
     async def history(self, run: str) -> Document:
-        """Improvements of each island's champion."""
+        """Fetch the improvements of each island's champion."""
         return await self._fetch_document(calls.HISTORY_KEY(run))
 
     async def response(self, run: str, max_points: int = 1000) -> Document:
-        """Measured and simulated outputs."""
+        """Fetch the measured and simulated outputs."""
         return await self._fetch_document(calls.RESPONSE(run, max_points=max_points))
 
     async def simulate_run(
@@ -262,49 +262,49 @@ class AsyncClient:
         skip: int = 0,
         max_points: int = 1000,
     ) -> Document:
-        """Run the identified model freely over another recording: RMS and fit there."""
+        """Simulate the identified model on another recording: RMS and fit."""
         body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
         return await self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
 
     async def migrations(self, run: str) -> Document:
-        """The migration log."""
+        """Fetch the migration log."""
         return await self._fetch_document(calls.MIGRATIONS(run))
 
     async def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
-        """Profile likelihood of some free parameters, of all if none is named."""
+        """Compute the profile likelihood of some free parameters; of all if none is named."""
         body = {"parameters": parameters or None, "points": points}
         return await self._fetch_document(calls.PROFILE(run, json=body))
 
     async def residuals(self, run: str) -> Document:
-        """Correlation functions of the residuals with their bands and tests."""
+        """Fetch the correlation functions of the residuals, their bands and tests."""
         return await self._fetch_document(calls.RESIDUALS(run))
 
     async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
-        """The identified model as text: json, python, c or control."""
+        """Export the identified model as text: json, python, c or control."""
         return (await self.send(calls.EXPORT(run, format=format, pade_order=pade_order))).text
 
     async def compare(self, *runs: str) -> Document:
-        """Runs on the same data side by side, the best first."""
+        """Compare runs on the same data, best first."""
         return await self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
     async def references(self) -> list[Document]:
-        """The references in use, by name."""
+        """List the references in use, by name."""
         return await self._fetch_list(calls.REFERENCES())
 
     async def reference(self, name: str) -> Document:
-        """One reference with its history."""
+        """Fetch one reference with its history."""
         return await self._fetch_document(calls.REFERENCE(name))
 
     async def accept_reference(
         self, name: str, run: str, *, by: str | None = None, note: str | None = None
     ) -> Document:
-        """Make a run the reference of a name; the one before stays in the history."""
+        """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
         return await self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
 
 
 async def _read_blocks(path: Path) -> AsyncIterator[bytes]:
     with path.open("rb") as file:
-        while piece := await asyncio.to_thread(file.read, BLOCK_BYTES):
-            yield piece
+        while block := await asyncio.to_thread(file.read, BLOCK_BYTES):
+            yield block

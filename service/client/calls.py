@@ -1,6 +1,6 @@
-"""The calls of the REST interface as values, shared by the two clients; loads no HTTP library.
+"""The calls of the REST interface as values, shared by both clients; loads no HTTP library.
 
-The errors of the clients, the pages of a list, the events of a job, and which call is sent again.
+It also holds the errors of the clients, the pages of a list, the events of a job, and the retries.
 """
 
 import json
@@ -35,14 +35,14 @@ PAGE_SIZE = 500
 
 
 def make_auth_header(key: str | None) -> dict[str, str]:
-    """The header that carries an API key."""
+    """Make the header that carries an API key."""
     return {"Authorization": f"Bearer {key}"} if key else {}
 
 
 class ClientError(Exception):
-    """Base class of what a client raises on purpose.
+    """Base class of the errors that a client raises on purpose.
 
-    It is a ProblemError, a ServerUnreachable or a NotFinite.
+    Subclasses: ProblemError, ServerUnreachable and NotFinite.
     """
 
 
@@ -55,7 +55,7 @@ class ProblemError(ClientError):
     document : dict
         The RFC 9457 problem document; ``errors`` lists each fault with its JSON pointer.
     reason : str
-        What it says, in one line.
+        Text of the refusal, in one line.
     """
 
     def __init__(self, status: int, document: Document) -> None:
@@ -71,20 +71,20 @@ class ServerUnreachable(ClientError):
     def __init__(self, url: str, error: Exception) -> None:
         reason = str(error) or type(error).__name__
         super().__init__(
-            f"no lagid server answers at {url} ({reason}); start one with `lagid serve`, "
-            "or name another with --url or LAGID_URL"
+            f"no lagid server answers at {url} ({reason}). Start one with `lagid serve`, "
+            "or give another address with --url or LAGID_URL."
         )
 
 
 class NotFinite(ClientError):
-    """A body holds a number that JSON has no word for; it was not sent.
+    """A body contains a number that JSON cannot represent; it was not sent.
 
     Attributes
     ----------
     pointer : str
-        Where it stands in the body.
+        Position of the number in the body.
     reason : str
-        What was found there.
+        What was found there, and what is needed.
     """
 
     def __init__(self, pointer: str, value: float) -> None:
@@ -99,7 +99,7 @@ class RestCall:
     Raises
     ------
     NotFinite
-        If a number of the body is infinite or not a number.
+        If a number of the body is infinite or NaN.
     """
 
     method: str
@@ -113,7 +113,7 @@ class RestCall:
         _check_finite("", self.json)
 
     def request(self, content: Any, *, stream: bool) -> dict[str, Any]:
-        """Arguments for httpx's ``build_request``; a stream has no time limit."""
+        """Return the arguments of httpx's ``build_request``; a stream has no time limit."""
         request = {"method": self.method, "url": self.path, "content": content, "json": self.json}
         limit = {"timeout": None} if stream else {}
         return {**request, "params": dict(self.params), "headers": dict(self.headers), **limit}
@@ -123,23 +123,23 @@ def _check_finite(pointer: str, value: Any) -> None:
     if isinstance(value, float) and not isfinite(value):
         raise NotFinite(pointer, value)
     if isinstance(value, Mapping):
-        for name, one in value.items():
+        for name, item in value.items():
             part = str(name).replace("~", "~0").replace("/", "~1")
-            _check_finite(f"{pointer}/{part}", one)
+            _check_finite(f"{pointer}/{part}", item)
     elif isinstance(value, list | tuple):
-        for index, one in enumerate(value):
-            _check_finite(f"{pointer}/{index}", one)
+        for index, item in enumerate(value):
+            _check_finite(f"{pointer}/{index}", item)
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A call without its values: the method, and the path below ``/v1/`` with ``{}`` for names."""
+    """An endpoint: its method, and its path below ``/v1/`` with ``{}`` for each name."""
 
     method: str
     path: str
 
     def __call__(self, *names: str, json: Any = None, **params: Any) -> RestCall:
-        """The call on the things with these names; parameters that are None are left out."""
+        """Build the call for resources of these names; parameters that are None are left out."""
         path = self.path.format(*(quote(name, safe="") for name in names))
         query = {key: _to_query(value) for key, value in params.items() if value is not None}
         return RestCall(self.method, f"/v1/{path}", query, json)
@@ -195,22 +195,22 @@ ACCEPT_REFERENCE = Endpoint("PUT", "references/{}")
 
 
 def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> RestCall:
-    """A call that queues a job; the same idempotency key again gives the same job.
+    """Build a call that queues a job; the same idempotency key again returns the same job.
 
-    Without a key it has one of its own, so that it can be sent again where no answer came.
+    Without a key the call gets a random one, so that it can be repeated if no response came.
     """
     return replace(endpoint(json=body), headers={IDEMPOTENCY_HEADER: key or uuid4().hex})
 
 
 def build_event_stream(job: str, after: str | None) -> RestCall:
-    """The call for a job's events, or for those after a known one."""
+    """Build the call for a job's events, or for those after an event."""
     return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
 
 
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> RestCall:
-    """The call that stores a file or bytes; the kind follows from the suffix or the content."""
+    """Build the call that stores a file or bytes; suffix or content decide its media type."""
     content: bytes | Path
     if isinstance(source, bytes):
         content = source
@@ -224,7 +224,7 @@ def build_upload(
 
 
 class Paginator:
-    """What a call lists, page by page: `at_most` items, or all."""
+    """Reads a list page by page: `at_most` items, or all."""
 
     def __init__(self, call: RestCall, at_most: int | None) -> None:
         self._call, self._left, self._limit = call, at_most, min(at_most or PAGE_SIZE, PAGE_SIZE)
@@ -232,7 +232,7 @@ class Paginator:
         self._is_over = False
 
     def next_call(self) -> RestCall | None:
-        """The call of the next page, until there is none."""
+        """Return the call of the next page; None after the last page."""
         if self._is_over:
             return None
         position = {"cursor": self._cursor} if self._cursor else {}
@@ -240,43 +240,43 @@ class Paginator:
         return replace(self._call, params=params)
 
     def take_items(self, page: Document) -> list[Document]:
-        """The items of a page that answers the call."""
-        found: list[Document] = page["items"][: self._left]
+        """Return the items of a page and remember its cursor."""
+        items: list[Document] = page["items"][: self._left]
         if self._left is not None:
-            self._left -= len(found)
+            self._left -= len(items)
         self._cursor = page["next"]
         self._is_over = self._cursor is None or self._left == 0
-        return found
+        return items
 
 
-def raise_for_problem(answer: "httpx.Response") -> "httpx.Response":
-    """The answer, unless it is an error.
+def raise_for_problem(response: "httpx.Response") -> "httpx.Response":
+    """Return the response, or raise its error.
 
     Raises
     ------
     ProblemError
-        With the problem document; one is made where something else than lagid answered.
+        With the problem document. If the response is not one of lagid, a document is made for it.
     """
-    if answer.is_success:
-        return answer
+    if response.is_success:
+        return response
     try:
-        document = answer.json()
+        document = response.json()
     except ValueError:
         document = None
     if not isinstance(document, dict):
-        title, detail = answer.reason_phrase, answer.text[:200]
-        document = {"title": title, "status": answer.status_code, "detail": detail}
-    raise ProblemError(answer.status_code, document)
+        title, detail = response.reason_phrase, response.text[:200]
+        document = {"title": title, "status": response.status_code, "detail": detail}
+    raise ProblemError(response.status_code, document)
 
 
 class EventParser:
-    """Server-sent events from lines; `feed` gives an event when a line completes one."""
+    """Parses server-sent events line by line."""
 
     def __init__(self) -> None:
         self._fields: dict[str, str] = {}
 
     def feed_line(self, line: str) -> Iterator[Document]:
-        """Take one line; yield the event it completes, with its data decoded from JSON."""
+        """Take one line; yield the event that it completes, with its data decoded from JSON."""
         if line:
             key, _, value = line.partition(":")
             if key:  # a line that begins with a colon is a comment that keeps the line open
@@ -298,53 +298,53 @@ def _describe_fault(entry: Mapping[str, Any]) -> str:
 
 DEFAULT_RETRIES = 4
 FIRST_PAUSE_SECONDS = 0.5
-"""Pause before the second try, where the server names none; each one after is twice as long."""
+"""Pause before the second attempt, if the server names none; it doubles with each attempt."""
 LONGEST_PAUSE_SECONDS = 30.0
-"""No pause is longer: a server that asks for more is away for longer than a call should hang."""
+"""Longest pause. If the server asks for a longer one, the call is not repeated."""
 REPEATABLE_METHODS = frozenset({"GET", "HEAD", "PUT"})
 
 
 def plan_pauses(call: RestCall, retries: int) -> "Iterator[float]":
-    """Seconds to wait before each further try of a call, where the server names none.
+    """Yield the seconds to wait before each further attempt, if the server names none.
 
-    There are none for a request that might be carried out twice: a POST without idempotency key.
+    A request that might be carried out twice has none: a POST without an idempotency key.
     """
     if call.method in REPEATABLE_METHODS or IDEMPOTENCY_HEADER in call.headers:
         for number in range(retries):
             yield FIRST_PAUSE_SECONDS * 2**number
 
 
-def choose_pause(answer: "httpx.Response", left: "Iterator[float]") -> float | None:
-    """Seconds until a call is sent again; None if its answer stands.
+def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float | None:
+    """Return the seconds until a call is sent again; None if its response is final.
 
     Parameters
     ----------
-    answer : httpx.Response
-        Only 503 is temporary by its meaning; its ``Retry-After`` is waited for, in seconds or as
-        a date (RFC 9110, section 10.2.3).
-    left : iterator of float
-        The pauses of this call that are left, of which one is taken.
+    response : httpx.Response
+        Only status 503 is temporary. Its ``Retry-After`` sets the pause, in seconds or as a date
+        (RFC 9110, section 10.2.3).
+    pauses : iterator of float
+        The remaining pauses of this call; one is taken.
     """
-    if answer.status_code != HTTPStatus.SERVICE_UNAVAILABLE:
+    if response.status_code != HTTPStatus.SERVICE_UNAVAILABLE:
         return None
-    pause = next(left, None)
+    pause = next(pauses, None)
     if pause is None:
         return None
-    asked = _parse_retry_after(answer.headers.get("Retry-After"))
-    pause = pause if asked is None else asked
+    requested = _parse_retry_after(response.headers.get("Retry-After"))
+    pause = pause if requested is None else requested
     return pause if pause <= LONGEST_PAUSE_SECONDS else None
 
 
 def _parse_retry_after(header: str | None) -> float | None:
-    """Seconds that a ``Retry-After`` asks for; None if it is missing or neither of its forms."""
+    """Return the seconds of a ``Retry-After`` header; None if it is missing or invalid."""
     if header is None:
         return None
     if header.strip().isdecimal():
         return float(header)
     try:
         until = parsedate_to_datetime(header)
-    except (ValueError, OverflowError):  # the latter of a zone that no integer holds
+    except (ValueError, OverflowError):  # the latter if the zone exceeds an integer
         return None
-    if until.tzinfo is None:  # RFC 5322's -0000; HTTP's dates are of GMT
+    if until.tzinfo is None:  # RFC 5322's -0000; HTTP dates are in GMT
         until = until.replace(tzinfo=UTC)
     return max(0.0, (until - datetime.now(UTC)).total_seconds())

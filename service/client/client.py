@@ -1,6 +1,6 @@
 """The light client of the service: httpx only, without NumPy or Ray.
 
-All methods take and return plain documents with the names of the REST interface.
+All methods take and return plain documents with the field names of the REST interface.
 """
 
 import time
@@ -16,30 +16,30 @@ from service.client.calls import Document, RestCall, ServerUnreachable
 
 
 class Client:
-    """The service from a program.
+    """Synchronous client of the service.
 
     Parameters
     ----------
     url : str
         Address of the server.
     key : str, optional
-        API key, where the server asks for one.
+        API key, if the server requires one.
     retries : int
-        So often a request is sent again that the server could not serve just then (503), if it
-        may be sent twice: one that reads or replaces, or has an idempotency key, as those have
-        that queue a job. Pauses are what ``Retry-After`` asks for, 30 s at most; without one 0.5 s
-        and twice as long each time.
+        How often a request is repeated after an answer 503 (temporarily unavailable). Only requests
+        that may be sent twice are repeated: those that read or replace, and those with an
+        idempotency key, such as the submission of a job. The pause is that of ``Retry-After``,
+        30 s at most. Without this header it is 0.5 s, and doubles each time.
     transport : httpx.BaseTransport, optional
-        Another way to the server, for tests.
+        Replacement of the network transport, for tests.
 
     Raises
     ------
     ProblemError
-        From every method, if the server refuses; it carries the problem document.
+        From every method, if the server refuses the request; holds the problem document.
     ServerUnreachable
         From every method, if no server answers.
     NotFinite
-        From every method that sends a body, if a number in it is infinite or not a number.
+        From every method that sends a body, if a number in it is infinite or NaN.
     """
 
     def __init__(
@@ -69,13 +69,13 @@ class Client:
         self._http.close()
 
     def send(self, call: RestCall, *, stream: bool = False) -> httpx.Response:
-        """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = calls.plan_pauses(call, self._retries)
+        """Send one call and raise its errors. The caller reads and closes a stream."""
+        pauses = calls.plan_pauses(call, self._retries)
         while True:
-            answer = self._send_once(call, stream)
-            pause = calls.choose_pause(answer, left)
+            response = self._send_once(call, stream)
+            pause = calls.choose_pause(response, pauses)
             if pause is None:
-                return calls.raise_for_problem(answer)
+                return calls.raise_for_problem(response)
             time.sleep(pause)
 
     def _send_once(self, call: RestCall, stream: bool) -> httpx.Response:
@@ -85,12 +85,12 @@ class Client:
         with file as content:
             request = self._http.build_request(**call.request(content, stream=stream))
             try:
-                answer = self._http.send(request, stream=stream)
-                if not answer.is_success:
-                    answer.read()
+                response = self._http.send(request, stream=stream)
+                if not response.is_success:
+                    response.read()
             except httpx.TransportError as error:
                 raise ServerUnreachable(self.url, error) from error
-        return answer
+        return response
 
     def _fetch_document(self, call: RestCall) -> Document:
         document: Document = self.send(call).json()
@@ -111,7 +111,7 @@ class Client:
         segments: str | None = None,
         sample_time: float | None = None,
     ) -> Document:
-        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        """Store a recording (CSV or MCAP) from a file or from bytes."""
         return self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
@@ -124,40 +124,40 @@ class Client:
         return self._fetch_document(calls.DERIVE(dataset, json=body))
 
     def datasets(self) -> list[Document]:
-        """All datasets, newest first."""
+        """List all datasets, newest first."""
         return self._fetch_list(calls.DATASETS())
 
     def dataset(self, name: str) -> Document:
-        """One dataset by id."""
+        """Fetch one dataset by its id."""
         return self._fetch_document(calls.DATASET(name))
 
     def signals(self, dataset: str, max_points: int = 1000) -> Document:
-        """Signals of a dataset, reduced to at most so many points a channel."""
+        """Fetch the signals of a dataset, reduced to at most `max_points` points per channel."""
         return self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
 
     def lineage(self, dataset: str) -> Document:
-        """What a dataset was made from, and what was made from it."""
+        """Fetch the lineage of a dataset: its sources, and everything made from it."""
         return self._fetch_document(calls.LINEAGE(dataset))
 
     def content(self, dataset: str) -> bytes:
-        """A dataset as an MCAP file."""
+        """Download a dataset as an MCAP file."""
         return self.send(calls.CONTENT(dataset)).content
 
     # ---- models
     def models(self) -> list[Document]:
-        """Catalogue and own models."""
+        """List the built-in models and those of users."""
         return self._fetch_list(calls.MODELS())
 
     def model(self, name: str) -> Document:
-        """One model with its document."""
+        """Fetch one model with its document."""
         return self._fetch_document(calls.MODEL(name))
 
     def add_model(self, document: Mapping[str, Any]) -> Document:
-        """Store an own model; a changed document becomes its next version."""
+        """Store a user model; a changed document becomes its next version."""
         return self._fetch_document(calls.ADD_MODEL(json=document))
 
     def check_model(self, document: Mapping[str, Any]) -> Document:
-        """Whether a model document can be used, with every error and its column."""
+        """Check a model document; every error has its column."""
         return self._fetch_document(calls.CHECK_MODEL(json=document))
 
     # ---- jobs
@@ -180,15 +180,15 @@ class Client:
         return self._fetch_document(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
 
     def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
-        """Jobs, newest first: all, or at most `limit`, or those in some states."""
+        """List jobs, newest first: all, at most `limit`, or those in some states."""
         return self._fetch_list(calls.JOBS(state=state), limit)
 
     def job(self, name: str) -> Document:
-        """One job with its state and progress."""
+        """Fetch one job with its state and progress."""
         return self._fetch_document(calls.JOB(name))
 
     def cancel(self, job: str) -> Document:
-        """Cancel a job; what it has found so far stays."""
+        """Cancel a job; its results so far stay."""
         return self._fetch_document(calls.CANCEL(job))
 
     def resume(self, job: str) -> Document:
@@ -200,7 +200,7 @@ class Client:
         return self._fetch_document(calls.CLONE(job))
 
     def report(self, job: str) -> str:
-        """The report of a job, as HTML."""
+        """Fetch the report of a job, as HTML."""
         return self.send(calls.REPORT(job)).text
 
     def wait(
@@ -210,7 +210,7 @@ class Client:
         *,
         poll: float = calls.POLL_SECONDS,
     ) -> Document:
-        """Wait until a job has ended; `progress` hears its state at every look."""
+        """Wait until a job has ended; `progress` is called with its state at every poll."""
         while True:
             state = self.job(job)
             if progress is not None:
@@ -220,7 +220,7 @@ class Client:
             time.sleep(poll)
 
     def events(self, job: str, after: str | None = None) -> Iterator[Document]:
-        """Events of a job as they come, until its end; `after` is the id of the last one known."""
+        """Yield the events of a job until its end; `after` is the id of the last event received."""
         parser = calls.EventParser()
         with closing(self.send(calls.build_event_stream(job, after), stream=True)) as stream:
             for line in stream.iter_lines():
@@ -228,27 +228,27 @@ class Client:
 
     # ---- runs
     def runs(self, job: str, *, at_most: int | None = None, **filters: Any) -> list[Document]:
-        """All runs of a job, or the first `at_most` that the filters leave."""
+        """List all runs of a job, or the first `at_most` that pass the filters."""
         return self._fetch_list(calls.RUNS(job, **filters), at_most)
 
     def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
-        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        """Fetch quantiles over the values of axes or labels, by default over all axes but seeds."""
         return self._fetch_document(calls.SUMMARY(job, by=by))
 
     def trend(self, job: str) -> Document:
-        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift."""
         return self._fetch_document(calls.TREND(job))
 
     def run(self, name: str) -> Document:
-        """One run's result."""
+        """Fetch the result of one run."""
         return self._fetch_document(calls.RUN(name))
 
     def history(self, run: str) -> Document:
-        """Improvements of each island's champion."""
+        """Fetch the improvements of each island's champion."""
         return self._fetch_document(calls.HISTORY_KEY(run))
 
     def response(self, run: str, max_points: int = 1000) -> Document:
-        """Measured and simulated outputs."""
+        """Fetch the measured and simulated outputs."""
         return self._fetch_document(calls.RESPONSE(run, max_points=max_points))
 
     def simulate_run(self, run: str, body: Mapping[str, Any], max_points: int = 1000) -> Document:
@@ -264,43 +264,43 @@ class Client:
         skip: int = 0,
         max_points: int = 1000,
     ) -> Document:
-        """Run the identified model freely over another recording: RMS and fit there."""
+        """Simulate the identified model on another recording: RMS and fit."""
         body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
         return self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
 
     def migrations(self, run: str) -> Document:
-        """The migration log."""
+        """Fetch the migration log."""
         return self._fetch_document(calls.MIGRATIONS(run))
 
     def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
-        """Profile likelihood of some free parameters, of all if none is named."""
+        """Compute the profile likelihood of some free parameters; of all if none is named."""
         body = {"parameters": parameters or None, "points": points}
         return self._fetch_document(calls.PROFILE(run, json=body))
 
     def residuals(self, run: str) -> Document:
-        """Correlation functions of the residuals with their bands and tests."""
+        """Fetch the correlation functions of the residuals, their bands and tests."""
         return self._fetch_document(calls.RESIDUALS(run))
 
     def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
-        """The identified model as text: json, python, c or control."""
+        """Export the identified model as text: json, python, c or control."""
         return self.send(calls.EXPORT(run, format=format, pade_order=pade_order)).text
 
     def compare(self, *runs: str) -> Document:
-        """Runs on the same data side by side, the best first."""
+        """Compare runs on the same data, best first."""
         return self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
     def references(self) -> list[Document]:
-        """The references in use, by name."""
+        """List the references in use, by name."""
         return self._fetch_list(calls.REFERENCES())
 
     def reference(self, name: str) -> Document:
-        """One reference with its history."""
+        """Fetch one reference with its history."""
         return self._fetch_document(calls.REFERENCE(name))
 
     def accept_reference(
         self, name: str, run: str, *, by: str | None = None, note: str | None = None
     ) -> Document:
-        """Make a run the reference of a name; the one before stays in the history."""
+        """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
         return self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))

@@ -1,4 +1,4 @@
-"""A service of one's own for the length of a `with` block, for the demo, benchmarks and tests."""
+"""Run a private service for the length of a `with` block: for the demo, benchmarks and tests."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ import httpx
 from service.core.errors import ServiceDidNotStart
 
 START_LIMIT_SECONDS = 240.0
-"""A first start compiles the loops, which takes minutes beside other work."""
+"""A first start compiles the loops, which takes minutes on a busy machine."""
 STOP_LIMIT_SECONDS = 20.0
 
 
@@ -23,16 +23,16 @@ STOP_LIMIT_SECONDS = 20.0
 def run_embedded_service(
     data_dir: Path, *, port: int | None = None, cpus: int | None = None
 ) -> Iterator[str]:
-    """Start `lagid serve` as a child, wait until it is ready, and stop it at the end.
+    """Start `lagid serve` as a child process, wait until it is ready, and stop it at the end.
 
     Parameters
     ----------
     data_dir : Path
-        Database, objects and logs; made if absent.
+        Folder of database, objects and logs; created if it does not exist.
     port : int, optional
-        Port on loopback; a free one if not given.
+        Port on loopback; a free one by default.
     cpus : int, optional
-        Cores for the workers; all if not given.
+        Cores for the workers; all by default.
 
     Yields
     ------
@@ -42,13 +42,13 @@ def run_embedded_service(
     Raises
     ------
     ServiceDidNotStart
-        If it ended or was not ready in time; the message holds the end of its log.
+        If it ended or was not ready in time; the message quotes the end of its log.
     """
     data_dir.mkdir(parents=True, exist_ok=True)
-    chosen = port or find_free_port()
-    url = f"http://127.0.0.1:{chosen}"
+    chosen_port = port or find_free_port()
+    url = f"http://127.0.0.1:{chosen_port}"
     command = [sys.executable, "-m", "service.cli.main", "serve", "--data-dir", str(data_dir)]
-    command += ["--host", "127.0.0.1", "--port", str(chosen)]
+    command += ["--host", "127.0.0.1", "--port", str(chosen_port)]
     command += ["--cpus", str(cpus)] if cpus else []
     log = data_dir / "serve.log"
     with log.open("ab") as sink:
@@ -61,7 +61,7 @@ def run_embedded_service(
 
 
 def find_free_port() -> int:
-    """Return a port of loopback that nobody listens on at this moment."""
+    """Return a port of loopback that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

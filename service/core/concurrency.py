@@ -1,7 +1,7 @@
-"""Turns at what is heavy in the web process: so many requests at once, some more wait, no others.
+"""Concurrency limits for heavy requests: some run, some wait, all others get 503.
 
-A simulation of a million samples takes a second of a core and hundreds of megabytes; every request
-that waits for its turn holds one of the threads that all others need.
+A simulation of a million samples takes a second of a core and hundreds of megabytes. Every request
+that waits holds one of the threads that all others need.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ MAX_WAIT_SECONDS = 20.0
 
 
 class ConcurrencyLimit:
-    """At most `at_once` go on, `waiting` others wait, `seconds` at most."""
+    """Limit of `at_once` running and `waiting` queued calls; a call waits for `seconds` at most."""
 
     def __init__(
         self,
@@ -24,30 +24,32 @@ class ConcurrencyLimit:
         waiting: int = MAX_WAITING,
         seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
-        self._going, self._seconds = BoundedSemaphore(at_once), seconds
-        self._here = BoundedSemaphore(at_once + waiting)
+        self._running, self._seconds = BoundedSemaphore(at_once), seconds
+        self._admitted = BoundedSemaphore(at_once + waiting)
 
     @contextmanager
     def acquire(self) -> Iterator[None]:
-        """A turn, for the length of a block or of a function.
+        """Hold a slot for the length of a block or of a function.
 
         Raises
         ------
-        Busy
-            If too many wait already, or it did not come in time.
+        ServiceBusy
+            If too many calls wait already, or no slot became free in time.
         """
-        if not self._here.acquire(blocking=False):
-            raise ServiceBusy("too many simulations are waiting; ask again in a while")
+        if not self._admitted.acquire(blocking=False):
+            raise ServiceBusy("too many simulations are waiting; ask again in a few seconds")
         try:
-            if not self._going.acquire(timeout=self._seconds):
-                raise ServiceBusy(f"other simulations took {self._seconds:g} s and more; ask again")
+            if not self._running.acquire(timeout=self._seconds):
+                raise ServiceBusy(
+                    f"no simulation slot became free within {self._seconds:g} s; ask again"
+                )
             try:
                 yield
             finally:
-                self._going.release()
+                self._running.release()
         finally:
-            self._here.release()
+            self._admitted.release()
 
 
 simulation_limit = ConcurrencyLimit()
-"""Those of this process."""
+"""Limit of this process for simulations."""

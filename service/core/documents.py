@@ -1,4 +1,4 @@
-"""Reading JSON and YAML that users write: data only, with the place of what cannot be read."""
+"""Read JSON and YAML documents of users: data only, with the position of every fault."""
 
 import json
 from math import isfinite
@@ -13,7 +13,7 @@ MAX_DOCUMENT_BYTES = 4 * 1024**2
 
 
 def parse_yaml(text: bytes) -> Any:
-    """What a YAML text says; JSON is YAML too.
+    """Parse a YAML document; JSON is YAML too.
 
     Raises
     ------
@@ -27,14 +27,16 @@ def parse_yaml(text: bytes) -> Any:
         return _check_storable(documents.parse_yaml(text.decode("utf-8-sig")))
     except UnicodeDecodeError as error:
         raise InvalidRequest.from_fault(
-            "", f"not UTF-8 text: byte {error.start} does not fit"
+            "", f"the document is not UTF-8 text: byte {error.start} is invalid"
         ) from None
     except InvalidModel as error:
-        raise InvalidRequest(FieldError(one.pointer, one.detail) for one in error.faults) from None
+        raise InvalidRequest(
+            FieldError(fault.pointer, fault.detail) for fault in error.faults
+        ) from None
 
 
 def parse_json(text: bytes) -> Any:
-    """What a JSON text says.
+    """Parse a JSON document.
 
     Raises
     ------
@@ -45,24 +47,26 @@ def parse_json(text: bytes) -> Any:
     """
     _check_size(text)
     try:
-        found = json.loads(text, parse_constant=_refuse_constant)
+        document = json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InvalidRequest.from_fault("", f"the body is not JSON: {place}: {error.msg}") from None
+        position = f"line {error.lineno}, column {error.colno}"
+        raise InvalidRequest.from_fault(
+            "", f"the body is not JSON: {position}: {error.msg}"
+        ) from None
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InvalidRequest.from_fault("", f"the body is not JSON: {error}") from None
-    return _check_storable(found)
+    return _check_storable(document)
 
 
 def to_finite(value: float | None) -> float | None:
-    """Give the number, or None where it is not finite: JSON has no such numbers."""
+    """Return the number, or None if it is not finite: JSON has no such numbers."""
     return None if value is None or not isfinite(value) else float(value)
 
 
 def _check_storable(document: Any) -> Any:
-    """The document, whose texts a database can keep: escapes can stand for what is no text."""
-    written = json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
-    fault = find_json_fault(written)
+    """Check that a database can store every text; an escape may stand for an invalid character."""
+    text = json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
+    fault = find_json_fault(text)
     if fault is not None:
         raise InvalidRequest.from_fault("", fault)
     return document
@@ -70,7 +74,9 @@ def _check_storable(document: Any) -> Any:
 
 def _check_size(text: bytes) -> None:
     if len(text) > MAX_DOCUMENT_BYTES:
-        raise TooLarge(f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES}")
+        raise TooLarge(
+            f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES} are allowed"
+        )
 
 
 def _refuse_constant(name: str) -> None:

@@ -1,21 +1,21 @@
 """Every error the service raises on purpose, each with its HTTP status.
 
 * ServiceError
-    - NotFound               404  no such dataset, model, job or run
-    - Conflict               409  the state of the thing does not allow it
+    - NotFound               404  the dataset, model, job or run does not exist
+    - Conflict               409  the state of the resource does not allow the request
     - StaleVersion           412  a precondition (If-Match) does not hold
-    - TooLarge               413  more than a stated limit
-    - UnsupportedMediaType   415  a body of a kind that is not read
+    - TooLarge               413  the body exceeds a limit
+    - UnsupportedMediaType   415  the media type of the body is not supported
     - UnsatisfiableRange     416  a byte range outside the content
-    - InvalidRequest         422  the body or a query value cannot be used, with every fault
-    - TooMuchUnfinished      429  the project has as much queued and running as it may
-    - Unavailable            503  a part the service needs is down
-        - Busy                    too many requests of a heavy kind
-    - Misconfigured               the settings cannot be used (command line only)
-    - ServiceDidNotStart          `lagid serve` ended or did not get ready (command line only)
+    - InvalidRequest         422  the body or a query value is invalid; lists every fault
+    - QuotaExceeded          429  the project has reached its limit of unfinished work
+    - Unavailable            503  a component of the service is down
+        - ServiceBusy             too many heavy requests
+    - Misconfigured               the settings are invalid (command line only)
+    - ServiceDidNotStart          `lagid serve` ended or was not ready in time (command line only)
 
-One handler (`service.api.problems`) makes the RFC 9457 problem document. This module imports
-nothing but the standard library, so that the light client can use it.
+One handler (`service.api.problems`) builds the RFC 9457 problem document. This module imports no
+heavy library, so that the light client can use it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,15 +27,15 @@ from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, Sysi
 
 @dataclass(frozen=True, slots=True)
 class FieldError:
-    """One thing wrong with a request.
+    """One fault of a request.
 
     Attributes
     ----------
     pointer : str
-        JSON pointer into the body, such as ``/algorithm/population``; ``?name`` for a query value,
-        ``{name}`` for a part of the path.
+        JSON pointer into the body, such as ``/algorithm/population``. ``?name`` is a query value,
+        ``{name}`` a part of the path.
     detail : str
-        What was wrong, what was found, what would be right.
+        What was wrong, which value was received, what would be right.
     column : int or None
         Column (from 1) inside the text of the field, for equations.
     """
@@ -48,7 +48,7 @@ class FieldError:
         return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry of a problem document's ``errors``."""
+        """Return the fault as an entry of a problem document's ``errors``."""
         entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
         return entry if self.column is None else {**entry, "column": self.column}
 
@@ -67,12 +67,12 @@ class ServiceError(Exception):
 
     @property
     def headers(self) -> Mapping[str, str]:
-        """Headers that the answer carries besides the document."""
+        """Headers that the response carries in addition to the document."""
         return {}
 
 
 class NotFound(ServiceError):
-    """There is no such dataset, model, job or run."""
+    """The dataset, model, job or run does not exist."""
 
     status, kind, title = 404, "not-found", "There is no such thing"
 
@@ -82,31 +82,31 @@ class NotFound(ServiceError):
 
 
 class DatasetNotFound(ServiceError):
-    """No dataset has that identifier or name, or several have the name; the text says which."""
+    """No dataset has that identifier or name, or several share the name; the text says which."""
 
     status, kind, title = 404, "not-found", "There is no such thing"
 
 
 class Conflict(ServiceError):
-    """The state of the thing does not allow it."""
+    """The state of the resource does not allow the request."""
 
     status, kind, title = 409, "conflict", "The state does not allow it"
 
 
 class StaleVersion(ServiceError):
-    """A precondition does not hold: the thing has changed since it was read."""
+    """A precondition does not hold: the resource has changed since it was read."""
 
     status, kind, title = 412, "stale", "The thing has changed since it was read"
 
 
 class TooLarge(ServiceError):
-    """More than a stated limit."""
+    """The body exceeds a limit."""
 
     status, kind, title = 413, "too-large", "The body is too large"
 
 
 class UnsupportedMediaType(ServiceError):
-    """A body of a kind that is not read."""
+    """The media type of the body is not supported."""
 
     status, kind, title = 415, "unsupported-media-type", "The body is of a kind that is not read"
 
@@ -116,67 +116,67 @@ class UnsatisfiableRange(ServiceError):
 
     status, kind, title = 416, "range", "The byte range lies outside the content"
 
-    def __init__(self, asked: str, size: int) -> None:
-        super().__init__(f"the range {asked!r} lies outside the {size} bytes")
+    def __init__(self, requested: str, size: int) -> None:
+        super().__init__(f"the range {requested!r} lies outside the {size} bytes")
         self.size = size
 
     @property
     def headers(self) -> Mapping[str, str]:
-        """The length, as RFC 9110 asks for."""
+        """The length of the content, as RFC 9110 requires."""
         return {"Content-Range": f"bytes */{self.size}"}
 
 
 class InvalidRequest(ServiceError):
-    """The body or a query value cannot be used."""
+    """The body or a query value is invalid."""
 
     status, kind, title = 422, "invalid", "The request cannot be used"
 
     def __init__(self, errors: Iterable[FieldError]) -> None:
-        found = tuple(errors)
-        super().__init__("; ".join(map(str, found)), found)
+        faults = tuple(errors)
+        super().__init__("; ".join(map(str, faults)), faults)
 
     @classmethod
     def from_fault(cls, pointer: str, detail: str) -> "InvalidRequest":
-        """A request with one fault."""
+        """Return the error of a request with one fault."""
         return cls((FieldError(pointer, detail),))
 
 
 class QuotaExceeded(ServiceError):
-    """The project has as much queued and running as it may."""
+    """The project has reached its limit of queued and running work."""
 
     status, kind, title = 429, "too-much-unfinished", "The project has too much unfinished work"
 
     @property
     def headers(self) -> Mapping[str, str]:
-        """When to try again, in seconds: work ends all the time."""
+        """When to try again, in seconds."""
         return {"Retry-After": "10"}
 
 
 class Unavailable(ServiceError):
-    """A part that the service needs is down."""
+    """A component that the service needs is down."""
 
     status, kind, title = 503, "unavailable", "A part of the service is down"
 
 
 class ServiceBusy(Unavailable):
-    """Too many requests of a heavy kind at once."""
+    """Too many heavy requests run at once."""
 
     title = "The service has too much to do"
 
     @property
     def headers(self) -> Mapping[str, str]:
-        """When to ask again."""
+        """When to ask again, in seconds."""
         return {"Retry-After": "2"}
 
 
 class Misconfigured(ServiceError):
-    """The settings cannot be used."""
+    """The settings are invalid."""
 
     kind, title = "misconfigured", "The settings cannot be used"
 
 
 class ServiceDidNotStart(ServiceError):
-    """A service that was started as a child ended, or did not get ready in time."""
+    """A service that was started as a child ended, or was not ready in time."""
 
     kind, title = "did-not-start", "The service did not start"
 
@@ -186,7 +186,7 @@ class ServiceDidNotStart(ServiceError):
 
 
 def to_field_errors(error: SysidError) -> list[FieldError]:
-    """What an error of the numerical core says of a job or model document, with its places."""
+    """Convert an error of the numerical core into faults of a job or model document."""
     match error:
         case InvalidModel():
             return [FieldError(f.pointer, f.detail, f.column) for f in error.faults]

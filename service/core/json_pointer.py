@@ -8,29 +8,29 @@ from sysid.core.errors import split_pointer
 
 
 def build_run_body(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Body of one run: the job's normal form with the cell's values put in.
+    """Build the body of one run: the job's normal form with the values of its cell.
 
-    What no value changes is the document's own: neither is to be changed.
+    Parts that no value changes are shared with `document`. Neither must be modified.
     """
     body = {name: value for name, value in document.items() if name != "sweep"}
     for path, value in values.items():
         *parents, last = split_pointer(path)
-        here: Any = body
+        node: Any = body
         for part in parents:
-            place: Any = int(part) if isinstance(here, list) else part
-            child = here[place] if isinstance(here, list) else here.get(place)
-            here[place] = {} if child is None else copy(child)
-            here = here[place]
-        if isinstance(here, list):
-            here[int(last)] = value
+            key: Any = int(part) if isinstance(node, list) else part
+            child = node[key] if isinstance(node, list) else node.get(key)
+            node[key] = {} if child is None else copy(child)
+            node = node[key]
+        if isinstance(node, list):
+            node[int(last)] = value
         else:
-            here[last] = [value] if path == "/datasets" and isinstance(value, str) else value
+            node[last] = [value] if path == "/datasets" and isinstance(value, str) else value
     return body
 
 
 def get_value(document: Mapping[str, Any], path: str) -> Any:
-    """The value of a field that is there."""
-    here: Any = document
+    """Return the value of an existing field."""
+    node: Any = document
     for part in split_pointer(path):
-        here = here[int(part)] if isinstance(here, list) else here[part]
-    return here
+        node = node[int(part)] if isinstance(node, list) else node[part]
+    return node

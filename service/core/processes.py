@@ -1,4 +1,4 @@
-"""Which process this is, and whether another one on this machine still lives."""
+"""Identify this process, and check whether another process of this machine still runs."""
 
 import os
 import socket
@@ -12,13 +12,13 @@ from sysid.core.machine import read_machine_id
 _ENDED = frozenset({psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD})
 _STOPPED = frozenset({psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP})
 _START_TOLERANCE = 200
-"""Two readings of one start differ by less, though the boot's time is corrected between them."""
+"""Tolerance of two readings of one start, in 1/100 s: the boot time may be corrected meanwhile."""
 
 
 def read_start(pid: int) -> int | None:
-    """Hundredths of a second from the boot to the start of a process; None if there is none.
+    """Read the start of a process in 1/100 s after the boot; None if there is no such process.
 
-    Unlike the time of day, it stays when the clock is set.
+    Unlike the time of day, it does not change when the clock is set.
     """
     try:
         start: float = psutil.Process(pid).create_time() - psutil.boot_time()
@@ -28,16 +28,16 @@ def read_start(pid: int) -> int | None:
 
 
 def describe_process() -> dict[str, Any]:
-    """What another process needs to know, to see later whether this one has ended."""
+    """Describe this process, so that another process can check later whether it has ended."""
     pid, machine = os.getpid(), read_machine_id()
     host, started = socket.gethostname(), read_start(pid)
     return {"host": host, "pid": pid, "machine": machine, "started": started}
 
 
 def has_process_ended(pid: int, started: int | None) -> bool:
-    """Whether the process of this machine that had the number `pid` has ended.
+    """Return whether the process of this machine that had the number `pid` has ended.
 
-    Another one may have its number by now: `started` tells them apart, unless it is None.
+    Another process may have its number by now. `started` distinguishes them, unless it is None.
     """
     status, start = _read_status(pid), read_start(pid)
     if status is None:
@@ -47,31 +47,31 @@ def has_process_ended(pid: int, started: int | None) -> bool:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process is there, but stopped (SIGSTOP)."""
+    """Return whether a process exists but is stopped (SIGSTOP)."""
     return _read_status(pid) in _STOPPED
 
 
 def is_gone(details: Mapping[str, Any]) -> bool:
-    """Whether a described process has ended; False wherever this process cannot see it."""
+    """Return whether a described process has ended; False if this process cannot see it."""
     return _is_visible(details) and has_process_ended(details["pid"], details["started"])
 
 
 def is_awake(details: Mapping[str, Any]) -> bool:
-    """Whether a described process is seen to live and not to be stopped (SIGSTOP)."""
+    """Return whether a described process is visible, runs and is not stopped (SIGSTOP)."""
     if not _is_visible(details) or is_gone(details):
         return False
     return _read_status(details["pid"]) not in {None, *_STOPPED}
 
 
 def _is_visible(details: Mapping[str, Any]) -> bool:
-    """Whether a description is complete, and of a process that this one could see."""
-    here = read_machine_id()
+    """Return whether a description is complete and its process is visible from here."""
+    machine = read_machine_id()
     is_complete = isinstance(details.get("pid"), int) and isinstance(details.get("started"), int)
-    return here is not None and details.get("machine") == here and is_complete
+    return machine is not None and details.get("machine") == machine and is_complete
 
 
 def _read_status(pid: int) -> str | None:
-    """The process's status; None if there is none, or this user may not see it."""
+    """Read the status of a process; None if it does not exist, or this user may not see it."""
     status: str | None
     try:
         status = psutil.Process(pid).status()
@@ -83,7 +83,7 @@ def _read_status(pid: int) -> str | None:
 
 
 def _is_hidden(pid: int) -> bool:
-    """Whether the number is in use, though ``/proc`` hides the process from this user."""
+    """Return whether the number is in use, though ``/proc`` hides the process from this user."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -10,36 +10,36 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from service.core.errors import Misconfigured
 
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-"""Of the lines that processes write about themselves."""
+"""Format of the log lines of all processes."""
 
 
 class Settings(BaseSettings):
-    """Where things are kept, where the service listens, and its limits.
+    """Storage, address and limits of the service.
 
     Attributes
     ----------
     data_dir : Path
-        Folder of everything that the embedded service keeps.
+        Folder of everything that the embedded service stores.
     database_url, store_url : str or None
         None: SQLite and a folder of objects inside `data_dir`.
     ray_address : str or None
-        None: a local Ray of this process.
+        None: a local Ray cluster, started by this process.
     cpus : int or None
         Workers of the local Ray; None: all cores.
     worker_memory_mb : int or None
-        Memory that a worker may use for its runs, in MiB; None: its share of 80 % of the machine.
+        Memory of a worker for its runs, in MiB; None: its share of 80 % of the machine.
     require_keys : bool or None
         None: API keys are off on loopback and required elsewhere.
     allow_open_host : bool
         Serve other hosts although this version has no API keys yet.
     max_upload_bytes, max_body_bytes : int
-        The longest recording, and the longest body of any other request; 413 beyond them.
+        Longest recording, and longest body of any other request. Larger ones are answered by 413.
     max_open_jobs, max_open_runs : int
-        What one project may have unfinished; a submission beyond it is refused with 429.
+        Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
     project_cores : int or None
-        Cores that the runs of one project may take of each dispatcher; None: all.
+        Cores of each dispatcher that the runs of one project may use; None: all.
     lease_seconds : float
-        How long a job stays with a dispatcher that is not heard of.
+        How long a job stays with a dispatcher that sends no heartbeat.
     data : Path or None
         Folder of measured records, for tests and benchmarks.
     """
@@ -75,7 +75,7 @@ class Settings(BaseSettings):
 
     @property
     def worker_memory_bytes(self) -> int | None:
-        """The same in bytes."""
+        """Memory of a worker in bytes."""
         return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
 
     @property
@@ -84,18 +84,18 @@ class Settings(BaseSettings):
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
 
     def prepare_data_folder(self) -> None:
-        """Make the data folder if it is not there.
+        """Create the data folder if it does not exist.
 
         Raises
         ------
         Misconfigured
-            If it cannot be made or written to.
+            If it cannot be created or written to.
         """
         folder = self.data_dir.absolute()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with TemporaryFile(dir=folder):
-                pass  # only a try shows it: permissions, a full disk, a read-only file system
+                pass  # only an attempt shows it: permissions, a full disk, a read-only file system
         except OSError as error:
             raise Misconfigured(
                 f"the data folder {folder} is not writable ({error.strerror}); "
@@ -103,25 +103,25 @@ class Settings(BaseSettings):
             ) from error
 
     def check_exposure(self) -> None:
-        """Refuse to serve other hosts without keys.
+        """Refuse to serve other hosts without API keys.
 
         Raises
         ------
         Misconfigured
-            If the host is not loopback, or keys are required: this version knows no keys.
+            If the host is not loopback, or keys are required: this version has no API keys.
         """
         if self.require_keys:
             raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
         if not is_loopback(self.host) and not self.allow_open_host:
             raise Misconfigured(
                 f"host {self.host} can be reached from other machines, and this version has no "
-                "API keys yet; serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if something "
-                "in front of it asks who is there"
+                "API keys yet. Serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if an "
+                "authenticating reverse proxy is in front of it."
             )
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address reaches this machine only."""
+    """Return whether a host name or address can be reached from this machine only."""
     if host == "localhost":
         return True
     try:

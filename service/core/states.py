@@ -1,4 +1,4 @@
-"""The states of jobs and runs, for tables, answers, commands and the client alike."""
+"""The states of jobs and runs: for tables, responses, commands and the client."""
 
 from enum import StrEnum
 from typing import Literal
@@ -7,7 +7,7 @@ StateName = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
 class JobState(StrEnum):
-    """How far a job or a run has come."""
+    """State of a job or of a run."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -17,7 +17,7 @@ class JobState(StrEnum):
 
     @property
     def is_terminal(self) -> bool:
-        """Whether no dispatcher will ever change it again."""
+        """Whether no dispatcher will ever change the state again."""
         return self not in OPEN_STATES
 
 

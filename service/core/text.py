@@ -1,6 +1,6 @@
-"""How numbers, units, times and labels are written: on pages, in reports and in terminals.
+"""Format numbers, units, times and labels for pages, reports and terminals.
 
-Nothing is imported here but the standard library, so that every command may use it.
+This module imports the standard library only, so that every command may use it.
 """
 
 import json
@@ -15,7 +15,10 @@ _MAX_JSON = 60
 
 
 def format_number(value: float | None, digits: int = 4) -> str:
-    """A number with that many significant digits; powers of ten where it is very large or small."""
+    """Format a number with `digits` significant digits.
+
+    Powers of ten are used where it is very large or small.
+    """
     if value is None or not math.isfinite(value):
         return DASH
     if value != 0 and not 1e-4 <= abs(value) < 1e7:
@@ -27,7 +30,7 @@ def format_number(value: float | None, digits: int = 4) -> str:
 
 
 def format_estimate(value: float, stderr: float | None) -> tuple[str, str]:
-    """An estimate and its standard error, both to the error's second significant digit."""
+    """Format an estimate and its standard error, both to the error's second significant digit."""
     if not _is_positive(stderr):
         return format_number(value, 6), ""
     decimals = _estimate_decimals(value, stderr)
@@ -38,12 +41,12 @@ def format_estimate(value: float, stderr: float | None) -> tuple[str, str]:
 
 
 def join_estimate(value: float, stderr: float | None) -> str:
-    """The same as one text, ``0.1193 ± 0.0004``."""
+    """Format an estimate and its standard error as one text, ``0.1193 ± 0.0004``."""
     return " ± ".join(filter(None, format_estimate(value, stderr)))
 
 
 def plain_estimate(value: float, stderr: float | None) -> str:
-    """The same for terminals and notes, with characters that programs read as numbers."""
+    """Format an estimate and its error for terminals and notes, readable by programs."""
     if not _is_positive(stderr):
         return f"{value:.6g}"
     decimals = _estimate_decimals(value, stderr)
@@ -53,7 +56,7 @@ def plain_estimate(value: float, stderr: float | None) -> str:
 
 
 def format_interval(ends: Sequence[float] | None, stderr: float | None) -> str:
-    """A 95 % interval, to the digits of the standard error."""
+    """Format a 95 % interval, to the digits of the standard error."""
     if ends is None:
         return ""
     low, high = (format_estimate(end, stderr)[0] for end in ends)
@@ -61,39 +64,39 @@ def format_interval(ends: Sequence[float] | None, stderr: float | None) -> str:
 
 
 def format_p_value(p: float | None) -> str:
-    """The p value of a test."""
+    """Format the p value of a test."""
     if p is None:
         return DASH
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def format_unit(symbol: str) -> str:
-    """A unit as it follows its number; nothing for a number without dimension."""
+    """Format a unit as it follows its number; empty for a dimensionless number."""
     return "" if symbol in ("1", "") else f"{_THIN_SPACE}{symbol}"
 
 
 def plain_unit(symbol: str | None) -> str:
-    """The same with a plain space, for terminals and notes."""
+    """Format a unit after a plain space, for terminals and notes."""
     return "" if symbol in (None, "", "1") else f" {symbol}"
 
 
 def bracket_unit(symbol: str | None) -> str:
-    """A unit as it follows a name; nothing for a number without dimension."""
+    """Format a unit as it follows a name; empty for a dimensionless number."""
     return "" if symbol in (None, "", "1") else f" [{symbol}]"
 
 
 def append_unit(name: str, symbol: str | None) -> str:
-    """A heading with its unit, ``T [s]``; σ as a unit is that of several outputs together."""
+    """Format a heading with its unit, ``T [s]``; the unit σ stands for several outputs together."""
     return f"{name}{bracket_unit(symbol)}"
 
 
 def format_count(value: float | None) -> str:
-    """A whole number in groups of three digits."""
+    """Format a whole number in groups of three digits."""
     return DASH if value is None else f"{value:,.0f}".replace(",", _THIN_SPACE)
 
 
 def format_duration(seconds: float | None) -> str:
-    """A length of time in the unit that suits it."""
+    """Format a duration in a suitable unit."""
     if seconds is None or not math.isfinite(seconds):
         return DASH
     if seconds < 1:
@@ -108,7 +111,7 @@ def format_duration(seconds: float | None) -> str:
 
 
 def format_age(moment: datetime, now: datetime) -> str:
-    """How long ago a moment was, in its largest unit."""
+    """Format the age of a moment in its largest unit."""
     seconds = max((now - moment).total_seconds(), 0.0)
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if seconds >= size:
@@ -117,7 +120,7 @@ def format_age(moment: datetime, now: datetime) -> str:
 
 
 def format_value(value: object) -> str:
-    """The value of an axis or of a label; a model is called by its name."""
+    """Format the value of an axis or of a label; a model is represented by its name."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
@@ -130,7 +133,7 @@ def format_value(value: object) -> str:
 
 
 def format_labels(labels: Mapping[str, object]) -> str:
-    """Labels with their values, ``length_m = 5, bore = 4 mm``."""
+    """Format labels with their values, ``length_m = 5, bore = 4 mm``."""
     return ", ".join(f"{name} = {format_value(value)}" for name, value in labels.items())
 
 
@@ -148,7 +151,7 @@ def _is_positive(stderr: float | None) -> TypeGuard[float]:
 
 
 def _estimate_decimals(value: float, stderr: float) -> int | None:
-    """Decimals of an estimate by its standard error; None where they would be too many digits."""
+    """Choose the decimals of an estimate by its standard error; None if they are too many."""
     decimals = _count_decimals(stderr, 2)
     return None if decimals > 9 or max(abs(value), stderr) >= 1e9 else decimals
 

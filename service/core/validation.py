@@ -1,10 +1,8 @@
-"""What is wrong with one field, in our words: the one place that translates Pydantic's errors.
+"""Translate the errors of Pydantic into faults with JSON pointers.
 
-Every sentence tells what was found and what would be right. An error that a wire type raises
-itself (`PydanticCustomError`) has its sentence with it; of a kind that is not known here nothing
-is quoted, so that no other wording reaches a user.
-
-What a validation error says to a user: where in the body, what was found, what is known.
+This is the only place that does so. Every message says what was received and what would be right.
+An error that a wire type raises itself (`PydanticCustomError`) brings its own message. An error of
+an unknown kind is not quoted, so that no foreign wording reaches a user.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +18,7 @@ from sysid.core.errors import join_pointer, suggest_name
 MAX_SHOWN_CHARACTERS = 80
 NOT_AN_OBJECT_KINDS = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
 PYDANTIC_KINDS = frozenset(get_args(ErrorType))
-"""Kinds of errors that are Pydantic's own."""
+"""Kinds of errors that Pydantic defines."""
 
 _EXPECTATIONS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "greater_than": lambda c: f"a number above {_format_number(c['gt'])}",
@@ -59,51 +57,55 @@ _EXPECTATIONS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
 
 
 def describe_error(
-    entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequence[str] = ()
+    entry: Mapping[str, Any], fields: Sequence[str], elsewhere: Sequence[str] = ()
 ) -> str:
-    """What was wrong, what was found, what would be right.
+    """Describe one error: what was wrong, what was received, what would be right.
 
     Parameters
     ----------
     entry : mapping
-        As `pydantic.ValidationError.errors` gives them.
-    known : sequence of str
-        Fields that are known at its place; `elsewhere` are pointers to fields of its name.
+        As `pydantic.ValidationError.errors` returns them.
+    fields : sequence of str
+        Names of the fields at this position.
+    elsewhere : sequence of str
+        Pointers to fields of the same name at other positions.
     """
-    kind, found = entry["type"], _format_value(entry.get("input"))
+    kind, received = entry["type"], _format_value(entry.get("input"))
     if kind == "extra_forbidden":
-        return f"unknown field {entry['loc'][-1]!r}{_suggest_field(str(entry['loc'][-1]), known, elsewhere)}"
+        suggestion = _suggest_field(str(entry["loc"][-1]), fields, elsewhere)
+        return f"unknown field {entry['loc'][-1]!r}{suggestion}"
     if kind == "missing":
         return "this field is required"
     if kind in NOT_AN_OBJECT_KINDS:
-        some = f" with fields such as {', '.join(known)}" if known else " (name: value)"
-        return f"found {found}; need an object{some}"
+        example = f" with fields such as {', '.join(fields)}" if fields else " (name: value)"
+        return f"found {received}; need an object{example}"
     if kind == "string_pattern_mismatch" and entry["loc"][-1] == "path":
-        return f"found {found}; need a JSON pointer, such as /noise/sigma"
+        return f"found {received}; need a JSON pointer, such as /noise/sigma"
     if kind == "list_type":
-        one = f", such as [{found}]" if isinstance(entry.get("input"), str) else ""
-        return f"found {found}; need a list{one}"
+        example_list = f", such as [{received}]" if isinstance(entry.get("input"), str) else ""
+        return f"found {received}; need a list{example_list}"
     if kind in _EXPECTATIONS:
-        return f"found {found}{_format_size(kind, entry)}; need {_EXPECTATIONS[kind](entry.get('ctx', {}))}"
-    return _describe_raised_error(entry, found)
+        expected = _EXPECTATIONS[kind](entry.get("ctx", {}))
+        return f"found {received}{_format_size(kind, entry)}; need {expected}"
+    return _describe_raised_error(entry, received)
 
 
-def _describe_raised_error(entry: Mapping[str, Any], found: str) -> str:
-    """The sentence that a validator raised; of the other kinds what was found."""
+def _describe_raised_error(entry: Mapping[str, Any], received: str) -> str:
+    """Describe an error by the message that a validator raised, else by the received value."""
     if entry["type"] in ("value_error", "assertion_error") and "error" in entry.get("ctx", {}):
         return str(entry["ctx"]["error"])
     if entry["type"] in PYDANTIC_KINDS:
-        return f"found {found}; this cannot be used here"
-    return f"{entry['msg']}; found {found}"
+        return f"found {received}; this cannot be used here"
+    return f"{entry['msg']}; found {received}"
 
 
-def _suggest_field(name: str, known: Sequence[str], elsewhere: Sequence[str]) -> str:
-    """Where a field of this very name is, else the nearest of those that are here."""
-    return f"; there is {' and '.join(elsewhere[:2])}" if elsewhere else suggest_name(name, known)
+def _suggest_field(name: str, fields: Sequence[str], elsewhere: Sequence[str]) -> str:
+    """Name the position where a field of this name exists, else the most similar field here."""
+    return f"; there is {' and '.join(elsewhere[:2])}" if elsewhere else suggest_name(name, fields)
 
 
 def _format_value(value: Any) -> str:
-    """A value as it is written in JSON where Python has another word for it."""
+    """Format a value as JSON writes it, where Python writes it differently."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     try:
@@ -114,7 +116,7 @@ def _format_value(value: Any) -> str:
 
 
 def _format_size(kind: str, entry: Mapping[str, Any]) -> str:
-    """How much was found, where it is too much or too little."""
+    """Describe the size that was received, if it is too large."""
     if kind == "too_long" and (length := entry.get("ctx", {}).get("actual_length")):
         return f" ({_format_count(length, 'entry')})"
     if kind == "string_too_long" and isinstance(entry.get("input"), str):
@@ -123,7 +125,7 @@ def _format_size(kind: str, entry: Mapping[str, Any]) -> str:
 
 
 def _format_number(value: Any) -> str:
-    """A bound as it is written by hand: 9223372036854775808 stays, 0.0 is 0."""
+    """Format a bound as it is written by hand: 9223372036854775808 stays, 0.0 becomes 0."""
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -138,36 +140,36 @@ ErrorLocation = Sequence[str | int]
 def explain_errors(
     entries: Iterable[Mapping[str, Any]], body: Any, kind: Any
 ) -> Iterator[FieldError]:
-    """Pydantic's errors of a body as faults with JSON pointers.
+    """Convert Pydantic's errors of a body into faults with JSON pointers.
 
     Parameters
     ----------
     entries : iterable of mapping
-        As `pydantic.ValidationError.errors` gives them.
+        As `pydantic.ValidationError.errors` returns them.
     kind : type
-        The body's wire type, for the names of known fields.
+        Wire type of the body, for the names of its fields.
     """
     seen: set[str] = set()
     for entry in entries:
         pointer = to_pointer(body, entry["loc"], is_missing=entry["type"] == "missing")
-        # A union gives one entry per member; the first is about the member most often meant.
+        # A union has one entry per member; the first concerns the member that is meant most often.
         if pointer not in seen:
             seen.add(pointer)
-            at = entry["loc"] if entry["type"] in NOT_AN_OBJECT_KINDS else entry["loc"][:-1]
+            location = entry["loc"] if entry["type"] in NOT_AN_OBJECT_KINDS else entry["loc"][:-1]
             elsewhere = find_field_pointers(kind, entry["loc"][-1]) if entry["loc"] else []
-            yield FieldError(pointer, describe_error(entry, list_fields(kind, at), elsewhere))
+            yield FieldError(pointer, describe_error(entry, list_fields(kind, location), elsewhere))
 
 
 def to_pointer(body: Any, loc: ErrorLocation, *, is_missing: bool = False) -> str:
-    """JSON pointer of a Pydantic location, without the names that unions put into it.
+    """Return the JSON pointer of a Pydantic location, without the names that unions add to it.
 
-    `is_missing`: the last part is not in the body, and should be.
+    With `is_missing` the last part is not in the body, but should be.
     """
     parts: list[str | int] = []
-    here = body
+    node = body
     for position, part in enumerate(loc):
-        if _contains_part(here, part):
-            here = here[part]
+        if _contains_part(node, part):
+            node = node[part]
             parts.append(part)
         elif is_missing and position == len(loc) - 1:
             parts.append(part)
@@ -175,12 +177,12 @@ def to_pointer(body: Any, loc: ErrorLocation, *, is_missing: bool = False) -> st
 
 
 def find_body_type(endpoint: Callable[..., Any] | None) -> Any:
-    """Wire type of an endpoint's body."""
+    """Return the wire type of the body of an endpoint."""
     return get_annotations(endpoint, eval_str=True).get("body") if endpoint else None
 
 
 def list_fields(kind: Any, loc: ErrorLocation) -> list[str]:
-    """Fields that a wire type knows at a location."""
+    """List the fields of a wire type at a location."""
     types = list(_iterate_models(kind))
     for part in loc:
         fields = [t.model_fields[part] for t in types if part in t.model_fields]
@@ -191,15 +193,15 @@ def list_fields(kind: Any, loc: ErrorLocation) -> list[str]:
 
 
 def find_field_pointers(kind: Any, name: str | int, above: str = "") -> list[str]:
-    """Pointers of the fields of a name that can be reached by names alone, the shortest first."""
-    found = []
+    """List pointers to the fields of a name that need no list index, the shortest first."""
+    pointers = []
     for model in _iterate_models(kind):
-        for own, field in model.model_fields.items():
-            if own == name:
-                found.append(f"{above}/{own}")
+        for field_name, field in model.model_fields.items():
+            if field_name == name:
+                pointers.append(f"{above}/{field_name}")
             if get_origin(field.annotation) not in (dict, list):
-                found += find_field_pointers(field.annotation, name, f"{above}/{own}")
-    return sorted(dict.fromkeys(found), key=lambda place: place.count("/"))
+                pointers += find_field_pointers(field.annotation, name, f"{above}/{field_name}")
+    return sorted(dict.fromkeys(pointers), key=lambda pointer: pointer.count("/"))
 
 
 def _contains_part(value: Any, part: str | int) -> bool:

@@ -1,4 +1,4 @@
-"""What every wire type shares. The client imports no wire type, so that it stays light."""
+"""Base classes and fields of all wire types. The client imports none of them."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any, Generic, Self, TypeVar
@@ -15,20 +15,23 @@ Pointer = Annotated[str, Field(pattern=r"^(/[^/]+)+$", examples=["/noise/sigma"]
 
 
 MAX_DEPTH = 50
-"""Levels of lists and objects within one another in a body; a model document has five."""
+"""Depth of nested lists and objects in a body; a model document has five levels."""
 
 
 def check_depth(value: Any) -> Any:
-    """The value itself; what is nested too deeply cannot be copied or written again."""
+    """Return the value if it is not nested too deeply to be copied or written."""
     level, depth = [value], 0
     while level := [
-        inner for one in level if isinstance(one, dict | list) for inner in _iterate_children(one)
+        inner
+        for item in level
+        if isinstance(item, dict | list)
+        for inner in _iterate_children(item)
     ]:
         depth += 1
         if depth > MAX_DEPTH:
             raise PydanticCustomError(
                 "nesting",
-                "need lists and objects at most {most} levels within one another",
+                "need lists and objects nested at most {most} levels deep",
                 {"most": MAX_DEPTH},
             )
     return value
@@ -39,29 +42,29 @@ def _iterate_children(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
 
 
 class Body(BaseModel):
-    """A request body: a field that is not known is an error, NaN and infinity are too."""
+    """A request body: unknown fields, NaN and infinity are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Answer(BaseModel):
-    """A response body; it is read from a mapping, or from a row or value by its attributes."""
+    """A response body, read from a mapping or from the attributes of a row or value."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
 
     @classmethod
     def from_source(cls, source: object, **fields: Any) -> Self:
-        """The answer with a row's or value's attributes; `fields` are what it says otherwise."""
-        found = {
+        """Build the response from the attributes of a row or value, replaced by `fields`."""
+        attributes = {
             name: getattr(source, name)
             for name in cls.model_fields
             if name not in fields and hasattr(source, name)
         }
-        return cls.model_validate(found | fields)
+        return cls.model_validate(attributes | fields)
 
 
 Finite = Annotated[float | None, BeforeValidator(to_finite)]
-"""A number of an answer; null where there is none, or none that is finite."""
+"""A number of a response; null if there is none or it is not finite."""
 
 
 class Page(Answer, Generic[Item]):
@@ -72,7 +75,7 @@ class Page(Answer, Generic[Item]):
 
 
 class FieldProblem(Answer):
-    """One thing wrong with a request."""
+    """One fault of a request."""
 
     pointer: str
     detail: str

@@ -1,6 +1,6 @@
-"""Use cases of models: the catalogue, own models with versions, and the check of a document.
+"""Use cases of models: the catalogue, user models with versions, and checks of documents.
 
-Whether runs are of one model: their estimates then stand for the same quantities.
+Estimates of different runs are comparable only if their models have the same equations.
 """
 
 import json
@@ -23,24 +23,24 @@ from sysid.models.parse import keep_terms, parse_model
 
 
 def list_models(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
-    """Built-in models on the first page, then every version of own ones, latest first."""
-    own = ModelRepository(session).list_page(cursor=cursor, limit=limit)
+    """List the built-in models (first page), then all versions of user models, latest first."""
+    stored = ModelRepository(session).list_page(cursor=cursor, limit=limit)
     built_in = [] if cursor else list_catalogue()
-    return Page(items=built_in + [_to_own_out(row) for row in own.items], next=own.next)
+    return Page(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
 
 
 def list_catalogue() -> list[ModelOut]:
-    """The built-in models."""
+    """List the built-in models."""
     return [_to_builtin_out(name) for name in library.catalogue()]
 
 
 def get_model(session: Session, reference: str) -> ModelOut:
-    """A model by ``name`` or ``name@version``.
+    """Return a model by ``name`` or ``name@version``.
 
     Raises
     ------
     NotFound
-        With the nearest known name.
+        With the most similar name.
     """
     if reference in library.catalogue():
         return _to_builtin_out(reference, with_document=True)
@@ -48,7 +48,7 @@ def get_model(session: Session, reference: str) -> ModelOut:
 
 
 def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
-    """Store an own model; the same document again gives the same version.
+    """Store a user model; the same document again returns the same version.
 
     Raises
     ------
@@ -65,10 +65,10 @@ def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
 
 
 def check_model(document: Any) -> CheckOut:
-    """Whether a model document can be used, and every fault in it."""
+    """Check a model document and report every fault in it."""
     if not isinstance(document, Mapping):
-        found = f"a model is an object with 'equations' and more; found {document!r:.60}"
-        return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=found)])
+        message = f"found {document!r:.60}; need an object with 'equations' and other fields"
+        return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=message)])
     try:
         model = parse_model(document)
     except SysidError as error:
@@ -78,10 +78,10 @@ def check_model(document: Any) -> CheckOut:
 
 
 def resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
-    """The model that a job names, and what to store for it.
+    """Return the model that a job names, and what to store for it.
 
-    A built-in model stays a name; an own one is stored as its document, so that a later version
-    does not change what was submitted.
+    A built-in model stays a name. A user model is stored as its document, so that a later version
+    does not change the submitted job.
 
     Raises
     ------
@@ -118,10 +118,10 @@ def _parse_stored(document: str) -> Model:
 
 
 def apply_selection(model: Model, result: Mapping[str, Any] | None) -> Model:
-    """A model with the terms that a run's result document says were selected, if it does."""
+    """Return the model with the terms that the result document of a run selected, if any."""
     if model.rule is None or not (result or {}).get("selection"):
         return model
-    return keep_terms(model, [one["term"] for one in (result or {})["selection"]])
+    return keep_terms(model, [entry["term"] for entry in (result or {})["selection"]])
 
 
 def _get_own_model(session: Session, reference: str) -> StoredModel:
@@ -132,8 +132,8 @@ def _get_own_model(session: Session, reference: str) -> StoredModel:
 
 
 def _list_names(session: Session) -> set[str]:
-    own = ModelRepository(session).list_page(limit=1000).items
-    return {*library.catalogue(), *(row.name for row in own)}
+    stored = ModelRepository(session).list_page(limit=1000).items
+    return {*library.catalogue(), *(row.name for row in stored)}
 
 
 def _to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
@@ -163,17 +163,17 @@ def _to_out(model: Model, version: int, document: Mapping[str, Any] | None) -> M
 
 
 _IRRELEVANT_KEYS = ("name", "title", "description", "source", "parameters", "initial", "solver")
-"""Of a model's document, what does not say what its parameters mean."""
+"""Keys of a model document that do not define the meaning of its parameters."""
 
 
-def have_same_equations(one: Model, other: Model) -> bool:
-    """Whether two models have the same equations of the same parameters, in the same units.
+def have_same_equations(model: Model, other: Model) -> bool:
+    """Return whether two models have the same equations, parameters and units.
 
-    Names and texts, bounds, initial states and the solver may differ.
+    Names, texts, bounds, initial states and the solver may differ.
     """
-    return bool(_extract_equations(one) == _extract_equations(other))
+    return bool(_extract_equations(model) == _extract_equations(other))
 
 
 def _extract_equations(model: Model) -> Any:
     document = {key: value for key, value in model.document.items() if key not in _IRRELEVANT_KEYS}
-    return document, [(one.name, one.unit) for one in model.parameters]
+    return document, [(parameter.name, parameter.unit) for parameter in model.parameters]

@@ -1,4 +1,4 @@
-"""What is told about models."""
+"""Wire types of models."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ class ModelOut(Answer):
 
 
 class CheckOut(Answer):
-    """Whether a model document can be used, and every error in it."""
+    """Result of a check: whether a model document is valid, and every error in it."""
 
     valid: bool
     errors: list[FieldProblem]

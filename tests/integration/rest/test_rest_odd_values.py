@@ -82,7 +82,7 @@ def test_a_model_that_cannot_be_stored_is_not_called_valid(server: TestClient, t
     for changed in ({"title": text}, {text: 1}):
         told = sent(server, "/v1/models:check", {**document, **changed}).json()
         assert told["valid"] is False
-        assert "text holds" in told["errors"][0]["detail"]
+        assert "text contains" in told["errors"][0]["detail"]
 
 
 def test_a_very_long_value_is_not_repeated_in_full(server: TestClient) -> None:
