@@ -1,12 +1,13 @@
-"""The development operator of the improved algorithm: an adaptive sequence search.
+"""Adaptive sequence search, the local search of the improved algorithm.
 
-Like the paper's sequence search it proposes neighbours of one individual, keeps the best and goes
-on while it gains; but direction and size of its steps come from the output's sensitivities (one
-Levenberg–Marquardt step a generation, several dampings tried at once).
+Like the paper's sequence search (its "development" operator) it proposes neighbours of one
+individual, keeps the best and continues while it gains. Here the direction and the size of the
+steps come from the sensitivities of the output. Each generation is one Levenberg–Marquardt step
+with several dampings tried at once.
 
-A lag makes the fitness over a whole record a comb of local minima, the denser the longer the
-record. Hence some developments begin with the first part of the record, where the comb is wide,
-from the best of fresh individuals, and take in the rest by and by.
+A time lag makes the fitness over a whole record a comb of local minima. The longer the record, the
+denser the comb. So some searches start from the best of new random individuals, on the first part
+of the record, where the comb is wide. They extend that part step by step.
 """
 
 import numpy as np
@@ -41,27 +42,25 @@ from sysid.simulation.scaling import from_unit
 N_TRIALS = 3
 DAMPING_FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
-EARLY_DAMPING = 1.0  # far from a minimum: a full step would leave the box
-EARLY_PLACES = 4  # of which an early fresh development begins with the best
+EARLY_DAMPING = 1.0  # far from a minimum, where a full step would leave the bounds
+EARLY_PLACES = 4  # random points: an early random search starts from the best of them
 LONGEST_GROWTH = 4.0  # doublings
 N_GROWTHS = 3
 MOST_SEARCH_STEPS = 12
 ENOUGH_GAIN = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART_GAIN = 1e-2
-EARLY_SEARCHES = (
-    4  # developments that follow each other at once and are cheap, before the long ones
-)
-FAR_FITNESS = 1.1  # of the champion's fitness: above, a search ends at the first small gain
-SEARCH_CYCLE = 8  # developments after which the kinds repeat where the fitness jumps
-SCATTER_TURN, GROWTH_TURN = 2, 4  # of four the one that spreads, of eight that grows from beside
-SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velocities are right
+EARLY_SEARCHES = 4  # cheap local searches in immediate succession, before the long ones
+FAR_FITNESS = 1.1  # times the champion's fitness: above, a search ends at the first small gain
+SEARCH_CYCLE = 8  # local searches until their kinds repeat, where the fitness jumps
+SCATTER_TURN, GROWTH_TURN = 2, 4  # turns: of four to scatter, of eight to grow near the champion
+SHORT_GROWTH = 1.5  # doublings: near the champion the later signs of velocities are right
 
 
 @jit_compile
 def _draw_best_start(
     evaluator: Evaluator, plan: IslandPlan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
-    """The best of a population of random places, judged by the record up to the horizon."""
+    """Draw random points and return the one that fits the record best up to the horizon."""
     places, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
@@ -70,19 +69,19 @@ def _draw_best_start(
             places[p, d] = to_uniform(word[0])
     search.evaluations += shape[0]
     predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
-    reached = evaluate_partial_fitness(evaluator, plan, predicted, horizon)
-    return np.asarray(places[np.argmin(reached[: shape[0]])])
+    fitness = evaluate_partial_fitness(evaluator, plan, predicted, horizon)
+    return np.asarray(places[np.argmin(fitness[: shape[0]])])
 
 
 @jit_compile
 def has_scattered(search: SearchRecord) -> bool:
-    """Whether the last development spread the population around the champion."""
+    """Return whether the last local search scattered the population around the champion."""
     return bool(search.local_searches % (SEARCH_CYCLE // 2) == SCATTER_TURN)
 
 
 @jit_compile
 def _should_search_far(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
-    """Whether this is a hop's turn that is better spent far away. Not where a budget ends."""
+    """Return whether to replace a hop by a search far away; False near the end of a budget."""
     search = island.search
     turn = search.local_searches % SEARCH_CYCLE
     if turn % 2 == 0 or turn == 1:
@@ -98,16 +97,19 @@ def _should_search_far(evaluator: Evaluator, plan: IslandPlan, island: IslandArr
 def _choose_discontinuous_start(
     size: int, word: RandomWords, is_lost: bool, search: SearchRecord
 ) -> int:
-    """The same where the fitness jumps: there most that is better lies beside the champion.
+    """Choose the next search where the fitness jumps: better optima are then near the champion.
 
-    Of eight developments four are hops, two of them of one parameter, two scatter, one grows from
-    beside the champion (one parameter moved, too) and one from far away: in two of three from
-    fresh individuals. Both grow so fast that it costs little. Where the champion's errors are no
-    noise, three of the hops give their turns to fresh individuals.
+    Of eight local searches four are hops (two of them move one parameter) and two scatter. One
+    grows the horizon from near the champion, with one parameter moved. One grows it from far away,
+    in two of three cases from random individuals. Both grow so fast that they cost little.
+
+    If the champion's residuals are not noise, random individuals replace three of the hops.
     """
     turn = search.local_searches % SEARCH_CYCLE
     search.wide_differences = 1
-    if search.champion_converged == 0:  # the champion first, whole: what follows is drawn around it
+    if (
+        search.champion_converged == 0
+    ):  # first the champion on the whole record: later points are drawn around it
         return 0
     if is_lost:
         search.horizon = 0.5 ** (LONGEST_GROWTH * (1.0 + to_uniform(word[0])) / 2.0)
@@ -134,28 +136,27 @@ def _choose_discontinuous_start(
 
 @jit_compile
 def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchRecord) -> int:
-    """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
+    """Choose the next kind of search; return the individual to start from, -1: a random one."""
     number = search.local_searches
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
     if search.fitness_discontinuities > 0 and number > EARLY_SEARCHES:
         return _choose_discontinuous_start(size, word, is_lost, search)
     grows = number == EARLY_SEARCHES or (number > EARLY_SEARCHES and number % 2 == 0)
-    last_early = (
+    last_early_search = (
         EARLY_SEARCHES - search.is_warm_start
-    )  # behind an earlier result, the last of them is a hop
-    settled = search.champion_converged == 1 and number > last_early
+    )  # in a warm start the last of them is a hop
+    is_settled = search.champion_converged == 1 and number > last_early_search
     chosen = to_integer(word[1], 3 * size) - size if grows else 0
     search.wide_differences = search.champion_converged == 1 or grows
-    if settled and (chosen >= size or number % 4 == 1 or number == EARLY_SEARCHES):
+    if is_settled and (chosen >= size or number % 4 == 1 or number == EARLY_SEARCHES):
         search.hop_kind = COUNTED_HOP
     elif grows:
         search.horizon = 0.5 ** (LONGEST_GROWTH * to_uniform(word[0]))
         doublings = 1.0 if number == EARLY_SEARCHES else 0.5 ** (1 + to_integer(word[3], N_GROWTHS))
         search.horizon_growth = 2.0**doublings
-        search.probe_count = (
-            0 if number == EARLY_SEARCHES else size // 3
-        )  # in lanes that would idle
-    elif settled:
+        # Probes fill vector elements that would be idle.
+        search.probe_count = 0 if number == EARLY_SEARCHES else size // 3
+    elif is_settled:
         search.probe_count = size
     if 1 < number <= EARLY_SEARCHES and not search.hop_kind:
         chosen = -1
@@ -164,7 +165,7 @@ def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchReco
 
 @jit_compile
 def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    """Choose the point to begin with, and how much of the record counts at first."""
+    """Choose the start of a local search, and the part of the record that it fits first."""
     chromosomes, search = island.chromosomes, island.search
     search.local_searches += 1
     search.in_sequence_search, search.step_count, search.failed_steps = 1, 0, 0
@@ -174,7 +175,7 @@ def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArr
     search.horizon, search.reached_fitness = 1.0, np.inf
     is_lost = _should_search_far(evaluator, plan, island)
     chosen = _choose_start(plan, chromosomes.shape[0], is_lost, search)
-    # The places of a fresh start, or the slopes of a hop, would pass the budget.
+    # The points of a random start, or the slopes of a hop, would exceed the budget.
     if search.evaluations + max(chromosomes.shape) + 1 > plan.most_evaluations:
         chosen, search.hop_kind = max(chosen, 0), 0
     if chosen >= 0:
@@ -192,16 +193,16 @@ def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArr
 
 @jit_compile
 def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
-    """Put a developed individual in the place of its former self, else of the worst."""
+    """Replace the individual that the search started from, or else the worst one."""
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
-    place = fitness.size - 1
+    index = fitness.size - 1
     for p in range(fitness.size - 1, -1, -1):
         if fitness[p] == search.replaced_fitness:
-            place = p
-    if reached < fitness[place]:
+            index = p
+    if reached < fitness[index]:
         for d in range(chromosome.size):
-            chromosomes[place, d] = chromosome[d]
-        fitness[place] = reached
+            chromosomes[index, d] = chromosome[d]
+        fitness[index] = reached
         sort_population(chromosomes, fitness)
         search.replaced_fitness = reached
 
@@ -210,9 +211,9 @@ def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: fl
 def _scatter_population(
     island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int
 ) -> None:
-    """Let the probes take the places of all but the champion: the genetic search goes on there."""
+    """Replace all individuals but the champion by the probes; the genetic search continues."""
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
-    if search.probe_count < fitness.size:  # those of a growing record go on with each step
+    if search.probe_count < fitness.size:  # probes of a growing horizon stay for the next step
         return
     search.probe_count, search.stagnation = 0, 0
     for p in range(1, min(fitness.size, reached.size - N_TRIALS + 1)):
@@ -226,7 +227,7 @@ def _scatter_population(
 
 @jit_compile
 def _extend_horizon(search: SearchRecord, champion: float) -> None:
-    """Take in more of the record; at its end, the development ends.
+    """Extend the part of the record that is fitted; at its end, end the local search.
 
     `champion` is the champion's fitness.
     """
@@ -250,7 +251,7 @@ def _extend_horizon(search: SearchRecord, champion: float) -> None:
 def _finish_part(
     evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, reached: float
 ) -> None:
-    """Go on to the next part; a growth from far away, beside jumps, not if it is behind already."""
+    """Extend the horizon; end early if a far search near jumps is behind the champion."""
     search = island.search
     races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop_kind == 0
     if races and is_behind_champion(evaluator, plan, island, search.horizon, reached):
@@ -262,7 +263,7 @@ def _finish_part(
 def _propose_places(
     plan: IslandPlan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
 ) -> FloatArray:
-    """Places to try: steps of several dampings, and probes spread as the estimate's covariance."""
+    """Propose steps of several dampings, and probes drawn from the estimate's covariance."""
     point, search = island.point, island.search
     places = np.empty((N_TRIALS + search.probe_count, point.size))
     for t in range(N_TRIALS):
@@ -280,7 +281,7 @@ def _propose_places(
 
 @jit_compile
 def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    """One generation of the adaptive search: sensitivities, then several steps at once."""
+    """Run one generation of the adaptive search: sensitivities, then several steps at once."""
     point, search = island.point, island.search
     horizon = search.horizon
     search.step_count += 1

@@ -1,21 +1,19 @@
-"""Hops: developments that begin beside the champion, a little way off or one parameter far off.
+"""Basin hopping: local searches that start near the champion, and detection of fitness jumps.
 
-Along the covariance of the estimate a hop stays in the champion's valley. One parameter alone
-leaves it across: that leads out where the fitness is a comb of narrow valleys side by side.
+A hop along the covariance of the estimate stays in the champion's valley. A hop of one parameter
+crosses the valley. It helps where the fitness is a comb of narrow valleys.
 
-Jumps of the fitness beside an estimate, as where dry friction switches a sample earlier.
+The fitness jumps near an estimate if, for example, dry friction switches a sample earlier. Then
+neighbouring minima differ greatly in width. A wide one attracts most searches, and a better one
+next to it attracts few. So it proves little how many searches returned to the best one.
 
-Then minima lie side by side that differ in width by far: a wide one draws most searches while a
-better one next to it draws few, and counting how often the best was found again proves little.
+A jump does not shrink under magnification. Consider increments of the loss between neighbouring
+points on a straight line through the estimate. For a smooth loss they vary slowly. The increment
+that differs most from its neighbours is divided into as many points again, and so on. For a smooth
+loss almost nothing of the difference remains. For a jump all of it remains in one increment.
 
-A jump is what does not shrink. On a straight line through the estimate, the increments of the loss
-between neighbouring places vary slowly where it is smooth. The one that differs most from its
-neighbours is looked at again, with as many places inside of it, and so on: of a smooth loss next
-to nothing of that difference is left in any of these, of a jump all of it in one. No scale enters.
-
-Whether more is to be found far from the champion, and whether a start far away leads nowhere.
-
-Both compare with nothing but the champion's own errors, so no scale enters.
+Two further tests decide whether to search far from the champion, and whether a far search is worth
+continuing. They compare with the champion's own residuals. None of the tests depends on a scale.
 """
 
 import numpy as np
@@ -36,29 +34,27 @@ from sysid.search.state import IslandArrays, IslandPlan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_partially
 from sysid.simulation.scaling import from_unit
 
-LINE_PLACES = 16  # on a line: one block of lanes
+LINE_PLACES = 16  # points on a line: one SIMD vector
 LINE_REACH = 5.0  # standard errors to both sides, in a random direction
-_ZOOM_LEVELS = 4  # each looks at a fifteenth of the last
+_ZOOM_LEVELS = 4  # each examines a fifteenth of the last
 MOST_LINE_SIMULATIONS = _ZOOM_LEVELS * LINE_PLACES
 _JUMP_REMAINDER = 0.25  # of the difference; a smooth loss leaves less than a tenth
-_HIGH_LOSS = (
-    4.0  # times the loss at the point: edges of what is far worse, or diverges, do not matter
-)
+_HIGH_LOSS = 4.0  # times the loss at the point: jumps to much worse losses do not matter
 
 
 @jit_compile
 def find_odd_increment(losses: FloatArray) -> tuple[int, float]:
-    """The increment that differs most from the mean of its two neighbours, and by how much.
+    """Find the increment that differs most from the mean of its neighbours, and the difference.
 
-    By nothing where the losses vary as a parabola.
+    The difference is 0 where the losses follow a parabola.
     """
-    place, most = 1, 0.0
+    index, largest = 1, 0.0
     for i in range(1, losses.size - 2):
         before, after = losses[i] - losses[i - 1], losses[i + 2] - losses[i + 1]
-        unlike = abs(losses[i + 1] - losses[i] - 0.5 * (before + after))
-        if unlike > most:
-            place, most = i, unlike
-    return place, most
+        difference = abs(losses[i + 1] - losses[i] - 0.5 * (before + after))
+        if difference > largest:
+            index, largest = i, difference
+    return index, largest
 
 
 @jit_compile
@@ -69,15 +65,17 @@ def _evaluate_line(
     direction: FloatArray,
     first: float,
     last: float,
-    most: float,
+    largest_loss: float,
 ) -> FloatArray:
-    """Squared fitness, `most` at most, at equal distances on a line through the point."""
+    """Evaluate the squared fitness, limited to `largest_loss`, at equal distances on a line."""
     places, deviation = np.empty((LINE_PLACES, point.size)), np.empty(point.size)
     for p in range(LINE_PLACES):
         for d in range(point.size):
             deviation[d] = (first + (last - first) * p / (LINE_PLACES - 1)) * direction[d]
         write_spread_place(factor, point, deviation, places[p])
-    return np.minimum(evaluate_population(evaluator, from_unit(evaluator, places)) ** 2, most)
+    return np.minimum(
+        evaluate_population(evaluator, from_unit(evaluator, places)) ** 2, largest_loss
+    )
 
 
 @jit_compile
@@ -89,47 +87,46 @@ def has_discontinuity(
     base: float,
     search: SearchRecord,
 ) -> bool:
-    """Whether the loss jumps on a line through a point (D,), in at most `MOST_LINE_SIMULATIONS` simulations.
+    """Return whether the loss jumps on a line through a point (D,).
+
+    It takes at most `MOST_LINE_SIMULATIONS` simulations.
 
     Parameters
     ----------
     factor : FloatArray, shape (D, D)
-        That of the sums of products of slopes (`sysid.search.levenberg_marquardt.factor_damped`).
+        Factor of the normal matrix (`sysid.search.levenberg_marquardt.factor_damped`).
     direction : FloatArray, shape (D,)
         Standard normal numbers times the fitness `base` at the point: a standard error.
     search : SearchRecord
-        The island's: simulations are counted.
+        Search record of the island, which counts the simulations.
     """
-    first, width, before, above = -LINE_REACH, 2.0 * LINE_REACH, 0.0, 0.0
-    variance, most = base**2 / evaluator.n_scored, _HIGH_LOSS * base**2
+    first, width, before, upper_loss = -LINE_REACH, 2.0 * LINE_REACH, 0.0, 0.0
+    variance, largest_loss = base**2 / evaluator.n_scored, _HIGH_LOSS * base**2
     for level in range(_ZOOM_LEVELS):
         search.evaluations += LINE_PLACES
-        losses = _evaluate_line(evaluator, factor, point, direction, first, first + width, most)
-        place, unlike = find_odd_increment(losses)
-        if unlike <= variance or (level > 0 and unlike <= _JUMP_REMAINDER * before):
+        losses = _evaluate_line(
+            evaluator, factor, point, direction, first, first + width, largest_loss
+        )
+        index, difference = find_odd_increment(losses)
+        if difference <= variance or (level > 0 and difference <= _JUMP_REMAINDER * before):
             return False
-        before, width = unlike, width / (LINE_PLACES - 1)
-        first += place * width
-        above = max(losses[place], losses[place + 1])
-    return bool(above < most)
+        before, width = difference, width / (LINE_PLACES - 1)
+        first += index * width
+        upper_loss = max(losses[index], losses[index + 1])
+    return bool(upper_loss < largest_loss)
 
 
 SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
-COUNTED_HOP, UNCOUNTED_HOP, SINGLE_PARAMETER_HOP = (
-    1,
-    2,
-    4,
-)  # hops: evidence for the champion or not; of one parameter
-SINGLE_HOP_FACTOR = (
-    10.0  # times as far, in standard errors with the others held, one parameter moves
-)
-PROBED_HOPS = 4  # hops that also look for jumps of the fitness, as long as there is none
-LINES_PER_HOP = 2  # on which each does
+# Bits of a kind of hop: counted as evidence for the champion, not counted, of one parameter.
+COUNTED_HOP, UNCOUNTED_HOP, SINGLE_PARAMETER_HOP = 1, 2, 4
+SINGLE_HOP_FACTOR = 10.0  # one parameter moves so much farther, in its conditional standard errors
+PROBED_HOPS = 4  # hops that also test for jumps of the fitness, until there is one
+LINES_PER_HOP = 2  # lines that each of them tests
 
 
 @jit_compile
 def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    """Move the point away: as the estimate's covariance spreads it, or one parameter alone."""
+    """Move the point away from the champion, along the covariance or in one parameter."""
     point, search = island.point, island.search
     search.evaluations += point.size + 1
     difference = choose_difference(plan, search)
@@ -149,9 +146,9 @@ def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArra
 def _move_single_parameter(
     plan: IslandPlan, search: SearchRecord, matrix: FloatArray, size: float, point: FloatArray
 ) -> None:
-    """Move one parameter by so many of its standard errors with the others held: off the valley.
+    """Move one parameter by some of its conditional standard errors, across the valley.
 
-    One to which the output is insensitive stays.
+    A parameter without effect on the output stays.
     """
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 1)
     d = to_integer(word[2], point.size)
@@ -164,7 +161,7 @@ def _move_single_parameter(
 def _draw_deviation(
     plan: IslandPlan, search: SearchRecord, line: int, size: float, n: int
 ) -> FloatArray:
-    """Normal numbers (n,) of that standard deviation."""
+    """Draw normal numbers (n,) with the standard deviation `size`."""
     drawn = np.empty(n)
     for d in range(n):
         draw = 1 + line * n + d
@@ -177,7 +174,7 @@ def _draw_deviation(
 def _probe_discontinuities(
     evaluator: Evaluator, plan: IslandPlan, factor: FloatArray, base: float, island: IslandArrays
 ) -> None:
-    """Note whether the fitness jumps on lines through the point; not where a budget ends."""
+    """Record whether the fitness jumps on lines through the point; not at the end of a budget."""
     point, search = island.point, island.search
     for line in range(1, LINES_PER_HOP + 1):
         if (
@@ -189,20 +186,18 @@ def _probe_discontinuities(
             direction = _draw_deviation(plan, search, line, base, point.size)
             jumps = has_discontinuity(evaluator, factor, point, direction, base, search)
             search.champion_discontinuities += jumps
-            # A warm start settles by fewer searches, chosen with those of a smooth fitness.
+            # A warm start needs fewer agreeing restarts, a number chosen for smooth fitness.
             search.fitness_discontinuities += jumps and search.is_warm_start == 0
 
 
-COLOUR_THRESHOLD = (
-    0.5  # correlation of neighbouring errors: noise has none, a wrong response nearly 1
-)
+COLOUR_THRESHOLD = 0.5  # correlation of neighbouring residuals: noise has 0, a wrong response 1
 
 
 @jit_compile
 def _predict_champion(
     evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, horizon: float
 ) -> FloatArray:
-    """Predictions (M, 1 or more) of the champion up to that part of the record."""
+    """Simulate the champion up to a part of the record: predictions (M, 1 or more)."""
     island.search.evaluations += 1
     champion = from_unit(evaluator, decode(island.chromosomes[:1], plan.bits))
     return predict_partially(evaluator, champion, horizon)
@@ -210,9 +205,9 @@ def _predict_champion(
 
 @jit_compile
 def is_champion_coloured(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
-    """Whether the champion's errors go together with their neighbours: a simulation.
+    """Return whether the champion's residuals are autocorrelated; takes one simulation.
 
-    Then far more than noise is left to explain. Neighbours are so in the list of measured values.
+    If so, the residuals are more than noise. Neighbours are consecutive measured values.
     """
     predicted = _predict_champion(evaluator, plan, island, 1.0)
     products, squares, last = 0.0, 0.0, 0.0
@@ -229,9 +224,9 @@ def is_champion_coloured(evaluator: Evaluator, plan: IslandPlan, island: IslandA
 def is_behind_champion(
     evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, horizon: float, reached: float
 ) -> bool:
-    """Whether the champion fits a part better than what was fitted to it: a simulation.
+    """Return whether the champion fits a part of the record better; takes one simulation.
 
-    Not where the budget ends.
+    `reached` is the fitness of the search on that part. False at the end of the budget.
     """
     if island.search.evaluations >= plan.most_evaluations:
         return False

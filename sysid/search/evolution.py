@@ -1,4 +1,4 @@
-"""Generations of one island, all of them in one compiled call (Figures 4 to 6)."""
+"""Generations of one island, evolved in one compiled call (Figures 4 to 6)."""
 
 import numpy as np
 
@@ -52,10 +52,10 @@ from sysid.simulation.scaling import from_unit
 
 @jit_compile
 def draw_initial_places(plan: IslandPlan, individuals: int, n: int) -> FloatArray:
-    """Random places; for the improved method stratified over the whole archipelago.
+    """Draw random points; the improved method stratifies them over the whole archipelago.
 
-    Stratified (Latin hypercube): each of the archipelago's `total` equal parts of every
-    parameter's range holds one individual. All islands derive the same permutations.
+    Stratified (Latin hypercube): every parameter's range has as many equal parts as the
+    archipelago has individuals, and each part holds one. All islands derive the same permutations.
     """
     places = np.empty((individuals, n))
     order = np.arange(plan.population)
@@ -73,19 +73,23 @@ def draw_initial_places(plan: IslandPlan, individuals: int, n: int) -> FloatArra
 
 @jit_compile
 def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
-    """Figure 4: the survivors stay unchanged, their children take the places of the others."""
-    words, fitness = island.chromosomes, island.fitness
-    generation, length = island.search.generation, words.shape[1] * plan.bits
+    """Breed as in Figure 4: the survivors stay, their children replace the others."""
+    chromosomes, fitness = island.chromosomes, island.fitness
+    generation, length = island.search.generation, chromosomes.shape[1] * plan.bits
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
     for p in range(plan.survivors, fitness.size):
         word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p)
-        more = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p + 1)
+        next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p + 1)
         first, second = draw_pair(word[0], word[1], plan.survivors)
         cross_over(
-            words[p], words[first], words[second], 1 + to_integer(word[2], length - 1), plan.bits
+            chromosomes[p],
+            chromosomes[first],
+            chromosomes[second],
+            1 + to_integer(word[2], length - 1),
+            plan.bits,
         )
         if to_uniform(word[3]) < rate:
-            flip_bit(words[p], to_integer(more[0], length), plan.bits)
+            flip_bit(chromosomes[p], to_integer(next_word[0], length), plan.bits)
         fitness[p] = np.nan
 
 
@@ -98,29 +102,31 @@ def _breed_child(
     p: int,
     word: WordArray,
 ) -> None:
-    """Write child `p`: by crossover, or by a difference of parents (differential evolution)."""
+    """Write child `p` by crossover or by differential evolution."""
     bits, n = plan.bits, word.size
-    drawn = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
-    more = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
-    last = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
-    first, second = draw_pair(drawn[0], drawn[1], plan.survivors)
-    crossed, third = more[0] & 1, to_integer(more[1], places.shape[0])
-    cross_over(word, parents[first], parents[second], 1 + to_integer(drawn[2], n * bits - 1), bits)
+    first_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
+    next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
+    last_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
+    first, second = draw_pair(first_word[0], first_word[1], plan.survivors)
+    crossed, third = next_word[0] & 1, to_integer(next_word[1], places.shape[0])
+    cross_over(
+        word, parents[first], parents[second], 1 + to_integer(first_word[2], n * bits - 1), bits
+    )
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
-    mutated = to_integer(last[0], n) if to_uniform(drawn[3]) < rate else -1
+    mutated = to_integer(last_word[0], n) if to_uniform(first_word[3]) < rate else -1
     for d in range(n):
         place = word[d] / float((1 << bits) - 1)
         if not crossed:
-            length = 0.4 + 0.6 * to_uniform(drawn[2])
+            length = 0.4 + 0.6 * to_uniform(first_word[2])
             place = reflect_at_bounds(places[p, d] + length * (places[first, d] - places[third, d]))
         if d == mutated:
-            place = mutate_by_step(place, last[1], last[2], bits)
+            place = mutate_by_step(place, last_word[1], last_word[2], bits)
         word[d] = np.uint32(round(place * float((1 << bits) - 1)))
 
 
 @jit_compile
 def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray:
-    """As many children as there are individuals, to compete with their parents."""
+    """Breed as many children as there are individuals; they compete with their parents."""
     parents = island.chromosomes
     children, places = np.empty_like(parents), decode(parents, plan.bits)
     for p in range(parents.shape[0]):
@@ -130,55 +136,55 @@ def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray
 
 @jit_compile
 def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
-    """All but the champion are drawn anew."""
-    words, fitness = island.chromosomes, island.fitness
-    largest, n = float((1 << plan.bits) - 1), words.shape[1]
+    """Draw all individuals but the champion again."""
+    chromosomes, fitness = island.chromosomes, island.fitness
+    largest, n = float((1 << plan.bits) - 1), chromosomes.shape[1]
     for p in range(1, fitness.size):
         fitness[p] = np.nan
         for d in range(n):
             word = draw_words(
                 plan.seed, USE_RESTART, plan.island, island.search.generation, p * n + d
             )
-            words[p, d] = np.uint32(round(to_uniform(word[0]) * largest))
+            chromosomes[p, d] = np.uint32(round(to_uniform(word[0]) * largest))
 
 
 @jit_compile
 def select_fittest(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
-    """Of parents and children the fittest stay; on equal fitness the parent does."""
-    words, fitness = island.chromosomes, island.fitness
-    size, n = words.shape
-    everyone, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
+    """Select the fittest of parents and children; on equal fitness the parent stays."""
+    chromosomes, fitness = island.chromosomes, island.fitness
+    size, n = chromosomes.shape
+    candidates, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
     for p in range(size):
         values[p], values[size + p] = fitness[p], reached[p]
         for d in range(n):
-            everyone[p, d], everyone[size + p, d] = words[p, d], children[p, d]
-    sort_population(everyone, values)
+            candidates[p, d], candidates[size + p, d] = chromosomes[p, d], children[p, d]
+    sort_population(candidates, values)
     for p in range(size):
         fitness[p] = values[p]
         for d in range(n):
-            words[p, d] = everyone[p, d]
+            chromosomes[p, d] = candidates[p, d]
 
 
 @jit_compile
 def evaluate_new_individuals(
-    evaluator: Evaluator, plan: IslandPlan, words: WordArray, fitness: FloatArray
+    evaluator: Evaluator, plan: IslandPlan, chromosomes: WordArray, fitness: FloatArray
 ) -> int:
-    """Simulate the individuals that are not evaluated yet (``nan``), and rank all.
+    """Simulate the individuals that are not evaluated yet (``nan``), and sort all.
 
-    Gives the number of simulations.
+    Returns the number of simulations.
     """
-    waiting = np.flatnonzero(np.isnan(fitness))
-    if waiting.size == 0:
+    unevaluated = np.flatnonzero(np.isnan(fitness))
+    if unevaluated.size == 0:
         return 0
-    chosen = np.empty((waiting.size, words.shape[1]), np.uint32)
-    for i in range(waiting.size):
-        for d in range(words.shape[1]):
-            chosen[i, d] = words[waiting[i], d]
+    chosen = np.empty((unevaluated.size, chromosomes.shape[1]), np.uint32)
+    for i in range(unevaluated.size):
+        for d in range(chromosomes.shape[1]):
+            chosen[i, d] = chromosomes[unevaluated[i], d]
     reached = evaluate_population(evaluator, from_unit(evaluator, decode(chosen, plan.bits)))
-    for i in range(waiting.size):
-        fitness[waiting[i]] = reached[i]
-    sort_population(words, fitness)
-    return waiting.size
+    for i in range(unevaluated.size):
+        fitness[unevaluated[i]] = reached[i]
+    sort_population(chromosomes, fitness)
+    return unevaluated.size
 
 
 @jit_compile
@@ -186,11 +192,11 @@ def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.in_sequence_search and plan.method == METHOD_IMPROVED:
         run_adaptive_sequence(evaluator, plan, island)
-        # Two steps of a hop simulate no more than one generation of another kind.
-        goes_on = search.in_sequence_search and search.probe_count == 0
-        again = goes_on and search.fitness_discontinuities > 0
+        # Two steps of a hop take no more simulations than one generation of another kind.
+        continues = search.in_sequence_search and search.probe_count == 0
+        takes_second_step = continues and search.fitness_discontinuities > 0
         step = chromosomes.shape[1] + 1 + N_TRIALS
-        if again and search.evaluations + step <= plan.most_evaluations:
+        if takes_second_step and search.evaluations + step <= plan.most_evaluations:
             run_adaptive_sequence(evaluator, plan, island)
     elif search.in_sequence_search:
         run_fixed_sequence(evaluator, plan, island)
@@ -210,14 +216,14 @@ def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
 
 @jit_compile
 def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    """GA ⇒ sequence: where the genetic search stands still, local search takes over."""
+    """Switch to the local search when the genetic search stagnates."""
     search = island.search
     if search.in_sequence_search or plan.method == METHOD_SIMPLE:
         return
     if plan.method == METHOD_IMPROVED:
-        early = search.local_searches < EARLY_SEARCHES
-        beside = search.fitness_discontinuities > 0 and not has_scattered(search)
-        if early or beside or search.step_count >= max(1, plan.stagnation // 10):
+        is_early = search.local_searches < EARLY_SEARCHES
+        hops_next = search.fitness_discontinuities > 0 and not has_scattered(search)
+        if is_early or hops_next or search.step_count >= max(1, plan.stagnation // 10):
             start_local_search(evaluator, plan, island)
     elif search.stagnation >= plan.stagnation:
         search.in_sequence_search, search.stagnation = 1, 0
@@ -235,7 +241,7 @@ def _record_improvement(
 def write_improvement(
     search: SearchRecord, rms: float, phase: int, values: FloatArray, row: FloatArray
 ) -> None:
-    """Write the row of a better champion with these physical values (D,)."""
+    """Write the row of a better champion with physical values (D,)."""
     row[COLUMN_GENERATION], row[COLUMN_EVALUATIONS] = search.generation, search.evaluations
     row[COLUMN_RMS], row[COLUMN_PHASE] = rms, phase
     for d in range(values.size):
@@ -244,7 +250,7 @@ def write_improvement(
 
 @jit_compile
 def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
-    """Forget what spoke for the champion before, where the new one is another optimum."""
+    """Reset the evidence for the champion if the new one is another optimum."""
     if rms < before * (1.0 - SAME_OPTIMUM):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
         search.hop_count, search.returned_hops = 0, 0
@@ -252,7 +258,7 @@ def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
 
 @jit_compile
 def is_done(plan: IslandPlan, search: SearchRecord, rms: float) -> bool:
-    """Whether an island has used up its evaluations or reached the target RMS."""
+    """Return whether an island has used up its evaluations or reached the target RMS."""
     return bool(search.evaluations >= plan.most_evaluations or rms <= plan.target_rms)
 
 
@@ -264,14 +270,14 @@ def run_generations(
     island: IslandArrays,
     improvements: FloatArray,
 ) -> int:
-    """Evolve in place by `count` generations; gives the number of improvements written.
+    """Evolve in place by `count` generations; return the number of improvements written.
 
-    An island that has used up its evaluations, or reached the target, rests. Before the first
-    generation the initial population is evaluated.
+    An island that has used up its evaluations or reached the target rests. The initial population
+    is evaluated before the first generation.
     """
     fitness, search, written = island.fitness, island.search, 0
-    if np.any(np.isnan(fitness)):  # the beginning, or migrants from an island of other bits
-        # Not by the evaluations: finding the starts of a polynomial may have taken some.
+    if np.any(np.isnan(fitness)):  # first generation, or migrants from an island of other bits
+        # The count of evaluations does not tell: the starts of a polynomial may have taken some.
         begins = np.all(np.isnan(fitness))
         best = np.inf if begins else np.nanmin(fitness)
         phase = PHASE_START if begins else PHASE_MIGRATION

@@ -1,4 +1,4 @@
-"""An island: one population between two generations, and its evolution as a pure function."""
+"""An island: one population between two generations, its evolution and its budgets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,22 +28,22 @@ from sysid.simulation.evaluator import Evaluator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Island:
-    """One population at one generation. A value: to evolve is to make a new one.
+    """One population at one generation, an immutable value.
 
     Attributes
     ----------
     index : int
-        Its number in the archipelago.
+        Number of the island in the archipelago.
     seed : int
-        The run's seed: with the index, what its random numbers derive from.
-    words : WordArray, shape (P, D)
+        The run's seed. Random numbers derive from seed and index.
+    chromosomes : WordArray, shape (P, D)
         Chromosomes, fittest first.
     fitness : FloatArray, shape (P,)
-        J of Eq. 10, ascending; ``inf`` diverges, ``nan`` is not evaluated yet.
+        J of Eq. 10, ascending; ``inf``: diverged, ``nan``: not evaluated yet.
     search : SearchArray, shape ()
-        How far the search has got (see `sysid.search.state.SEARCH_RECORD`).
+        State of the search (see `sysid.search.state.SEARCH_RECORD`).
     point : FloatArray, shape (D,)
-        Where the local search stands.
+        Present point of the local search.
     history : tuple of Improvement
         Every better champion since the start.
     """
@@ -73,12 +73,12 @@ class Island:
 
     @property
     def arrays(self) -> IslandArrays:
-        """What compiled code reads and changes: not copies."""
+        """The arrays themselves, not copies, for compiled code to change."""
         return IslandArrays(self.chromosomes, self.fitness, self.search[()], self.point)
 
 
 def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -> Island:
-    """The island after `count` generations, fewer where it comes to rest.
+    """Evolve an island by `count` generations, or fewer if it comes to rest.
 
     ``evolve(…, a + b)`` equals ``evolve(…, b)`` of ``evolve(…, a)``, bit for bit.
     """
@@ -91,12 +91,12 @@ def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -
     )
     rows = np.empty((count + 1, COLUMN_VALUES + island.point.size))
     written = run_generations(evaluator, plan, count, after.arrays, rows)
-    better = tuple(to_improvement(row) for row in rows[:written].tolist())
-    return replace(after, history=island.history + better)
+    new_improvements = tuple(to_improvement(row) for row in rows[:written].tolist())
+    return replace(after, history=island.history + new_improvements)
 
 
 def to_improvement(row: Sequence[float]) -> Improvement:
-    """An improvement, of the row that compiled code wrote of it."""
+    """Convert a row that compiled code wrote to an improvement."""
     return Improvement(
         int(row[COLUMN_GENERATION]),
         int(row[COLUMN_EVALUATIONS]),
@@ -107,7 +107,7 @@ def to_improvement(row: Sequence[float]) -> Improvement:
 
 
 def stack_search(islands: Sequence[Island]) -> SearchArray:
-    """Copies of the islands' search records (I,)."""
+    """Copy the search records of the islands into one array (I,)."""
     return np.array([island.search for island in islands], SEARCH_RECORD).view(np.recarray)
 
 
@@ -116,13 +116,13 @@ NO_TARGET_RMS = -1.0
 
 
 def split_population(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
-    """Individuals of each island: the population dealt as evenly as possible."""
-    each, more = divmod(algorithm.population, algorithm.n_islands)
-    return tuple(each + (i < more) for i in range(algorithm.n_islands))
+    """Split the population over the islands as evenly as possible."""
+    size, remainder = divmod(algorithm.population, algorithm.n_islands)
+    return tuple(size + (i < remainder) for i in range(algorithm.n_islands))
 
 
 def get_island_settings(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
-    """The settings of one island, where islands differ."""
+    """Get the settings of one island."""
     if not isinstance(algorithm.islands, tuple):
         return algorithm
     change = algorithm.islands[index]
@@ -135,60 +135,64 @@ def get_island_settings(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgor
 
 
 def compute_search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
-    """Simulations that the islands may run: all but a tenth kept for the refinement.
+    """Compute the simulations for the islands: all but a tenth reserved for the refinement.
 
-    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept, and
-    what the last step of each island may take beyond its share.
+    The reserve covers at least a few refinement steps of n + 1 simulations. It also covers what the
+    last step of each island may take beyond its share. It is at most half of the budget.
     """
     limit = algorithm.stop.evaluations
     if limit is None:
         return _UNLIMITED
     if not algorithm.refine:
         return limit
-    beyond = algorithm.n_islands * (n + LANES)
-    return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
+    last_steps = algorithm.n_islands * (n + LANES)
+    return limit - min(max(limit // 10, 4 * (n + 2)) + last_steps, limit // 2)
 
 
 def compute_analysis_budget(n: int) -> int:
-    """Simulations kept for the standard errors of n parameters.
+    """Compute the simulations reserved for the standard errors of n parameters.
 
-    They take two a parameter, beside jumps of the output ten more, and a look at what cannot be
-    told two more.
+    Each parameter takes two, ten more near jumps of the output, and two more for the test of
+    identifiability.
     """
     return 14 * n + 1
 
 
 def _compute_island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
-    """Simulations from which on an island begins no other generation.
+    """Compute the number of simulations after which an island starts no further generation.
 
-    Its share of `compute_search_budget`; of a tiny budget less, so that its last generation does
-    not take it beyond its share of what the standard errors leave.
+    It is the island's share of `compute_search_budget`. It is less for a tiny budget, so that the
+    last generation stays within the island's share of what the standard errors leave.
     """
     limit = algorithm.stop.evaluations
     if limit is None:
         return _UNLIMITED
     share = compute_search_budget(algorithm, n) * size // algorithm.population
-    left = (
+    available = (
         max(limit - compute_analysis_budget(n), algorithm.population) * size // algorithm.population
     )
-    return max(1, min(share, left - _count_generation_evaluations(n, size) + 1))
+    return max(1, min(share, available - _count_generation_evaluations(n, size) + 1))
 
 
 def _count_generation_evaluations(n: int, size: int) -> int:
-    """Simulations of one generation of an island at most."""
+    """Count the simulations of one generation of an island, at most."""
     return size + n + 1 + N_TRIALS
 
 
 def compute_start_budget(algorithm: GeneticAlgorithm, n: int) -> int:
-    """What the islands and the standard errors leave of the budget to the finding of starts.
+    """Compute the simulations that islands and standard errors leave for the search of starts.
 
-    It counts as the first island's work, which may be less than its share for that.
+    They count as work of the first island, whose own search may be shorter for it.
     """
     limit = algorithm.stop.evaluations
     if limit is None:
         return _UNLIMITED
     taken = 0
     for size in split_population(algorithm)[1:]:
-        rests = _compute_island_budget(algorithm, n, size)
-        taken += size if rests <= size else rests - 1 + _count_generation_evaluations(n, size)
+        island_budget = _compute_island_budget(algorithm, n, size)
+        taken += (
+            size
+            if island_budget <= size
+            else island_budget - 1 + _count_generation_evaluations(n, size)
+        )
     return max(0, limit - (2 * n + 1) - split_population(algorithm)[0] - taken)

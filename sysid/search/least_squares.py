@@ -1,11 +1,11 @@
-"""Bounded least squares on places in [0, 1], several damped steps tried in one batch.
+"""Bounded least squares on positions in [0, 1], with several damped steps tried in one batch.
 
-Levenberg-Marquardt with Marquardt's scaling [1]_; a place at a bound whose slope leads outwards is
-held there. Robust losses go by reweighting. The batches are what our kernels are made for: one
-gives the residuals of the steps for several dampings, one those for the Jacobian.
+The method is Levenberg–Marquardt with Marquardt's scaling [1]_. A parameter at a bound whose slope
+leads outwards is held there. Robust losses use iterative reweighting. Kernels evaluate batches: one
+for the steps of several dampings, one for the Jacobian.
 
-A search is compiled as a whole, but on long records cut into calls of a few steps, between which a
-cancel is heard. What it needs to go on lies in its arrays, so the cuts change no bit.
+The whole search is compiled. On long records it is divided into calls of a few steps, and between
+them it can be cancelled. Its state is in its arrays, so the division changes no bit.
 
 .. [1] D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters,
    SIAM J. Appl. Math. 11 (1963) 431.
@@ -31,21 +31,21 @@ from sysid.simulation.evaluator import Evaluator, predict_partially
 from sysid.simulation.scaling import from_unit
 
 _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
-"""Tried in one batch, times the present damping; 0 stands for the least one."""
+"""Factors of the present damping that one batch tries; 0 means the least damping."""
 N_TRIED = _DAMPINGS.size
-"""Simulations of a batch of steps; the Jacobian takes one for each parameter besides."""
+"""Simulations of a batch of steps; the Jacobian takes one more for each parameter."""
 _FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-11, 1e12
-_MOST_IDLE_STEPS = 2  # steps in a row that gain next to nothing
+_MOST_IDLE_STEPS = 2  # consecutive steps that gain almost nothing
 _STEPS_PER_CALL = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
 
 class _Progress(Protocol):
-    """How far a search has got. What reads as a statement is 0 or 1."""
+    """Progress of a search. Fields that read as statements are 0 or 1."""
 
-    loss: float  # at the place
+    loss: float  # at the present point
     damping: float
-    idle_steps: int  # in a row, that gained next to nothing
-    has_jacobian: int  # the slopes are of this place
+    idle_steps: int  # consecutive steps that gained almost nothing
+    has_jacobian: int  # the slopes are those of the present point
     evaluations: int
     has_ended: int
 
@@ -54,7 +54,7 @@ _PROGRESS = make_record_dtype(_Progress)
 
 
 class ScoredSamples(NamedTuple):
-    """A problem's scored samples: which of the M measured values, and the weight of each.
+    """The scored samples of a problem: their rows among the M measured values, and weights.
 
     Attributes
     ----------
@@ -62,8 +62,8 @@ class ScoredSamples(NamedTuple):
     rows : IntArray, shape (n,)
     weight : FloatArray, shape (n,)
     owed : FloatArray, shape (n,), or empty
-        What residuals owe to those before them (`sysid.residuals.whitening.Whitening`); empty:
-        they are taken as they are.
+        AR(1) coefficient of each sample (`sysid.residuals.whitening.Whitening`). Empty: the
+        residuals are not whitened.
     """
 
     evaluator: Evaluator
@@ -73,15 +73,15 @@ class ScoredSamples(NamedTuple):
 
 
 class _Descent(NamedTuple):
-    """A search between two compiled calls, which change it in place.
+    """State of a search between two compiled calls, which change it in place.
 
     Attributes
     ----------
     place : FloatArray, shape (D,)
     error : FloatArray, shape (n,)
-        Residuals there.
+        Residuals at the place.
     columns : FloatArray, shape (D, n)
-        Their slopes.
+        Slopes of the residuals.
     progress : _Progress
     """
 
@@ -93,21 +93,21 @@ class _Descent(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeastSquaresSolution:
-    """Where the search ended.
+    """Result of a search.
 
     Attributes
     ----------
     place : FloatArray
         (D,) in [0, 1].
     is_converged : bool
-        Whether the next step promises less than the tolerance; False after too many steps, or
-        too late.
+        Whether the next step promises less than the tolerance. False after too many steps, or
+        after the deadline.
     evaluations : int
         Simulations run.
     loss : float
-        Of the residuals at the place.
+        Loss of the residuals at the place.
     is_cut_short : bool
-        Whether it was too late to go on.
+        Whether the deadline ended the search.
     """
 
     place: FloatArray
@@ -127,20 +127,20 @@ def solve_least_squares(
     tolerance: float = 1e-10,
     is_late: Callable[[], bool] | None = None,
 ) -> LeastSquaresSolution:
-    """The local minimum that Levenberg-Marquardt finds from a place (D,).
+    """Search a local minimum by Levenberg–Marquardt from a place (D,) in [0, 1].
 
     Parameters
     ----------
     scale : float
-        Of the soft-l1 loss, Σ 2s²(√(1 + (e/s)²) - 1), in the residuals' unit; 0: Σe².
+        Scale of the soft-l1 loss, Σ 2s²(√(1 + (e/s)²) - 1), in the residuals' unit; 0: Σe².
     steps : int
-        Batches of steps at most.
+        Limit on the batches of steps.
     at_once : int
-        So many of them in one compiled call.
+        Batches in one compiled call.
     tolerance : float
-        Of the loss: the part that a step must promise to be worth taking.
+        Least relative gain of the loss that a step must promise.
     is_late : callable or None
-        Asked after each call: whether to leave it at that.
+        Called after each compiled call; True ends the search.
     """
     progress: Any = np.zeros((), _PROGRESS).view(np.recarray)
     size, is_cut_short = scored.rows.size, False
@@ -148,8 +148,8 @@ def solve_least_squares(
     while steps > 0 and not progress.has_ended and not is_cut_short:
         _run_steps(scored, descent, scale, min(steps, at_once), tolerance)
         steps -= at_once
-        goes_on = steps > 0 and not progress.has_ended
-        is_cut_short = goes_on and is_late is not None and is_late()
+        continues = steps > 0 and not progress.has_ended
+        is_cut_short = continues and is_late is not None and is_late()
     return LeastSquaresSolution(
         descent.place,
         bool(progress.has_ended),
@@ -160,7 +160,7 @@ def solve_least_squares(
 
 
 def steps_at_once(n_parameters: int, n_steps: int) -> int:
-    """Steps in one compiled call of about 0.1 s.
+    """Compute the steps of the search in one compiled call of about 0.1 s.
 
     A simulation takes `n_steps` steps of integration or recursion.
     """
@@ -171,7 +171,7 @@ def steps_at_once(n_parameters: int, n_steps: int) -> int:
 def _run_steps(
     scored: ScoredSamples, descent: _Descent, scale: float, steps: int, tolerance: float
 ) -> None:
-    """Go some steps on, in place."""
+    """Take some steps in place."""
     place, progress = descent.place, descent.progress
     if progress.evaluations == 0:
         descent.error[:] = compute_residuals(scored, place.reshape((1, place.size)))[0]
@@ -184,7 +184,7 @@ def _run_steps(
 
 @jit_compile
 def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance: float) -> None:
-    """One step, the best of those tried; or a larger damping where none gains."""
+    """Take the best of the proposed steps, or increase the damping if none gains."""
     place, progress = descent.place, descent.progress
     if not progress.has_jacobian:
         fill_jacobian(scored, place, descent.error, descent.columns)
@@ -200,7 +200,7 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
     best, value = _find_best(errors, progress.loss, scale)
     if best < 0:
         progress.damping *= 1e3
-        progress.has_ended = progress.damping > _MOST_DAMPING  # rounding is all that is left
+        progress.has_ended = progress.damping > _MOST_DAMPING  # the rest is rounding
         return
     gained = (progress.loss - value) / progress.loss
     place[:], descent.error[:] = places[best], errors[best]
@@ -213,7 +213,7 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
 
 @jit_compile
 def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, float]:
-    """Which residuals (P, n) have the least loss below `value`, -1 if none has, and that loss."""
+    """Find the residuals (P, n) of least loss below `value` (-1: none), and that loss."""
     best = -1
     for p in range(errors.shape[0]):
         total = _sum_loss(errors[p], scale)
@@ -224,7 +224,7 @@ def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, flo
 
 @jit_compile
 def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
-    """Weighted residuals (P, n) of the scored values at places (P, D)."""
+    """Compute the weighted residuals (P, n) of the scored values at places (P, D)."""
     evaluator = scored.evaluator
     predicted = predict_partially(evaluator, from_unit(evaluator, places), 1.0)
     errors = np.empty((places.shape[0], scored.rows.size))
@@ -237,13 +237,15 @@ def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
 
 
 @jit_compile
-def _whiten(owed: FloatArray, errors: FloatArray) -> None:
-    """Take out of residuals (P, n), in place, what they owe to those before them."""
-    for i in range(owed.size - 1, 0, -1):
-        if owed[i] != 0.0:
-            left = np.sqrt(1.0 - owed[i] * owed[i])
+def _whiten(ar1_coefficient: FloatArray, errors: FloatArray) -> None:
+    """Whiten residuals (P, n) in place by the AR(1) coefficient of each sample."""
+    for i in range(ar1_coefficient.size - 1, 0, -1):
+        if ar1_coefficient[i] != 0.0:
+            innovation_deviation = np.sqrt(1.0 - ar1_coefficient[i] * ar1_coefficient[i])
             for p in range(errors.shape[0]):
-                errors[p, i] = (errors[p, i] - owed[i] * errors[p, i - 1]) / left
+                errors[p, i] = (
+                    errors[p, i] - ar1_coefficient[i] * errors[p, i - 1]
+                ) / innovation_deviation
 
 
 @jit_compile
@@ -252,7 +254,7 @@ def fill_jacobian(
 ) -> None:
     """Write the slopes (D, n) of the residuals (n,) at a place (D,); 0 where a neighbour diverges.
 
-    By forward differences, one batch of D simulations.
+    Forward differences: one batch of D simulations.
     """
     places, steps = step_aside(place, FINE_DIFFERENCE)
     errors = compute_residuals(scored, places[1:])
@@ -264,7 +266,7 @@ def fill_jacobian(
 
 @jit_compile
 def _sum_loss(error: FloatArray, scale: float) -> float:
-    """The loss of residuals (n,); ``inf`` where one is not finite."""
+    """Sum the loss of residuals (n,); ``inf`` if it is not finite."""
     if scale == 0.0:
         total = compute_inner_product(error, error, error.size)
     else:
@@ -278,7 +280,7 @@ def _sum_loss(error: FloatArray, scale: float) -> float:
 def _propose_places(
     descent: _Descent, damping: FloatArray, scale: float
 ) -> tuple[FloatArray, float]:
-    """Places (P, D) after the step of each damping (P,), and the largest gain that one promises."""
+    """Propose places (P, D) for dampings (P,); return them and the largest promised gain."""
     place, promised = descent.place, 0.0
     matrix, gradient = form_normal_equations(descent.error, descent.columns, scale)
     places = np.empty((damping.size, place.size))

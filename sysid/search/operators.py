@@ -1,15 +1,13 @@
-"""Operators of the genetic algorithm on chromosomes: rank, cross, mutate (Figure 4).
+"""Genetic operators on chromosomes (rank, cross, mutate; Figure 4), and their random numbers.
 
-The code of an individual: one unsigned word per free parameter (Eq. 8, 9).
+A chromosome has one unsigned word for each free parameter (Eq. 8, 9). Eq. 9 reads
+θ = lower + (upper − lower)·int/(2^bits − 1). On a logarithmic scale the same rule holds for ln θ.
+The *place* of a parameter is int/(2^bits − 1), a number in [0, 1].
 
-Reading of Eq. 9: θ = lower + (upper − lower)·int/(2^bits − 1); on a logarithmic scale the same
-rule holds for ln θ. The *place* of a parameter is int/(2^bits − 1), a number in [0, 1].
-
-Random numbers as a pure function of where they are used: counter-based, nothing is stored.
-
-The generator is Philox4x32-10 (Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*,
-SC 2011). Its key is the run's seed, its counter (use, island, generation, draw). So a loop that
-is cut anywhere, or runs on another machine, draws the same numbers, and no two uses share any.
+Random numbers are a pure function of where they are used; no state is stored. The generator is
+Philox4x32-10 (Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011). Its key is
+the run's seed, and its counter is (use, island, generation, draw). So an interrupted loop, or
+another machine, draws the same numbers. No two uses share any.
 """
 
 from typing import Any, TypeAlias
@@ -20,9 +18,9 @@ from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
 
 RandomWords: TypeAlias = tuple[Any, Any, Any, Any]
-"""Four independent words of 32 bits, as whole numbers."""
+"""Four independent words of 32 bits, as integers."""
 
-# Uses of random numbers: the first word of the counter.
+# Uses of random numbers, one word of the counter.
 USE_INITIAL, USE_STRATA, USE_CHILDREN, USE_LOCAL_SEARCH, USE_RESTART, USE_WARM_START = (
     1,
     2,
@@ -40,7 +38,7 @@ _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 
 @jit_compile
 def draw_words(seed: int, use: int, island: int, generation: int, draw: int) -> RandomWords:
-    """Four words of 32 bits that belong to this place of this run."""
+    """Draw the four words of 32 bits that belong to a seed and a counter."""
     k0, k1 = np.uint64(seed) & _MASK, np.uint64(seed) >> _HALF
     c0, c1 = np.uint64(draw) & _MASK, np.uint64(generation) & _MASK
     c2, c3 = np.uint64(island) & _MASK, np.uint64(use) & _MASK
@@ -53,19 +51,19 @@ def draw_words(seed: int, use: int, island: int, generation: int, draw: int) -> 
 
 @jit_compile
 def to_uniform(word: int) -> float:
-    """A drawn word as a number in (0, 1)."""
+    """Convert a drawn word to a number in (0, 1)."""
     return (word + 0.5) / 4294967296.0
 
 
 @jit_compile
 def to_integer(word: int, n: int) -> int:
-    """A drawn word as a whole number 0 … n − 1 (n is far below 2³², so the bias is nil)."""
+    """Convert a drawn word to an integer 0 … n − 1; n is far below 2³², so without bias."""
     return (word * n) >> 32
 
 
 @jit_compile
 def to_normal(word: RandomWords) -> float:
-    """A normal number of standard deviation 1 from the first two of four drawn words."""
+    """Compute a standard normal number from the first two of four drawn words."""
     return float(
         np.sqrt(-2.0 * np.log(to_uniform(word[0]))) * np.cos(2.0 * np.pi * to_uniform(word[1]))
     )
@@ -73,7 +71,7 @@ def to_normal(word: RandomWords) -> float:
 
 @jit_compile
 def encode(places: FloatArray, bits: int) -> WordArray:
-    """Nearest chromosomes of places in [0, 1]."""
+    """Encode places in [0, 1] as the nearest chromosomes."""
     largest = float((1 << bits) - 1)
     words = np.empty(places.shape, np.uint32)
     for p in range(places.shape[0]):
@@ -84,7 +82,7 @@ def encode(places: FloatArray, bits: int) -> WordArray:
 
 @jit_compile
 def decode(words: WordArray, bits: int) -> FloatArray:
-    """Places of chromosomes; the inverse of `encode`."""
+    """Decode chromosomes to places in [0, 1]; the inverse of `encode`."""
     largest = float((1 << bits) - 1)
     places = np.empty(words.shape)
     for p in range(words.shape[0]):
@@ -95,33 +93,33 @@ def decode(words: WordArray, bits: int) -> FloatArray:
 
 @jit_compile
 def sort_population(words: WordArray, fitness: FloatArray) -> None:
-    """Sort a population in place, fittest first; equals keep their order.
+    """Sort a population in place, fittest first; equal ones keep their order.
 
-    By insertion: populations are small, and after a generation half of them is in order.
+    Insertion sort: populations are small, and half of them is in order after a generation.
     """
     n = words.shape[1]
-    held = np.empty(n, np.uint32)
+    moved = np.empty(n, np.uint32)
     for p in range(1, fitness.size):
-        value, place = fitness[p], p
+        value, index = fitness[p], p
         if fitness[p - 1] <= value:
             continue
         for d in range(n):
-            held[d] = words[p, d]
-        while place > 0 and fitness[place - 1] > value:
-            fitness[place] = fitness[place - 1]
+            moved[d] = words[p, d]
+        while index > 0 and fitness[index - 1] > value:
+            fitness[index] = fitness[index - 1]
             for d in range(n):
-                words[place, d] = words[place - 1, d]
-            place -= 1
-        fitness[place] = value
+                words[index, d] = words[index - 1, d]
+            index -= 1
+        fitness[index] = value
         for d in range(n):
-            words[place, d] = held[d]
+            words[index, d] = moved[d]
 
 
 @jit_compile
 def cross_over(child: WordArray, first: WordArray, second: WordArray, cut: int, bits: int) -> None:
-    """One-point crossover of the whole bit string: `cut` bits of `first`, the rest of `second`.
+    """Cross over the bit strings at one point: `cut` bits of `first`, the rest of `second`.
 
-    The string is the words one after the other, each from its highest bit.
+    The bit string consists of the words in order, each from its highest bit.
     """
     for d in range(child.size):
         taken = min(max(cut - d * bits, 0), bits)
@@ -131,13 +129,13 @@ def cross_over(child: WordArray, first: WordArray, second: WordArray, cut: int, 
 
 @jit_compile
 def flip_bit(child: WordArray, position: int, bits: int) -> None:
-    """Mutation: one bit of the string changes."""
+    """Mutate one bit of the string."""
     child[position // bits] ^= np.uint32(1 << (bits - 1 - position % bits))
 
 
 @jit_compile
 def get_mutation_rate(starts: IntArray, rates: FloatArray, generation: int) -> float:
-    """Mutation rate at a generation: that of the last entry that has begun."""
+    """Get the mutation rate at a generation from the schedule."""
     rate = float(rates[0])
     for i in range(starts.size):
         if starts[i] <= generation:
@@ -147,17 +145,17 @@ def get_mutation_rate(starts: IntArray, rates: FloatArray, generation: int) -> f
 
 @jit_compile
 def reflect_at_bounds(place: float) -> float:
-    """A place of at most one range outside, mirrored at the bound it has passed."""
+    """Reflect a place, at most one range outside, at the bound that it has passed."""
     inside = abs(place)
     return inside if inside <= 1.0 else max(2.0 - inside, 0.0)
 
 
 @jit_compile
 def mutate_by_step(place: float, size: int, sign: int, bits: int) -> float:
-    """Scale-free mutation: a step whose size is uniform in its logarithm, reflected at a bound.
+    """Mutate by a scale-free step: its size is log-uniform, and it is reflected at a bound.
 
-    A flipped bit also changes a parameter by a power of two, but of the code, so that some
-    neighbours are far apart (Hamming cliffs); a step on the axis has none.
+    A flipped bit also changes the code by a power of two, but some neighbouring values differ in
+    many bits (Hamming cliffs). A step on the axis has no such cliffs.
     """
     step = float(2.0 ** (-to_uniform(size) * bits))
     return reflect_at_bounds(place + (step if sign & 1 else -step))
@@ -165,7 +163,7 @@ def mutate_by_step(place: float, size: int, sign: int, bits: int) -> float:
 
 @jit_compile
 def draw_pair(a: int, b: int, n: int) -> tuple[int, int]:
-    """Two different numbers below n (n ≥ 2) from two drawn words."""
+    """Draw two different numbers below n (n ≥ 2) from two words."""
     first = to_integer(a, n)
     second = to_integer(b, n - 1)
     return first, second + (1 if second >= first else 0)

@@ -1,7 +1,7 @@
-"""The sequence search as printed in the paper (Eq. 11, 12): fixed steps around the champion.
+"""Sequence search as printed in the paper (Eq. 11, 12): fixed steps around the champion.
 
 Every proposal moves a subset of the parameters by ±β. A generation evaluates one population of
-proposals, keeps the best, and the search goes on while it gains.
+proposals and keeps the best. The search continues while it gains.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ _LEAST_STEP_SIZE = 0.01  # of the range: a relative step can leave zero
 
 @jit_compile
 def _draw_signs(plan: IslandPlan, generation: int, proposal: int, signs: IntArray) -> None:
-    """Which parameters move, and which way: each stays, rises or falls, and one moves at least."""
+    """Draw for each parameter whether it stays, rises or falls; at least one moves."""
     moves = 0
     for d in range(signs.size):
         word = draw_words(
@@ -41,7 +41,7 @@ def _draw_signs(plan: IslandPlan, generation: int, proposal: int, signs: IntArra
 def _propose_neighbours(
     evaluator: Evaluator, plan: IslandPlan, champion: FloatArray, n: int, generation: int
 ) -> FloatArray:
-    """Physical values of `n` neighbours of the champion."""
+    """Propose physical values of `n` neighbours of the champion."""
     theta = np.empty((n, champion.size))
     signs = np.zeros(champion.size, np.int64)
     for p in range(n):
@@ -55,7 +55,7 @@ def _propose_neighbours(
 
 @jit_compile
 def run_fixed_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
-    """One generation of the fixed sequence search; two without a gain end the phase."""
+    """Run one generation of the fixed sequence search; two without gain end the phase."""
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     champion = from_unit(evaluator, decode(chromosomes[:1], plan.bits))[0]
     theta = _propose_neighbours(evaluator, plan, champion, fitness.size, search.generation)

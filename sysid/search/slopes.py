@@ -1,6 +1,6 @@
-"""Slopes of a part of a record: what a search takes for its next Levenberg–Marquardt step.
+"""Sensitivities over a part of a record, for the next Levenberg–Marquardt step of a search.
 
-The sensitivities come from forward differences, all columns in one call of the kernel.
+They are forward differences, with all columns from one call of the kernel.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ from sysid.simulation.scaling import from_unit
 def evaluate_partial_fitness(
     evaluator: Evaluator, plan: IslandPlan, predicted: FloatArray, horizon: float
 ) -> FloatArray:
-    """Fitness of each column of predictions (M, P) by the samples up to `horizon` (1: all)."""
+    """Compute the fitness of each column of predictions (M, P) up to `horizon` (1: all)."""
     totals, count = np.zeros(predicted.shape[1]), 0
     for m in range(predicted.shape[0]):
         weight, measured = evaluator.weight[m], evaluator.measured[m]
@@ -40,11 +40,11 @@ def evaluate_partial_fitness(
 
 @jit_compile
 def choose_difference(plan: IslandPlan, search: SearchRecord) -> float:
-    """Distance (of the range) over which the next slopes are taken.
+    """Choose the distance, as a share of the range, over which the next slopes are taken.
 
-    The first searches take derivatives, the others slopes over a distance that each step draws
-    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
-    next ripple, and no ripple stops them all.
+    The first searches use derivatives. Later ones use slopes over a random distance, drawn for each
+    step. Where switching (dry friction) makes the fitness rough, such slopes look past the next
+    ripple, and no ripple stops all of them.
     """
     if search.wide_differences == 0:
         return FINE_DIFFERENCE
@@ -56,7 +56,7 @@ def choose_difference(plan: IslandPlan, search: SearchRecord) -> float:
 def build_normal_equations(
     evaluator: Evaluator, plan: IslandPlan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
+    """Compute JᵀJ, Jᵀe and the fitness at a point up to `horizon`, in D + 1 simulations."""
     n, (places, steps) = point.size, step_aside(point, difference)
     predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
     scored = np.flatnonzero((evaluator.weight != 0.0) & (plan.progress <= horizon))

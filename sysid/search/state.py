@@ -1,4 +1,4 @@
-"""What compiled generations read and change: the plan of an island and its arrays."""
+"""Plan and state of an island, as compiled generations read and change them."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
@@ -9,9 +9,9 @@ SearchPhase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
 
 class Improvement(NamedTuple):
-    """A better champion of one island: the RMS history is kept as these only, without loss.
+    """A better champion of one island; the RMS history consists of these, without loss.
 
-    `rms` is the fitness: J of Eq. 10, with soft-l1 √(robust loss / n) in its stead.
+    `rms` is the fitness: J of Eq. 10, or √(robust loss / n) with soft-l1.
     """
 
     generation: int
@@ -32,9 +32,9 @@ class Migrant(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class IslandSummary:
-    """What one island found, before and after refinement (for the waterfall).
+    """Champion of one island before and after refinement (for the waterfall plot).
 
-    The two RMS are fitnesses: J of Eq. 10, with soft-l1 √(robust loss / n) in its stead.
+    The two RMS are fitnesses: J of Eq. 10, or √(robust loss / n) with soft-l1.
     """
 
     champion_rms: float
@@ -44,35 +44,35 @@ class IslandSummary:
 
 
 METHOD_SIMPLE, METHOD_PAPER, METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE = 0, 1, 2, 3
-"""Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
+"""Methods: simple GA, GA with fixed sequence, improved with adaptive or with fixed sequence."""
 
 
 class SearchRecord(Protocol):
-    """How far the search of an island has got. What reads as a statement is 0 or 1."""
+    """State of the search of an island. Fields that read as statements are 0 or 1."""
 
     generation: int
     evaluations: int
     stagnation: int  # generations since the last better champion
     in_sequence_search: int
-    step_count: int  # of this sequence search, or of the generations since the last
-    failed_steps: int  # one after the other
-    local_searches: int  # begun so far
-    champion_converged: int  # a local search of the champion has come to its end
+    step_count: int  # of this sequence search, or generations since the last one
+    failed_steps: int  # in succession
+    local_searches: int  # started so far
+    champion_converged: int  # a local search of the champion has ended
     probe_count: int
-    from_random_start: int  # this local search
-    random_starts: int  # local searches from random places that have ended
-    confirmed_starts: int  # those of them that led to the champion
-    hop_kind: int  # 0: this local search is none
-    hop_count: int  # hops that have ended
-    returned_hops: int  # those of them that led back to the champion
-    champion_discontinuities: int  # lines beside this champion on which the fitness jumps
+    from_random_start: int  # this local search began at a random point
+    random_starts: int  # ended local searches from random points
+    confirmed_starts: int  # of these, those that led to the champion
+    hop_kind: int  # 0: this local search is no hop
+    hop_count: int  # ended hops
+    returned_hops: int  # of these, those that led back to the champion
+    champion_discontinuities: int  # lines through this champion on which the fitness jumps
     is_warm_start: int
-    fitness_discontinuities: int  # the same beside any champion, and what neighbours have met
-    wide_differences: int  # slopes are taken over distances that are drawn
+    fitness_discontinuities: int  # the same for any champion, and for those of neighbours
+    wide_differences: int  # slopes are taken over random distances
     damping: float
-    horizon: float  # part of the record that counts
+    horizon: float  # part of the record that is fitted
     horizon_growth: float  # factor from one part to the next
-    replaced_fitness: float  # of the individual whose place a local search takes
+    replaced_fitness: float  # of the individual that a local search replaces
     reached_fitness: float  # by this local search, over the whole record
 
 
@@ -92,10 +92,10 @@ class IslandArrays(NamedTuple):
     chromosomes : WordArray, shape (P, D)
         Fittest first.
     fitness : FloatArray, shape (P,)
-        Ascending; ``nan`` is not evaluated yet.
+        Ascending; ``nan``: not evaluated yet.
     search : SearchRecord
     point : FloatArray, shape (D,)
-        Where the local search stands, in [0, 1].
+        Present point of the local search, in [0, 1].
     """
 
     chromosomes: WordArray
@@ -113,30 +113,30 @@ SAME_OPTIMUM = 1e-4  # relative: champions this near in fitness are one optimum
 
 
 class IslandPlan(NamedTuple):
-    """How one island searches, as compiled code reads it.
+    """Search plan of one island, as compiled code reads it.
 
     Attributes
     ----------
     seed, island : int
-        What its random numbers derive from.
-    first, total : int
-        Number of its first individual among the `total` of the archipelago.
+        Random numbers derive from these.
+    first_individual, population : int
+        Number of its first individual among the `population` of the archipelago.
     method : int
         One of `METHOD_SIMPLE`, `METHOD_PAPER`, `METHOD_IMPROVED`, `METHOD_IMPROVED_FIXED_SEQUENCE`.
     bits, survivors, stagnation : int
-    relative : int
+    is_relative : int
         1: `beta` is relative to the value (Eq. 12); 0: to the range.
-    evaluations : int
-        After that many simulations the island rests.
+    most_evaluations : int
+        The island rests after so many simulations.
     beta : float
-    rms : float
-        At that fitness the island rests; negative: never.
+    target_rms : float
+        The island rests at this fitness; negative: never.
     loss_scale : float
         Scale of the soft-l1 loss; 0: squares.
-    starts, rates : arrays
+    mutation_starts, mutation_rates : arrays
         Mutation schedule.
     progress : FloatArray, shape (M,)
-        How far in its record (0 … 1) each measured value lies.
+        Position of each measured value in its record (0 … 1).
     """
 
     seed: int
