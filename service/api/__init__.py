@@ -1,1 +1,1 @@
-"""FastAPI: one thin file per resource."""
+"""FastAPI routes: one thin file per resource."""

@@ -1,4 +1,4 @@
-"""The web application: parts opened and closed, routes joined, errors made problem documents."""
+"""Build the web application: lifespan, routes, middleware and error handlers."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -26,17 +26,17 @@ from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
 
 DESCRIPTION = (
-    "Identification of nonlinear time-lag systems. Send a recording, name a model or write its "
-    "equations, submit a job, read the estimates with their standard errors. Errors are RFC 9457 "
-    "problem documents."
+    "Identification of nonlinear time-lag systems. Upload a recording, name a model or write its "
+    "equations, and submit a job. Then read the estimates with their standard errors. Errors are "
+    "RFC 9457 problem documents."
 )
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """The application with these settings; by default those of the environment.
+    """Build the application with these settings; the default is those of the environment.
 
-    Its lifespan opens database and store and brings the tables to this version. `app.state.parts`
-    holds them while it runs.
+    Its lifespan opens the database and the store and upgrades the tables to this version.
+    `app.state.parts` holds both while the application runs.
     """
     chosen = settings or Settings()
     app = FastAPI(
@@ -68,7 +68,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def open_parts(settings: Settings) -> Parts:
-    """Open database and object store, making the data folder and the tables where needed.
+    """Open the database and the object store; create the data folder and the tables if needed.
 
     Raises
     ------

@@ -1,6 +1,7 @@
-"""Objects over HTTP: ranges, ETags and cross-origin reading, as MCAP viewers ask for them.
+"""Send and receive recordings over HTTP.
 
-Receiving a recording: the body goes to a temporary file, hashed and counted on the way.
+Objects are sent with ranges, ETags and cross-origin headers, which MCAP viewers need. An uploaded
+body goes to a temporary file; its bytes are hashed and counted as they arrive.
 """
 
 import hashlib
@@ -39,7 +40,7 @@ _RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class ByteRange:
-    """Bytes `start` to `stop`, the last one not included."""
+    """Bytes from `start` up to but excluding `stop`."""
 
     start: int
     stop: int
@@ -52,12 +53,12 @@ def content_response(
     file_name: str,
     part_of: ByteRange | None = None,
 ) -> Response:
-    """An object, or the part of it that was asked for.
+    """Answer with an object, or with the requested range of it.
 
     Parameters
     ----------
     part_of : ByteRange, optional
-        Where the file is in the object; the whole object is the file if this is not given.
+        Where the file lies in the object. By default the file is the whole object.
 
     Raises
     ------
@@ -75,10 +76,12 @@ def content_response(
         "Content-Disposition": f'attachment; filename="{file_name}"',
     }
     if "if-match" in request.headers and not _matches_etag(request.headers["if-match"], etag):
-        raise StaleVersion(f"the content is {etag}; asked for {request.headers['if-match']}")
+        raise StaleVersion(
+            f"the content has ETag {etag}; If-Match asks for {request.headers['if-match']}"
+        )
     if _matches_etag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    whole = ByteRange(0, store.get_size(sha256))  # asked in any case: it may be missing
+    whole = ByteRange(0, store.get_size(sha256))  # in any case: raises if the object is missing
     file = whole if part_of is None else part_of
     size = file.stop - file.start
     part = _parse_range(request, size, etag)
@@ -93,7 +96,7 @@ def content_response(
 
 
 def preflight_response() -> Response:
-    """Answer of a browser's question whether a page of another origin may ask for ranges."""
+    """Answer a CORS preflight: pages of other origins may request ranges."""
     headers = {
         **CROSS_ORIGIN,
         "Access-Control-Allow-Methods": "GET, HEAD",
@@ -104,7 +107,7 @@ def preflight_response() -> Response:
 
 
 def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
-    """The range asked for; None for the whole, also where the client holds another version."""
+    """Parse the Range header; None for the whole file, also if the client's version is stale."""
     text = request.headers.get("range")
     if text is None or request.headers.get("if-range", etag) != etag:
         return None
@@ -134,7 +137,7 @@ PIECE_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A received file: where it lies, what it is, and the hash of its bytes."""
+    """A received file: its path, format, and the hash of its bytes."""
 
     path: Path
     file_format: FileFormat
@@ -144,14 +147,14 @@ class Upload:
 
 @asynccontextmanager
 async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[Upload]:
-    """The body as a file that is there for the length of the block.
+    """Receive the body as a file that exists until the block ends.
 
     Raises
     ------
     TooLarge
-        As soon as more bytes are announced or have come than are allowed.
+        As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
-        If it is neither CSV nor MCAP.
+        If the body is neither CSV nor MCAP.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != MULTIPART:
@@ -160,7 +163,7 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
     if announced.isdecimal():
         check_upload_size(int(announced), settings)
     elif kind == MULTIPART:
-        raise TooLarge("a form needs a Content-Length header, to be known as small enough")
+        raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
     with TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
         path = Path(folder) / "upload"
         if kind == MULTIPART:
@@ -199,7 +202,7 @@ async def _save_body(pieces: AsyncIterator[bytes], path: Path, settings: Setting
 
 
 def _detect_format(kind: str, file_name: str | None) -> FileFormat:
-    # Browsers do not know MCAP and call CSV many things: a file's suffix says it better.
+    # Browsers send many types for CSV and none for MCAP, so the file's suffix comes first.
     suffix = Path(file_name or "").suffix.lower()
     if suffix == ".mcap" or kind in MCAP_TYPES:
         return "mcap"

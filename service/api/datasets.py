@@ -38,9 +38,12 @@ UPLOAD_BODY: dict[str, Any] = {
 }
 Name = Annotated[str | None, Query(max_length=200)]
 Segments = Annotated[
-    str | None, Query(description="CSV columns of labels, separated by commas, that part the rows")
+    str | None,
+    Query(description="CSV label columns, separated by commas; each combination is a segment"),
 ]
-SampleTime = Annotated[float | None, Query(gt=0, description="s, for a CSV without a time column")]
+SampleTime = Annotated[
+    float | None, Query(gt=0, description="sampling period in s, for a CSV without a time column")
+]
 
 
 @router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY)
@@ -52,7 +55,7 @@ async def add_dataset(
     segments: Segments = None,
     sample_time: SampleTime = None,
 ) -> DatasetOut:
-    """Store a recording, CSV or MCAP. The same bytes again give the same dataset (200)."""
+    """Store a recording, CSV or MCAP. The same bytes again return the same dataset (200)."""
     async with receive_upload(request, parts.settings) as upload:
         stored = await run_in_threadpool(
             datasets.add_upload,
@@ -70,7 +73,7 @@ async def add_dataset(
 
 @router.post("/datasets:simulate", status_code=201)
 def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
-    """Make a dataset from a model, its true parameters, inputs and noise."""
+    """Simulate a dataset from a model, its true parameters, inputs and noise."""
     return _dataset_response(
         simulations.simulate_dataset(parts.database, parts.store, body), response, body.name
     )
@@ -80,7 +83,7 @@ def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> D
 def derive_dataset(
     dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
 ) -> DatasetOut:
-    """Make a dataset from another, by its id or name: noise, resample, trim, select and so on."""
+    """Derive a dataset from another, by its id or name: add noise, resample, trim, select etc."""
     stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
     return _dataset_response(stored, response, body.name)
 
@@ -89,13 +92,13 @@ def derive_dataset(
 def list_datasets(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50
 ) -> Page[DatasetOut]:
-    """Datasets, latest first."""
+    """List datasets, latest first."""
     return datasets.list_datasets(session, cursor, limit)
 
 
 @router.get("/datasets/{dataset_id}")
 def read_dataset(dataset_id: str, session: ReadSession) -> DatasetOut:
-    """One dataset: channels, sampling, segments, warnings."""
+    """Read one dataset: channels, sampling, segments, warnings."""
     return datasets.to_out(DatasetRepository(session).get(dataset_id))
 
 
@@ -103,13 +106,13 @@ def read_dataset(dataset_id: str, session: ReadSession) -> DatasetOut:
 def read_signals(
     dataset_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> SignalsOut:
-    """The samples, reduced so that extremes stay visible."""
+    """Read the samples, reduced so that extremes stay visible."""
     return datasets.read_signals(session, parts.store, dataset_id, max_points)
 
 
 @router.get("/datasets/{dataset_id}/lineage")
 def read_lineage(dataset_id: str, session: ReadSession) -> LineageOut:
-    """What it was made from, and what was made from it."""
+    """Read the lineage: the datasets it was derived from, and those derived from it."""
     return lineage.read_lineage(session, dataset_id)
 
 
@@ -118,20 +121,20 @@ def read_lineage(dataset_id: str, session: ReadSession) -> LineageOut:
 def read_content(
     dataset_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
-    """The recording as MCAP; ranges and ETags are honoured."""
+    """Download the recording as MCAP; ranges and ETags are honoured."""
     row = DatasetRepository(session).get(dataset_id)
     return content_response(request, parts.store, row.sha256, f"{row.id}.mcap")
 
 
 @router.options("/datasets/{dataset_id}/content", include_in_schema=False)
 def allow_cross_origin(dataset_id: str) -> Response:
-    """Pages of other origins may read content."""
+    """Allow pages of other origins to read content."""
     return preflight_response()
 
 
 @router.get("/datasets/{dataset_id}/content.csv", response_class=StreamingResponse)
 def read_content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> StreamingResponse:
-    """The recording as CSV."""
+    """Download the recording as CSV."""
     row = DatasetRepository(session).get(dataset_id)
     rows: Iterator[str] = generate_csv(load_recording(parts.store, row.sha256))
     headers = {**CROSS_ORIGIN, "Content-Disposition": f'attachment; filename="{row.id}.csv"'}

@@ -1,4 +1,4 @@
-"""What routes ask for: the parts of the service, sessions, and page cursors."""
+"""Dependencies of routes: the parts of the service, sessions, and page cursors."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from service.storage.sessions import Database
 class Parts:
     """The service's parts, one of each per process.
 
-    `stopping` is set as soon as the process is asked to end: open event streams then close.
+    `stopping` is set as soon as the process is asked to end. Open event streams then close.
     """
 
     settings: Settings
@@ -27,7 +27,7 @@ class Parts:
 
 
 def get_parts(request: Request) -> Parts:
-    """The parts of this process."""
+    """Return the parts of this process."""
     found: Parts = request.app.state.parts
     return found
 
@@ -41,15 +41,15 @@ def _open_read_session(found: PartsDep) -> Iterator[Session]:
 
 
 def _open_write_session(found: PartsDep) -> Iterator[Session]:
-    """One session and one transaction per request: commit if the route returns, else roll back."""
+    """Open a session with one transaction: commit if the route returns, else roll back."""
     with found.database.write_session() as session:
         yield session
 
 
-# The scope makes the commit happen before the answer is sent: what a client is told is stored.
+# With this scope the commit happens before the answer is sent: a confirmed change is stored.
 ReadSession = Annotated[Session, Depends(_open_read_session, scope="function")]
 WriteSession = Annotated[Session, Depends(_open_write_session, scope="function")]
 
-Cursor = Annotated[str | None, Query(max_length=100, description="`next` of the page before")]
-Limit = Annotated[int, Query(ge=1, le=1000, description="items a page")]
-MaxPoints = Annotated[int, Query(ge=2, le=1_000_000, description="points a line, at most")]
+Cursor = Annotated[str | None, Query(max_length=100, description="`next` of the previous page")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="items per page")]
+MaxPoints = Annotated[int, Query(ge=2, le=1_000_000, description="most points per line")]

@@ -1,4 +1,4 @@
-"""Server-sent events of a job, read from the events table."""
+"""Stream the events of a job (server-sent events), read from the events table."""
 
 import json
 from collections.abc import AsyncIterator
@@ -27,11 +27,11 @@ NO_BUFFER = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 async def stream_events(
     job_id: str, parts: PartsDep, last_event_id: Annotated[str | None, Header()] = None
 ) -> Response:
-    """Events as they happen: state, progress, log, end. Goes on after `Last-Event-ID`."""
+    """Stream events as they happen: state, progress, log, end. Continues after `Last-Event-ID`."""
     last = _parse_event_id(last_event_id)
     batch, is_over = await run_in_threadpool(_read_events, parts, job_id, last)
     if is_over and not batch:
-        return Response(status_code=204)  # tells an EventSource not to come again
+        return Response(status_code=204)  # an EventSource then does not reconnect
     stream = _stream_events(parts, job_id, last)
     return StreamingResponse(stream, media_type="text/event-stream", headers=NO_BUFFER)
 
@@ -59,7 +59,7 @@ async def _stream_events(parts: Parts, job_id: str, last: int) -> AsyncIterator[
 
 
 def _read_events(parts: Parts, job_id: str, last: int) -> tuple[list[Event], bool]:
-    """Newer events, and whether the job has ended, as of one moment."""
+    """Read newer events, and whether the job has ended, in one transaction."""
     with parts.database.read_session() as session:
         state = JobRepository(session).get_state(job_id)
         return EventRepository(session).list_after(

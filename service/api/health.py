@@ -1,4 +1,4 @@
-"""Whether the service is well: for people, supervisors and Prometheus."""
+"""Routes for health checks and Prometheus metrics."""
 
 from collections.abc import Callable, Iterator, Mapping
 
@@ -16,30 +16,30 @@ from service.storage.errors import StorageError
 router = APIRouter(tags=["health"])
 
 PROBLEM_KINDS = {
-    "conflict": "The state of the job does not allow what was asked.",
-    "internal": "An unexpected error; the log of the server has it.",
-    "invalid": "The body or a query value cannot be used; `errors` lists every fault. "
-    "Faults of types come first; once all types are right, the answer lists all others.",
-    "invalid-upload": "The file cannot be used; the message says where and why.",
+    "conflict": "The current state of the job does not allow this request.",
+    "internal": "An unexpected error occurred. The server's log has the details.",
+    "invalid": "The body or a query value is invalid. `errors` lists every fault. "
+    "Type errors come first. Once all types are right, the answer lists the other faults.",
+    "invalid-upload": "The file cannot be read. The message says where and why.",
     "method-not-allowed": "The path exists, but not for this method.",
-    "not-found": "There is no such thing.",
+    "not-found": "The resource does not exist.",
     "range": "The byte range lies outside the content.",
-    "stale": "The thing has changed since it was read.",
+    "stale": "The resource has changed since it was read.",
     "too-large": "The body is larger than the stated limit.",
     "unavailable": "A part of the service is down.",
-    "unsupported-media-type": "The body is of a kind that is not read.",
+    "unsupported-media-type": "The content type of the body is not supported.",
 }
 
 
 @router.get("/healthz")
 def check_alive() -> dict[str, str]:
-    """The web process answers."""
+    """Confirm that the web process answers."""
     return {"status": "ok"}
 
 
 @router.get("/readyz")
 def check_ready(parts: PartsDep) -> dict[str, str]:
-    """Database at head, store writable, a dispatcher alive; 503 with what is not."""
+    """Check that the database is at head, the store writable, and a dispatcher alive; else 503."""
     checks = {"database": _check_database, "store": _check_store, "dispatcher": _check_dispatcher}
     failures = list(_collect_failures(parts, checks))
     if failures:
@@ -50,7 +50,7 @@ def check_ready(parts: PartsDep) -> dict[str, str]:
 
 @router.get("/metrics", response_class=PlainTextResponse)
 def read_metrics(session: ReadSession) -> str:
-    """Gauges in Prometheus' text format."""
+    """Read gauges in Prometheus' text format."""
     alive_now = len(DispatcherRepository(session).list_alive())
     lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
     for state, n in JobRepository(session).count_states().items():
@@ -65,8 +65,8 @@ def read_metrics(session: ReadSession) -> str:
 
 @router.get("/problems/{kind}", response_class=PlainTextResponse, include_in_schema=False)
 def explain_problem(kind: str) -> str:
-    """What a problem document's `type` means."""
-    return PROBLEM_KINDS.get(kind, "This server gives no problem of that type.")
+    """Explain the `type` of a problem document."""
+    return PROBLEM_KINDS.get(kind, "This server has no problem of that type.")
 
 
 def _collect_failures(
@@ -90,4 +90,6 @@ def _check_store(parts: Parts) -> None:
 def _check_dispatcher(parts: Parts) -> None:
     with parts.database.read_session() as session:
         if not DispatcherRepository(session).list_alive():
-            raise Unavailable("no dispatcher is alive; jobs are accepted, and wait for one")
+            raise Unavailable(
+                "no dispatcher is alive; jobs are accepted, but wait until one starts"
+            )

@@ -1,4 +1,4 @@
-"""A page as it is answered, with what a browser may load for it; also that of an error."""
+"""Answer with HTML pages, also for errors; a policy limits what the browser may load."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,9 +9,9 @@ from service.core.errors import FieldError
 from service.pages.render import render_template
 
 PROGRAM_PATHS = ("/v1/", "/static/", "/pages/", "/healthz", "/readyz", "/metrics", "/openapi.json")
-"""Addresses, or their beginnings, that programs read and scripts load."""
-# Scripts and data come from here only. Plotly styles its own elements, hence the inline styles;
-# it writes pictures for download through blob: and data: addresses.
+"""Paths, or their prefixes, that programs and scripts request."""
+# Scripts and data come from this server only. Plotly styles its own elements, hence the inline
+# styles. It writes pictures for download through blob: and data: addresses.
 PAGE_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -25,7 +25,7 @@ PAGE_HEADERS = {
 
 
 class HtmlPage(HTMLResponse):
-    """A page, with what a browser may load for it."""
+    """An HTML page with its content security policy."""
 
     def __init__(
         self, content: str, status: int = 200, headers: Mapping[str, str] | None = None
@@ -34,7 +34,7 @@ class HtmlPage(HTMLResponse):
 
 
 def wants_html(request: Request) -> bool:
-    """Whether a browser asked for a page: then an error is told on one."""
+    """Whether a browser requests a page; an error is then shown as a page."""
     accepted = request.headers.get("accept", "")
     is_page = request.method in ("GET", "HEAD") and not request.url.path.startswith(PROGRAM_PATHS)
     return is_page and "text/html" in accepted
@@ -43,7 +43,7 @@ def wants_html(request: Request) -> bool:
 def error_page(
     status: int, title: str, detail: str, errors: Sequence[FieldError], headers: Mapping[str, str]
 ) -> HtmlPage:
-    """An error as a page, in the words of the problem document."""
+    """Render an error as a page, in the words of the problem document."""
     lines = [str(one).removeprefix("?") for one in errors] or [detail]
     return HtmlPage(
         render_template("error.html", status=status, title=title, lines=lines), status, headers

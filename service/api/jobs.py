@@ -24,14 +24,14 @@ from service.trends.schemas import TrendOut
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 IdempotencyKeyHeader = Annotated[
-    str | None, Header(max_length=200, description="same key, same job")
+    str | None, Header(max_length=200, description="the same key returns the same job")
 ]
 StatesFilter = Annotated[
-    list[JobState] | None, Query(description="only jobs or runs in these states")
+    list[JobState] | None, Query(description="lists only jobs or runs in these states")
 ]
 CellFilter = Annotated[
     list[str] | None,
-    Query(description="`/noise/sigma=0.1` keeps the cells with that value; may be repeated"),
+    Query(description="`/noise/sigma=0.1` selects the cells with that value; may be repeated"),
 ]
 
 
@@ -42,10 +42,10 @@ def submit_job(
     response: Response,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
-    """Queue a job. Everything that can be wrong with it is told now.
+    """Queue a job. The answer reports every fault of the request.
 
-    Of a sweep of more than 2,000 runs the others are made while it runs; until then they count as
-    queued, and have no page and no identifier.
+    A sweep of more than 2,000 runs creates the further runs while it runs. Until then they count
+    as queued, and have no page and no identifier.
     """
     job = jobs.submit_job(parts.database, body, parts.settings, idempotency_key)
     return _set_location(job, response)
@@ -55,26 +55,26 @@ def submit_job(
 def list_jobs(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: StatesFilter = None
 ) -> Page[JobOut]:
-    """Jobs, latest first."""
+    """List jobs, latest first."""
     return jobs.list_jobs(session, cursor, limit, state or [])
 
 
 @router.get("/{job_id}")
 def read_job(job_id: str, session: ReadSession) -> JobOut:
-    """One job: state, progress, and the exact request."""
+    """Read one job: state, progress, and the exact request."""
     job = JobRepository(session).get(job_id)
     return jobs.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
 
 
 @router.post("/{job_id}:cancel")
 def cancel_job(job_id: str, session: WriteSession) -> JobOut:
-    """Cancel a job: at once if it is queued, within a moment if it runs."""
+    """Cancel a job: immediately if it is queued, within moments if it runs."""
     return jobs.to_job_out(JobRepository(session).cancel(job_id))
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
 def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
-    """Queue a failed or cancelled job again; it goes on from its last checkpoints."""
+    """Queue a failed or cancelled job again; it continues from its last checkpoints."""
     return _set_location(
         jobs.to_job_out(jobs.resume_job(session, job_id, parts.settings)), response
     )
@@ -88,7 +88,7 @@ def clone_job(job_id: str, parts: PartsDep, response: Response) -> JobOut:
 
 @router.get("/{job_id}/runs.csv", response_class=StreamingResponse)
 def export_runs_csv(job_id: str, parts: PartsDep) -> StreamingResponse:
-    """All runs of a job as CSV: one row each, with its cell, its estimates and their errors."""
+    """Export all runs of a job as CSV: a row per run, with cell, estimates and standard errors."""
     disposition = {"Content-Disposition": f'attachment; filename="{job_id}.csv"'}
     rows = runs_table.stream_table(parts.database, job_id)
     return StreamingResponse(rows, media_type="text/csv", headers=disposition)
@@ -106,7 +106,7 @@ def list_runs(
     order: RunOrder = "number",
     descending: bool = False,
 ) -> Page[RunOut]:
-    """Runs of a job that have been made; filter by axis values, labels or state."""
+    """List the runs of a job that exist already; filter by axis values, labels or state."""
     choice = runs.RunQuery(state or [], cell or [], label or [], order, descending)
     return runs.list_runs(session, job_id, cursor, limit, choice)
 
@@ -117,16 +117,18 @@ def read_summary(
     session: ReadSession,
     by: Annotated[
         list[str] | None,
-        Query(description="axis (`/noise/sigma`) or label; may be repeated; default: no seeds"),
+        Query(
+            description="axis (`/noise/sigma`) or label; may be repeated; default: all but seeds"
+        ),
     ] = None,
 ) -> SummaryOut:
-    """Quantiles, success rate and mean evaluations for each value of the chosen axes."""
+    """Summarise the runs for each value of the chosen axes: quantiles, success, evaluations."""
     return summaries.summarise_job(session, job_id, by)
 
 
 @router.get("/{job_id}/trend")
 def read_trend(job_id: str, session: ReadSession) -> TrendOut:
-    """Estimates over a label: the law, its band, predictions, outliers and drift."""
+    """Fit the estimates over a label: law, band, predictions, outliers and drift."""
     return trends.compute_trend(session, job_id)
 
 

@@ -1,6 +1,6 @@
-"""No request makes the server hold more of its body than it may; uploads have a limit of their own.
+"""Limit the size of request bodies; uploads have a separate limit.
 
-FastAPI reads a body as a whole before it looks at it, so the limit is set where it is received.
+FastAPI reads a whole body before it parses it, so the limit must apply while it is received.
 """
 
 from starlette.datastructures import Headers
@@ -9,20 +9,20 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.core.errors import TooLarge
 
 UPLOAD_ROUTE = ("POST", "/v1/datasets")
-"""Goes to a file as it comes (`service.api.content`)."""
+"""The upload goes to a file while it arrives (`service.api.content`)."""
 
 
 class BodyLimit:
     """Middleware that refuses a body of more than `limit` bytes.
 
-    One that is announced as longer is not read at all; another one no further than the limit.
+    A body that is announced as longer is not read at all. Any other body is read up to the limit.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self._app, self._limit = app, limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Hand the request on, its body watched."""
+        """Pass the request on and count the bytes of its body."""
         if scope["type"] != "http" or (scope["method"], scope["path"]) == UPLOAD_ROUTE:
             await self._app(scope, receive, send)
         else:
@@ -46,5 +46,6 @@ class BodyLimit:
     def _check_size(self, size: int, more: str) -> None:
         if size > self._limit:
             raise TooLarge(
-                f"the body has {size} bytes{more}; at most {self._limit} (LAGID_MAX_BODY_BYTES)"
+                f"the body has {size} bytes{more}; at most {self._limit} are allowed "
+                "(LAGID_MAX_BODY_BYTES)"
             )

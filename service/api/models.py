@@ -18,7 +18,7 @@ YAML_TYPES = ("application/yaml", "application/x-yaml", "text/yaml", "text/x-yam
 DOCUMENT_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "A model document: an object as JSON, or the same as YAML.",
+        "description": "A model document: an object in JSON or YAML.",
         "content": {
             "application/json": {"schema": {"type": "object"}},
             "application/yaml": {"schema": {"type": "string"}},
@@ -29,22 +29,22 @@ DOCUMENT_BODY: dict[str, Any] = {
 
 @router.get("/models")
 def list_models(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[ModelOut]:
-    """Built-in models, then own ones."""
+    """List models: built-in ones, then your own."""
     return models.list_models(session, cursor, limit)
 
 
 @router.get("/models/{name}")
 def read_model(name: str, session: ReadSession) -> ModelOut:
-    """One model with its document; ``name@version`` for an earlier version of an own one."""
+    """Read a model with its document; ``name@version`` is an earlier version of your own model."""
     return models.get_model(session, name)
 
 
 @router.post("/models", status_code=201, openapi_extra=DOCUMENT_BODY)
 async def add_model(request: Request, parts: PartsDep) -> ModelOut:
-    """Store an own model; a changed document becomes the next version of its name."""
+    """Store your own model; a changed document becomes the next version of its name."""
     document = await _read_document(request)
     if not isinstance(document, dict):
-        raise InvalidRequest.from_fault("", f"a model is an object; found {document!r:.60}")
+        raise InvalidRequest.from_fault("", f"a model must be an object; found {document!r:.60}")
 
     def store() -> ModelOut:
         with parts.database.write_session() as session:
@@ -55,7 +55,7 @@ async def add_model(request: Request, parts: PartsDep) -> ModelOut:
 
 @router.post("/models:check", openapi_extra=DOCUMENT_BODY)
 async def check_model(request: Request) -> CheckOut:
-    """Whether a model can be used; every error with its pointer, and its column in equations."""
+    """Check a model document; each error has its pointer, and in equations its column."""
     try:
         document = await _read_document(request)
     except InvalidRequest as error:
@@ -73,5 +73,5 @@ async def _read_document(request: Request) -> Any:
     async for piece in request.stream():
         text += piece
         if len(text) > MAX_DOCUMENT_BYTES:
-            raise TooLarge(f"a document has at most {MAX_DOCUMENT_BYTES} bytes")
+            raise TooLarge(f"the document has more than {MAX_DOCUMENT_BYTES} bytes")
     return parse_yaml(bytes(text)) if kind in YAML_TYPES else parse_json(bytes(text))

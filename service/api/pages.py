@@ -1,4 +1,4 @@
-"""Routes of the pages, of the figures that they show, and of the files that they load."""
+"""Routes of the pages, of their figures, and of the files that they load."""
 
 from typing import Annotated, Any
 
@@ -31,25 +31,25 @@ ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
 
 @router.get("/docs", **HIDDEN)
 def reference_page(request: Request) -> Response:
-    """The REST interface for people."""
+    """Show the documentation of the REST interface."""
     return HtmlPage(pages.reference_page(request.app.openapi()))
 
 
 @router.get("/", **HIDDEN)
 def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
-    """The list of jobs, and the form of a new identification."""
+    """Show the list of jobs, and the form of a new identification."""
     return HtmlPage(pages.jobs_page(session, state, cursor))
 
 
 @router.get("/new/noise-sweep", **HIDDEN)
 def noise_sweep_page(session: ReadSession) -> Response:
-    """The form of a noise sweep."""
+    """Show the form of a noise sweep."""
     return HtmlPage(recipe_pages.noise_sweep_page(session))
 
 
 @router.get("/new/reidentify", **HIDDEN)
 def reidentify_page(session: ReadSession) -> Response:
-    """The form of a batch re-identification."""
+    """Show the form of a batch re-identification."""
     return HtmlPage(recipe_pages.reidentify_page(session))
 
 
@@ -61,20 +61,20 @@ def job_page(
     cursor: Cursor = None,
     cell: CellFilter = None,
 ) -> Response:
-    """One job with its runs, or the grid of its cells and the runs of the chosen one."""
+    """Show a job with its runs, or the grid of its cells and the runs of the chosen cell."""
     url = str(request.base_url)
     return HtmlPage(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
 
 
 @router.get("/runs/{run_id}", **HIDDEN)
 def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
-    """The job of one run, with this run in full."""
+    """Show the job of a run, with this run in full."""
     return HtmlPage(pages.run_page(session, run_id, str(request.base_url)))
 
 
 @router.get("/runs/{run_id}/simulate", **HIDDEN)
 def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
-    """The model of a run in a closed loop, over a recording, or on a signal; or its form."""
+    """Show the form to simulate the model of a run; with a full query, the simulation."""
     query = dict(request.query_params)
     found = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
     if found.is_csv:
@@ -84,37 +84,37 @@ def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
 
 @router.get("/compare", **HIDDEN)
 def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
-    """Runs of several models on the same data side by side."""
+    """Compare runs of several models on the same data."""
     return HtmlPage(pages.compare_page(session, run))
 
 
 @router.get("/datasets", **HIDDEN)
 def datasets_page(session: ReadSession, cursor: Cursor = None) -> Response:
-    """The stored recordings."""
+    """List the stored recordings."""
     return HtmlPage(pages.datasets_page(session, cursor))
 
 
 @router.get("/datasets/{dataset_id}", **HIDDEN)
 def dataset_page(dataset_id: str, session: ReadSession) -> Response:
-    """One dataset: signals, channels, lineage."""
+    """Show one dataset: signals, channels, lineage."""
     return HtmlPage(pages.dataset_page(session, dataset_id))
 
 
 @router.get("/pages/models/{name}.yaml", **HIDDEN)
 def model_text(name: str, session: ReadSession) -> Response:
-    """A model as the text that the form shows."""
+    """Return a model as the text that the form shows."""
     return PlainTextResponse(pages.model_text(session, name))
 
 
 @router.get("/pages/jobs/{job_id}/model.yaml", **HIDDEN)
 def job_model_text(job_id: str, session: ReadSession) -> Response:
-    """The model of a job as the text that the form shows for its clone."""
+    """Return the model of a job as the text that the form shows for a clone."""
     return PlainTextResponse(pages.job_model_text(session, job_id))
 
 
 @router.get("/static/{name}", **HIDDEN)
 def static_file(name: str, request: Request) -> Response:
-    """Our own files, and Plotly out of its installed wheel."""
+    """Serve the package's static files, and Plotly from its installed wheel."""
     if name == assets.plotly_file_name():
         return _plotly_response(request)
     found = assets.load_asset(name)
@@ -130,7 +130,7 @@ def static_file(name: str, request: Request) -> Response:
 def run_figure(
     run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
-    """A figure of a run as Plotly JSON, or the numbers it draws as CSV."""
+    """Draw a figure of a run as Plotly JSON, or export its numbers as CSV."""
     return _figure_response(
         results.load_run_figure(session, parts.store, run_id, name, choice), name, choice
     )
@@ -138,13 +138,13 @@ def run_figure(
 
 @router.get("/v1/jobs/{job_id}/figures/summary", tags=["jobs"], response_class=JSONResponse)
 def job_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
-    """Errors against the noise (Figure 15) as Plotly JSON, or the numbers drawn as CSV."""
+    """Draw errors against the noise (Figure 15) as Plotly JSON, or export the numbers as CSV."""
     return _figure_response(results.load_noise_figure(session, job_id, choice), "summary", choice)
 
 
 @router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], response_class=JSONResponse)
 def trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
-    """Estimates over the label of a batch as Plotly JSON, or the numbers drawn as CSV."""
+    """Draw estimates over a batch's label as Plotly JSON, or export the numbers as CSV."""
     return _figure_response(results.load_trend_figure(session, job_id, choice), "trend", choice)
 
 
@@ -154,14 +154,14 @@ def trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Resp
 def dataset_figure(
     dataset_id: str, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
-    """The signals of a dataset as Plotly JSON, or the numbers drawn as CSV."""
+    """Draw the signals of a dataset as Plotly JSON, or export the numbers as CSV."""
     found = results.load_dataset_figure(session, parts.store, dataset_id, choice)
     return _figure_response(found, "signals", choice)
 
 
 @router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
 def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSession) -> Response:
-    """The job as one HTML file that needs no server: tables, figures, the exact request."""
+    """Export the job as one HTML file that needs no server: tables, figures, the exact request."""
     made = report.render_job_report(session, parts.store, job_id, str(request.base_url))
     policy = {
         "Content-Security-Policy": report.security_policy(),

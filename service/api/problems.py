@@ -1,4 +1,4 @@
-"""RFC 9457 problem documents: the one place where an error becomes an answer."""
+"""Turn every error into an RFC 9457 problem document."""
 
 import errno
 import json
@@ -36,8 +36,8 @@ RETRY_HEADERS = {"Retry-After": "1"}
 TOO_DEEP_MESSAGE = "the body is nested too deeply"
 MAX_FAULTS = 1000
 MAX_DETAIL_CHARACTERS, MAX_TOTAL_CHARACTERS = 1000, 20_000
-"""Of one sentence, and of all: a value that is quoted may be as long as a body."""
-"""So many fields that cannot be read are told; each costs a look at what is known there."""
+"""Limits for one message and for all: a quoted value may be as long as the body."""
+"""`MAX_FAULTS` limits the reported fields, since each one is compared with the valid names."""
 PROBLEM_TYPE = "application/problem+json"
 STATUS_KINDS = {
     404: "not-found",
@@ -63,7 +63,7 @@ def problem_response(
 ) -> Response:
     """Answer with a problem document; its `type` is a path of this server, one per kind.
 
-    A browser that asked for a page gets one that says the same.
+    A browser that requests a page gets the same content as a page.
     """
     if wants_html(request):
         return error_page(status, title, detail, errors, headers or {})
@@ -77,30 +77,30 @@ def problem_response(
     if errors:
         told = [error.to_dict() for error in errors[: MAX_FAULTS + 1]]
         if len(errors) > len(told):
-            told.append(FieldError("", "and more faults, not told here").to_dict())
+            told.append(FieldError("", "more faults follow; they are not listed").to_dict())
         content["errors"] = [
             {**one, "detail": _shorten(one["detail"], MAX_DETAIL_CHARACTERS)} for one in told
         ]
-    given = {"Vary": "Accept", **(headers or {})}  # no cache gives it to who asks for a page
+    given = {"Vary": "Accept", **(headers or {})}  # caches keep JSON and page apart
     return _ProblemResponse(content, status, given, media_type=PROBLEM_TYPE)
 
 
 class _ProblemResponse(JSONResponse):
-    """JSON also where it names a field whose name is no Unicode text: halves of pairs escaped."""
+    """A JSON response that escapes lone surrogates, which a quoted field name may contain."""
 
     def render(self, content: Any) -> bytes:
-        """The document in UTF-8."""
+        """Encode the document in UTF-8."""
         text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
         return text.encode("utf-8", "backslashreplace")
 
 
 def _shorten(text: str, most: int) -> str:
-    """The text, of a very long one beginning and end."""
+    """Shorten a long text to its beginning and end."""
     return text if len(text) <= most else f"{text[: most // 2]} … {text[-(most // 2) :]}"
 
 
 def install_handlers(app: FastAPI) -> None:
-    """Make every error of the application a problem document."""
+    """Register handlers that turn every error into a problem document."""
     app.add_exception_handler(ServiceError, _handle_service_error)
     app.add_exception_handler(StorageError, _handle_storage_error)
     app.add_exception_handler(SysidError, _handle_sysid_error)
@@ -133,7 +133,7 @@ def _handle_database_outage(request: Request, error: Exception) -> Response:
     if isinstance(error, TRANSIENT_ERRORS) and not is_transient(error):
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
-    detail = "the database does not answer, or its disk is full; nothing was changed, try again"
+    detail = "the database does not answer, or its disk is full. Nothing was changed. Try again."
     away = Unavailable(detail)
     return problem_response(
         request, away.status, away.kind, away.title, away.detail, headers=RETRY_HEADERS
@@ -145,20 +145,18 @@ def _handle_os_error(request: Request, error: Exception) -> Response:
     if error.errno not in (errno.ENOSPC, errno.EDQUOT):
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, error)
-    return _handle_service_error(
-        request, Unavailable("there is no space left on a disk of the server")
-    )
+    return _handle_service_error(request, Unavailable("a disk of the server is full"))
 
 
 def _handle_recursion_error(request: Request, error: Exception) -> Response:
-    """Only a body has levels that are followed one by one."""
+    """Report a body that is nested too deeply; only bodies are parsed recursively."""
     if request.method not in ("POST", "PUT", "PATCH"):
         return _handle_unexpected_error(request, error)
     return _handle_service_error(request, InvalidRequest.from_fault("", TOO_DEEP_MESSAGE))
 
 
 def _handle_unicode_error(request: Request, error: Exception) -> Response:
-    """Only the escapes of a body's JSON can make half of a surrogate pair; UTF-8 has none."""
+    """Report a lone surrogate, which only JSON escapes in a body can produce."""
     if request.method not in ("POST", "PUT", "PATCH"):
         return _handle_unexpected_error(request, error)
     return _handle_service_error(request, InvalidRequest.from_fault("", LONE_SURROGATE))
@@ -186,7 +184,7 @@ def _handle_http_error(request: Request, error: Exception) -> Response:
 
 def _handle_validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    if isinstance(error.body, bytes):  # FastAPI reads no body that is not announced as JSON
+    if isinstance(error.body, bytes):  # FastAPI parses only bodies with a JSON content type
         kind = request.headers.get("content-type", "")
         return _handle_service_error(
             request, UnsupportedMediaType(f"found {kind!r}; need application/json")
@@ -195,21 +193,21 @@ def _handle_validation_error(request: Request, error: Exception) -> Response:
 
 
 def _handle_unexpected_error(request: Request, error: Exception) -> Response:
-    # Starlette logs the traceback of what reaches this border; the caller learns no inner detail.
+    # Starlette logs the traceback. The client gets no internal detail.
     log.error("%s %s failed: %r", request.method, request.url.path, error)
-    detail = "an unexpected error; it is in the log of the server"
+    detail = "unexpected error; see the server's log"
     return problem_response(request, 500, "internal", "The service failed", detail)
 
 
 def _unreadable_reason(cause: BaseException | None) -> str | None:
-    """Why a body could not be read as JSON, where FastAPI only says that it could not."""
+    """Explain why a body could not be parsed as JSON; FastAPI reports only that it failed."""
     match cause:
         case UnicodeDecodeError():
-            return f"the body is not UTF-8 text: byte {cause.start} does not fit"
+            return f"the body is not UTF-8 text: byte {cause.start} is invalid"
         case RecursionError():
             return TOO_DEEP_MESSAGE
         case ValueError():
-            return "the body has a number with too many digits; need at most 4300"
+            return "the body has a number with more than 4300 digits"
     return None
 
 
@@ -222,11 +220,11 @@ def _to_field_errors(request: Request, error: RequestValidationError) -> Iterato
         elif place == "body":
             entries.append({**entry, "loc": loc})
         else:
-            # What follows the name is a position among its values.
+            # The rest of `loc` is an index into repeated values.
             name = loc[0] if loc else ""
             pointer = f"{{{name}}}" if place == "path" else f"?{name}"
             yield FieldError(pointer, describe_error(entry, ()))
     kind = find_body_type(request.scope.get("endpoint"))
     yield from explain_errors(entries[:MAX_FAULTS], error.body, kind)
     if len(entries) > MAX_FAULTS:
-        yield FieldError("", f"and {len(entries) - MAX_FAULTS} more faults, not told here")
+        yield FieldError("", f"{len(entries) - MAX_FAULTS} more faults are not listed")

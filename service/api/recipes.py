@@ -1,7 +1,4 @@
-"""The route of batch re-identification.
-
-The route of the noise sweep.
-"""
+"""Routes of recipes: noise sweep and batch re-identification."""
 
 from fastapi import APIRouter, Response, status
 
@@ -21,7 +18,7 @@ def submit_noise_sweep(
     response: Response,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
-    """Queue a job of σ × replicates × methods, from true parameters or from a dataset."""
+    """Queue a noise sweep, σ × replicates × methods, of a simulated record or a dataset."""
     job = noise.submit_noise_sweep(
         parts.database, parts.store, parts.settings, body, idempotency_key
     )
@@ -36,7 +33,7 @@ def submit_reidentification(
     response: Response,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
-    """Queue a run for each value of a label, warm-started, with a trend over it."""
+    """Queue a warm-started run for each value of a label, with a trend over the label."""
     job = reidentify.submit_reidentification(parts.database, body, parts.settings, idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job

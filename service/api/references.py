@@ -14,17 +14,17 @@ reference_router = APIRouter(prefix="/v1/references", tags=["references"])
 def list_references(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50
 ) -> Page[ReferenceOut]:
-    """References in use, by name."""
+    """List the current references by name."""
     return references.list_references(session, cursor, limit)
 
 
 @reference_router.get("/{name:path}")
 def read_reference(name: str, session: ReadSession) -> ReferenceOut:
-    """One reference: the run in use, its estimates, and what was accepted before."""
+    """Read a reference: the accepted run, its estimates, and previously accepted runs."""
     return references.get_reference(session, name)
 
 
 @reference_router.put("/{name:path}")
 def accept_reference(name: str, body: ReferenceIn, session: WriteSession) -> ReferenceOut:
-    """Accept a run as the reference of this name; the one before stays in the history."""
+    """Accept a run as the reference of this name; the previous run stays in the history."""
     return references.accept_reference(session, name, body)

@@ -1,7 +1,4 @@
-"""Routes of runs.
-
-The route that compares runs.
-"""
+"""Routes of runs, including their comparison."""
 
 from typing import Annotated
 
@@ -39,19 +36,19 @@ router = APIRouter(prefix="/v1/runs", tags=["runs"])
 
 @router.get("/{run_id}")
 def read_run(run_id: str, session: ReadSession) -> RunOut:
-    """One run: its state, and its result once there is one."""
+    """Read one run: its state, and its result as soon as it exists."""
     return runs.get_run(session, run_id)
 
 
 @router.get("/{run_id}/history")
 def read_history(run_id: str, session: ReadSession) -> HistoryOut:
-    """Improvements of every island's champion; nothing is thinned out."""
+    """Read all improvements of every island's champion."""
     return runs.get_history(session, run_id)
 
 
 @router.get("/{run_id}/migrations")
 def read_migrations(run_id: str, session: ReadSession) -> MigrationsOut:
-    """Who migrated when, from where, to where."""
+    """Read the migrations: individual, epoch, source island, target island."""
     return runs.get_migrations(session, run_id)
 
 
@@ -59,13 +56,13 @@ def read_migrations(run_id: str, session: ReadSession) -> MigrationsOut:
 def read_response(
     run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> ResponseOut:
-    """Measured and simulated outputs, reduced so that extremes stay visible."""
+    """Read measured and simulated outputs, reduced so that extremes stay visible."""
     return responses.build_response(session, parts.store, run_id, max_points)
 
 
 @router.get("/{run_id}/residuals")
 def read_residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> ResidualsOut:
-    """Auto- and cross-correlation of the residuals with 95 and 99 % bands, and their tests."""
+    """Read the residual tests: auto- and cross-correlation with 95 and 99 % bands."""
     return residuals.get_residuals(session, parts.store, run_id)
 
 
@@ -76,7 +73,7 @@ def export_model(
     format: ExportFormat = "json",
     pade_order: Annotated[int, Query(ge=1, le=MAX_PADE_ORDER)] = 3,
 ) -> Response:
-    """The identified model as text: json, python, c (C99), or control (python-control)."""
+    """Export the identified model as text: json, python, c (C99), or control (python-control)."""
     found = exports.export_run(session, run_id, format, pade_order)
     headers = {"Content-Disposition": f'attachment; filename="{found.name}"'}
     return Response(found.text, media_type=found.media_type, headers=headers)
@@ -94,7 +91,7 @@ def simulate_run(
 def validate_run(
     run_id: str, body: FreeRunIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> FreeRunOut:
-    """Run the identified model freely over another recording: RMS and fit there."""
+    """Simulate the identified model (free run) on another recording: RMS and fit."""
     return free_runs.validate_run(parts.database, parts.store, run_id, body, max_points)
 
 
@@ -102,7 +99,7 @@ def validate_run(
 def profile_run(
     run_id: str, body: ProfileIn, parts: PartsDep, theme: Theme = "light"
 ) -> ProfilesOut:
-    """Profile likelihood of some free parameters, the others estimated anew at every value."""
+    """Compute profile likelihoods of free parameters; the others are re-estimated at each value."""
     found = profiles.compute_profiles(parts.database, parts.store, run_id, body)
     figure = apply_theme(profile_figure(found.profiles, found.threshold), theme)
     return ProfilesOut(**dict(found), figure=figure)
@@ -113,7 +110,7 @@ def profile_run(
 def read_run_signals(
     run_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
-    """Measured and simulated outputs and residuals as MCAP; ranges and ETags are honoured."""
+    """Download measured and simulated outputs and residuals as MCAP; ranges and ETags work."""
     run = RunRepository(session).get(run_id)
     if run.signals_sha256 is None:
         raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
@@ -128,5 +125,5 @@ comparison_router = APIRouter(prefix="/v1", tags=["runs"])
 
 @comparison_router.post("/runs:compare")
 def compare_runs(body: CompareIn, session: ReadSession) -> ComparisonOut:
-    """Runs of several models on the same data side by side, the best first."""
+    """Compare runs of several models on the same data, best first."""
     return comparison.compare_runs(session, body.runs)

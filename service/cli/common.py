@@ -1,6 +1,7 @@
-"""What the commands share: options, consoles, tables, and errors as one line.
+"""Shared parts of the commands: options, consoles, tables, and one-line errors.
 
-Faults at the place where the user wrote: at an option or in a file, not at a pointer.
+A server reports faults at pointers into the body. Here they are reported where the user typed:
+at an option or in a file.
 """
 
 import json
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
-PIPE_WIDTH = 200  # where nobody looks, a line is not folded at 80 columns
+PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
 out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -38,12 +39,12 @@ Key = Annotated[
     str | None, typer.Option("--key", envvar="LAGID_KEY", help="API key.", show_default=False)
 ]
 Segments = Annotated[
-    str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
+    str | None, typer.Option(help="CSV label columns that divide the rows into segments: col,col.")
 ]
 SampleTime = Annotated[
-    float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
+    float | None, typer.Option(help="Sampling period in s, for a CSV without a time column.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for machines.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 __all__ = [
     "DEFAULT_URL",
@@ -61,8 +62,8 @@ __all__ = [
 
 @contextmanager
 def connect_client(url: str, key: str | None = None) -> "Iterator[Client]":
-    """A client for the length of a command."""
-    from service.client.client import Client  # commands without a server start sooner
+    """Open a client until the command ends."""
+    from service.client.client import Client  # a late import: other commands start faster
 
     with Client(url, key) as client:
         yield client
@@ -75,32 +76,32 @@ def fail(message: str, code: int = 1) -> NoReturn:
 
 
 def print_error(message: str) -> None:
-    """Print what went wrong as one line on stderr."""
+    """Print an error as one line on stderr."""
     err.print(f"lagid: {' '.join(message.split())}", markup=False)
 
 
 def check_succeeded(job: dict[str, Any]) -> None:
-    """End the command with the reason if a job that is over did not succeed."""
+    """End the command with the reason if a finished job did not succeed."""
     if job["state"] != "succeeded":
         reason = f": {job['error']}" if job["error"] else ""
         fail(f"{job['id']} {job['state']}{reason}")
 
 
 def fail_usage(message: str) -> NoReturn:
-    """End the command because it was called wrongly."""
+    """End the command with exit code 2: it was called with wrong arguments."""
     fail(message, 2)
 
 
 def split_setting_path(change: str) -> list[str]:
-    """The parts of the path of a ``--set path=value``; ends the command if it is none."""
+    """Split the path of a ``--set path=value`` at its dots; end the command if it has no ``=``."""
     path, equals, _ = change.partition("=")
     if not equals:
-        fail_usage(f"--set {change}: need path=value, as algorithm.population=100")
+        fail_usage(f"--set {change}: need path=value, such as algorithm.population=100")
     return [part for part in path.replace("/", ".").split(".") if part]
 
 
 def apply_setting(body: dict[str, Any], change: str) -> None:
-    """Put the value of a ``--set path=value`` into a body; the value is read as YAML."""
+    """Set the value of a ``--set path=value`` in a body; the value is read as YAML."""
     parts, here = split_setting_path(change), body
     for part in parts[:-1]:
         here = here.setdefault(part, {})
@@ -110,17 +111,17 @@ def apply_setting(body: dict[str, Any], change: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON, unstyled and unwrapped."""
+    """Print a value as JSON, without styles or folding."""
     out.print(json.dumps(value, indent=2, ensure_ascii=False), markup=False, soft_wrap=True)
 
 
 def print_line(text: str) -> None:
-    """Print a line as it is: neither styled nor folded."""
+    """Print a line without styles or folding."""
     out.print(text, markup=False, soft_wrap=True)
 
 
 def print_job(job: dict[str, Any]) -> None:
-    """Print a job that was just submitted."""
+    """Print a submitted job."""
     n_runs = job["progress"]["runs"]
     runs = f"{n_runs} runs, " if n_runs > 1 else ""
     print_line(f"{job['id']}  {job['name']}: {runs}{job['state']}")
@@ -129,7 +130,7 @@ def print_job(job: dict[str, Any]) -> None:
 def print_table(
     headings: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, title: str = ""
 ) -> None:
-    """Print rows under headings; a heading that begins with ``>`` is set to the right."""
+    """Print rows under headings; a heading that begins with ``>`` is right-aligned."""
     table = Table(title=title or None, box=None, pad_edge=False, title_justify="left")
     for number, heading in enumerate(headings):
         table.add_column(
@@ -154,7 +155,7 @@ def print_listing(
     *,
     empty: str,
 ) -> None:
-    """Print what a server lists: as JSON, or one `row` each under headings."""
+    """Print a server's listing as JSON, or as a table with one `row` per entry."""
     if as_json:
         print_json(found)
     else:
@@ -162,24 +163,24 @@ def print_listing(
 
 
 def format_cell(value: object) -> str:
-    """A value in a cell: a dash for None, six digits for a number."""
+    """Format a cell: a dash for None, six digits for a number."""
     if value is None:
         return DASH
     return format_value(value).replace("[", "\\[")
 
 
 def format_estimate(one: dict[str, Any]) -> str:
-    """``0.1193 ± 0.0004``, from an entry of a run's parameters."""
+    """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
     return plain_estimate(one["value"], one["stderr"])
 
 
 def describe_status(one: dict[str, Any]) -> str:
-    """The status of an estimate, with its reason where there is one."""
+    """Describe the status of an estimate, with its reason if there is one."""
     return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
 
 
 def read_file(path: Path) -> bytes:
-    """Content of a file that the user names; ends the command if it cannot be read."""
+    """Read a file that the user names; end the command if this fails."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -187,7 +188,7 @@ def read_file(path: Path) -> bytes:
 
 
 def read_document(path: Path) -> Any:
-    """What a YAML or JSON file says; ends the command if it cannot be read."""
+    """Parse a YAML or JSON file; end the command if this fails."""
     try:
         return parse_yaml(read_file(path))
     except InvalidRequest as error:
@@ -195,7 +196,7 @@ def read_document(path: Path) -> Any:
 
 
 def read_object(path: Path, form: str = "an object (name: value)") -> dict[str, Any]:
-    """The object in a YAML or JSON file; ends the command if it holds something else."""
+    """Read an object from a YAML or JSON file; end the command if it holds something else."""
     document = read_document(path)
     if not isinstance(document, dict):
         fail(f"{path} does not hold {form}")
@@ -203,12 +204,12 @@ def read_object(path: Path, form: str = "an object (name: value)") -> dict[str, 
 
 
 def read_model(name: str) -> Any:
-    """A model as a body gives it: the document if the name is that of a file."""
+    """Return a model as a body needs it: its document if the name is a file, else its name."""
     return read_document(Path(name)) if name.endswith(MODEL_SUFFIXES) else name
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file that the user names; ends the command if it cannot be written."""
+    """Write a file that the user names; end the command if this fails."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -216,12 +217,12 @@ def write_file(path: Path, text: str) -> None:
 
 
 def split_names(text: str | None) -> list[str]:
-    """Names that are joined by commas."""
+    """Split names at commas."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def parse_pairs(option: str, texts: Iterable[str], form: str = "NAME=VALUE") -> dict[str, str]:
-    """Texts of the form ``name=value`` by their names; ends the command if one is not."""
+    """Parse texts of the form ``name=value``; end the command if one has another form."""
     pairs = {}
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
@@ -232,12 +233,12 @@ def parse_pairs(option: str, texts: Iterable[str], form: str = "NAME=VALUE") -> 
 
 
 def parse_channels(text: str | None) -> dict[str, str]:
-    """The channel of each signal out of ``u=P1,y=P2``."""
+    """Parse the channel of each signal from ``u=P1,y=P2``."""
     return parse_pairs("--channels", split_names(text), "signal=channel, such as u=P1")
 
 
 def parse_number(place: str, text: str) -> float:
-    """A finite number; ends the command if the text at this place of the command is none."""
+    """Parse a finite number; end the command if the text at this place is none."""
     try:
         value = float(text)
     except ValueError:
@@ -248,56 +249,56 @@ def parse_number(place: str, text: str) -> float:
 
 
 def format_moment(text: str) -> str:
-    """A time of an answer to the second, ``2026-01-31 12:00:00``."""
+    """Format a time stamp to the second, ``2026-01-31 12:00:00``."""
     return text[:19].replace("T", " ")
 
 
 def format_decimals(value: float | None) -> str | None:
-    """A number with two decimals; None where there is none."""
+    """Format a number with two decimals; None stays None."""
     return None if value is None else f"{value:.2f}"
 
 
 INVALID_STATUS = 422
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
-"""Pointers in a message: where a field of a name is, and what in a value of an axis is wrong."""
+"""Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
 SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
-"""A field of a job in a note, as a job file has it: ``loss: {noise_model: ar1}``.
+"""A job field in a note, as in a job file: ``loss: {noise_model: ar1}``.
 
-What the model is to be given is a field of its document, which no option sets.
+Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class FieldOrigins:
-    """Where the fields of a body were written.
+    """Origins of the fields of a body: the options or files where the user typed them.
 
     Attributes
     ----------
     options : mapping
-        Pointer of a field → the option that gives it. One that ends in ``{}`` has there the name
-        of what is below the field: ``/truth/parameters/K`` is ``--true K``. One that ends in ``…``
-        is followed by the rest of the pointer: a place in a file.
+        Pointer of a field → the option that sets it. ``{}`` at the end stands for the name below
+        the field: ``/truth/parameters/K`` is ``--true K``. ``…`` at the end stands for the rest of
+        the pointer, which is a place in a file.
     rest : str
-        What all other fields are given by, in the same way; ``--set {}`` has the whole path.
+        The same for all other fields; in ``--set {}`` the braces stand for the whole path.
     """
 
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
 
     def locate(self, pointer: str) -> str:
-        """The place of a pointer."""
+        """Return the option or file where the field of a pointer was typed."""
         for above in _iterate_parents(pointer):
             if above in self.options:
                 return _format_option(self.options[above], pointer.removeprefix(above))
         return _format_option(self.rest, pointer, is_whole=True)
 
     def describe_faults(self, faults: Iterable[FieldError]) -> str:
-        """Faults as one line."""
+        """Describe faults in one line."""
         return "; ".join(self._describe_fault(fault) for fault in faults)
 
     def rewrite_note(self, note: str) -> str:
-        """A note of a result, with the options in it that set the fields which it advises."""
+        """Rewrite a note so that it names options instead of job fields."""
         return SETTING_PATTERN.sub(self._format_setting, note)
 
     def _format_setting(self, found: re.Match[str]) -> str:
@@ -315,13 +316,13 @@ class FieldOrigins:
 
 
 def file_origins(name: object) -> FieldOrigins:
-    """Places of a body that is a file."""
+    """Return the origins of a body that is read from a file."""
     return FieldOrigins(rest=f"{name} …")
 
 
 @contextmanager
 def report_faults(places: FieldOrigins) -> Iterator[None]:
-    """End the command with the faults that a server finds in a body, at the user's places."""
+    """End the command with the server's faults, reported where the user typed."""
     try:
         yield
     except NotFinite as error:
@@ -339,7 +340,7 @@ def report_faults(places: FieldOrigins) -> Iterator[None]:
 
 
 def _iterate_parents(pointer: str) -> Iterator[str]:
-    """A pointer and all that hold it, the longest first."""
+    """Yield a pointer and its parents, longest first."""
     while pointer:
         yield pointer
         pointer = pointer.rpartition("/")[0]

@@ -88,13 +88,13 @@ def simulate_dataset(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a recording from a model or a reference plant, its parameters, inputs and noise.
+    """Simulate a recording from a model or a reference plant, parameters, inputs and noise.
 
-    Inputs that jump (step, binary) are stored as held between samples, waves and expressions as
-    straight; a channel of a dataset keeps its own hold.
+    Inputs that jump (step, binary) are stored as held between samples. Waves and expressions are
+    stored as linearly interpolated. A channel of a dataset keeps its own hold.
     """
     if file is None and plant is None:
-        fail("give a file with the request, or --plant actuator or --plant tube")
+        fail("need a file with the request, or --plant actuator or --plant tube")
     body = {} if file is None else read_object(file)
     if plant is not None:
         body["plant"] = plant
@@ -120,7 +120,7 @@ def derive_dataset(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a recording from another: noise, resample, trim, select, pool and so on."""
+    """Derive a recording from another: add noise, resample, trim, select, pool etc."""
     steps = read_document(file)
     if isinstance(steps, dict):
         steps = steps.get("steps")
@@ -135,7 +135,7 @@ def derive_dataset(
 
 
 def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
-    """Where the fields of a simulation were given: by options, or all others in the file."""
+    """Map the fields of a simulation to options; all other fields are in the file."""
     given = {f"/parameters/{one.partition('=')[0].strip()}": "--set {}" for one in sets or ()}
     named = {place: option.format(place.rpartition("/")[2]) for place, option in given.items()}
     options = {"/plant": "--plant", "/name": "--name", **named}

@@ -1,4 +1,4 @@
-"""`lagid demo`: the paper's Example 1 through the whole service, printed beside its Table 1."""
+"""`lagid demo`: run the paper's Example 1 through the whole service and compare with Table 1."""
 
 import os
 from pathlib import Path
@@ -86,7 +86,7 @@ def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
 
 
 def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
-    table = Table(title="Example 1 (Eq. 13-16): estimates beside the paper's Table 1")
+    table = Table(title="Example 1 (Eq. 13-16): estimates and the paper's Table 1")
     for heading in ("", "true", "paper, simple GA", "paper, proposed GA"):
         table.add_column(heading, justify="right")
     for method in METHODS:
@@ -106,8 +106,8 @@ def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
     table.add_row("simulations", "", "", "", *(str(runs[m]["evaluations"]) for m in METHODS))
     console.print(table)
     console.print(
-        f"estimate ± standard error; measurement noise of sd {NOISE_SD:g} m was added; "
-        "the paper's own noise draw is not known, so its columns are for orientation",
+        f"Estimate ± standard error. Measurement noise with sd {NOISE_SD:g} m was added. "
+        "The paper does not publish its noise draw, so its columns are for orientation.",
         highlight=False,
     )
 
@@ -121,4 +121,4 @@ def _print_locations(console: Console, data_dir: Path, report: Path) -> None:
     console.print(f"report    {report.resolve()}", highlight=False, soft_wrap=True)
     console.print(f"MCAP      {folder / 'objects'}", highlight=False, soft_wrap=True)
     console.print(f"database  {folder / 'lagid.db'}", highlight=False, soft_wrap=True)
-    console.print("keep the service up with `make serve`, then open http://127.0.0.1:8000/")
+    console.print("To keep the service running: make serve, then open http://127.0.0.1:8000/")

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from sysid.residuals.residual_tests import ResidualTests
 
 
-# Fields of a job body that mean nothing in one process, and what does their work here.
+# Fields of a job body that need a server, and what to use instead.
 SERVER_SETTINGS = {
     "sweep": "a sweep needs a server: lagid submit job.yaml",
     "trend": "a trend needs a server: lagid reidentify",
@@ -63,7 +63,7 @@ FIELD_ORIGINS = FieldOrigins(
 
 @dataclass(frozen=True, slots=True)
 class CsvOptions:
-    """How CSV files are read."""
+    """Options for reading CSV files."""
 
     sample_time: float | None
     segments: tuple[str, ...]
@@ -74,7 +74,7 @@ def identify(
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", help="path=value of the job body, as algorithm.population=100."),
+        typer.Option("--set", help="path=value of the job body: algorithm.population=100."),
     ] = None,
     channels: Annotated[
         str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
@@ -82,7 +82,7 @@ def identify(
     validation: Annotated[
         Path | None,
         typer.Option(
-            help="Recording that is kept for validation; of DATA itself the last part: "
+            help="Recording for validation. To validate on the last part of DATA: "
             "--set validation.fraction=0.3."
         ),
     ] = None,
@@ -90,8 +90,8 @@ def identify(
         str | None,
         typer.Option(
             metavar=f"[{'|'.join(NOISE_MODELS)}]",
-            help="white; ar1: least squares generalised to first-order noise; auto, the default: "
-            "ar1 where residuals are coloured and the model does not forget where it began.",
+            help="white: least squares. ar1: generalised least squares for first-order noise. "
+            "auto (default): ar1 if residuals are autocorrelated and the model integrates.",
         ),
     ] = None,
     segments: Segments = None,
@@ -100,7 +100,7 @@ def identify(
         str | None, typer.Option("--json", metavar="FILE", help="Write the result; - for stdout.")
     ] = None,
 ) -> None:
-    """Identify a model's parameters and lags from a recording, in this process."""
+    """Identify a model's parameters and time lags from a recording, in this process."""
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
@@ -122,7 +122,7 @@ def identify(
 def _build_body(
     data: Path, model: str, changes: list[str], channels: dict[str, str]
 ) -> dict[str, Any]:
-    """The job body that the options stand for, unchecked."""
+    """Build the job body from the options, unchecked."""
     body: dict[str, Any] = {"model": model, "datasets": [str(data)], "channels": channels}
     for change in changes:
         _refuse_server_settings(change, split_setting_path(change))
@@ -131,14 +131,14 @@ def _build_body(
 
 
 def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
-    """The body as its type, and the model; ends the command with the faults of both.
+    """Validate the body and load its model; end the command with the faults of both.
 
-    A body of the wrong type is refused for that alone.
+    If the body has type errors, only these are reported.
 
     Parameters
     ----------
     pieces : int
-        Records in the recording, each of which may have initial states of its own.
+        Number of records in the recording. Each may have its own initial states.
     """
     from pydantic import ValidationError
 
@@ -174,7 +174,7 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
 
 @contextmanager
 def _report_core_faults() -> Iterator[None]:
-    """End the command with what the core refuses, at the user's places."""
+    """End the command with the core's errors, reported where the user typed."""
     from service.core.errors import to_field_errors
     from sysid.core.errors import SysidError
 
@@ -195,13 +195,13 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         return
     if read_file(data) == read_file(validation):
         fail_usage(
-            f"--validation {validation}: this is the recording that is fitted; name another, "
-            "or use --set validation.fraction=0.3"
+            f"--validation {validation}: this is the estimation recording. Name another, or use "
+            "--set validation.fraction=0.3"
         )
 
 
 def read_recording(path: Path, reading: CsvOptions) -> "Recording":
-    """A recording from a file; notes about it go to stderr."""
+    """Read a recording from a file and print notes about it on stderr."""
     from service.formats.csv_recordings import read_csv
     from sysid.models.units import list_unknown_unit_warnings
 
@@ -264,9 +264,9 @@ def print_result(
 
 
 def _residual_verdict(tests: "ResidualTests") -> str:
-    """Whether the residuals pass their tests, and which fail with what chance.
+    """Say whether the residuals pass their tests; failed tests have their p-value.
 
-    Warnings are for what is clear (p < 0.001), so most of what fails is told here only.
+    Warnings cover only p < 0.001, so most failed tests are reported only here.
     """
     failed = [
         f"{one.output} {'is not white' if one.input is None else f'depends on {one.input}'}"
@@ -306,7 +306,7 @@ def _run_identification(
         TimeElapsedColumn(),
     )
     console = Console(stderr=True, highlight=False)
-    quiet = quiet or not console.is_terminal  # in a file an ended bar is an empty line
+    quiet = quiet or not console.is_terminal  # in a file a finished bar is an empty line
     with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
         bar = progress.add_task("", total=algorithm.generations, rms="–")
 

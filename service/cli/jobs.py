@@ -1,4 +1,4 @@
-"""`lagid submit`, `watch_job`, `jobs`, `list_runs`, `cancel_job`, `resume_job`, `write_report`."""
+"""`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -50,9 +50,9 @@ JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 
 def submit_job(
     file: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON.")],
-    wait: Annotated[bool, typer.Option("--wait", help="Show its progress until its end.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     idempotency_key: Annotated[
-        str | None, typer.Option(help="The same key again gives the same job.")
+        str | None, typer.Option(help="The same key returns the same job.")
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
@@ -113,9 +113,7 @@ def list_jobs(
 def list_runs(
     job: Annotated[
         str | None,
-        typer.Argument(
-            metavar="[JOB|RUN]", help="Id of a job, by default the latest, or of one run."
-        ),
+        typer.Argument(metavar="[JOB|RUN]", help="Id of a job (default: the latest) or of a run."),
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
@@ -135,7 +133,7 @@ def list_runs(
 
 
 def cancel_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
-    """Cancel a job; what it has found so far stays."""
+    """Cancel a job; results so far are kept."""
     with connect_client(url, key) as client:
         found = client.cancel(job)
     asked = "will be cancelled" if found["state"] == "running" else f"is {found['state']}"
@@ -143,7 +141,7 @@ def cancel_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
 
 
 def resume_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
-    """Queue a failed or cancelled job again; it goes on from where it stopped."""
+    """Queue a failed or cancelled job again; it continues where it stopped."""
     with connect_client(url, key) as client:
         found = client.resume(job)
     out.print(f"{found['id']} is {found['state']}", markup=False)
@@ -165,7 +163,7 @@ def write_report(
 
 
 def read_job(file: Path) -> dict[str, Any]:
-    """The body of a job file; a model named as a file is read, beside the job file."""
+    """Read a job file; a model file is read relative to the job file's folder."""
     body = read_object(file, "a job (model: …, datasets: […])")
     model = body.get("model")
     if isinstance(model, str) and model.endswith(MODEL_SUFFIXES):
@@ -173,14 +171,14 @@ def read_job(file: Path) -> dict[str, Any]:
     for one in body.get("datasets") or []:
         if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
             fail(
-                f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
-                f"add it first: lagid dataset add {one}"
+                f"{file}: datasets must be ids or names on the server, but {one!r} is a file. "
+                f"Add it first: lagid dataset add {one}"
             )
     return body
 
 
 def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
-    """Print runs with their cells, fits and estimates; labels stand for the data they tell of."""
+    """Print runs with their cells, fits and estimates; labels replace the ids of their data."""
     places = [run_coordinates(run) for run in runs]
     paths = list(dict.fromkeys(path for place in places for path in place))
     units = {one["name"]: one["unit"] for run in runs for one in run["parameters"]}
@@ -234,7 +232,7 @@ def _find_latest_job(client: "Client") -> str:
 
 
 def _format_progress(job: dict[str, Any]) -> str:
-    """Runs that are over, of all; of several also how they ended."""
+    """Format the count of finished runs; for several runs also how they ended."""
     done = job["progress"]
     told = f"{done['finished']}/{done['runs']}"
     if done["runs"] == 1 or not done["finished"]:
@@ -244,7 +242,7 @@ def _format_progress(job: dict[str, Any]) -> str:
 
 
 def _single_run_rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
-    """RMS of a job of one run and its unit; the best of several, on other data, tells nothing."""
+    """RMS and its unit for a job of one run; None for several, whose RMS are not comparable."""
     best = job["progress"]["best_rms"]
     if job["progress"]["runs"] != 1 or best is None:
         return None, None

@@ -1,4 +1,4 @@
-"""`lagid`: the command line. Commands import what they need when they run, so `--help` is quick."""
+"""`lagid`: the command line. Commands import late, so `--help` is fast."""
 
 import os
 import sys
@@ -22,7 +22,7 @@ from service.core.errors import ServiceError
 
 SERVER_ERROR_STATUS = 500
 SURROGATE_REASON = "surrogates not allowed"
-"""What Python says of words of a command that were typed, or named a file, in another encoding."""
+"""Python's reason for an argument or a file name in another encoding."""
 app = typer.Typer(
     name="lagid",
     help="Identification of nonlinear systems with unknown time lags.",
@@ -56,7 +56,7 @@ app.command("doctor")(upkeep.check_installation)
 
 @app.command("demo")
 def run_demo(
-    data_dir: Annotated[Path, typer.Option(help="Where to keep its data.")] = Path("lagid-demo"),
+    data_dir: Annotated[Path, typer.Option(help="Folder for its data.")] = Path("lagid-demo"),
 ) -> None:
     """Run the paper's Example 1 through the whole service and print its Table 1."""
     from service.cli import demo as program
@@ -65,11 +65,11 @@ def run_demo(
 
 
 def main() -> None:
-    """Run the command line; a user's mistake gives one line, never a traceback."""
-    # Its matrices are tiny: on several threads they take many times their own time beside other
-    # work. Told before NumPy is loaded, which asks once.
+    """Run the command line; a user's mistake prints one line, never a traceback."""
+    # The matrices are tiny: several threads take many times longer when other work runs as well.
+    # NumPy reads this variable once, when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Errors of the core are imported late: the package may load compiled code.
+    # Errors of the core are imported late, since the package may load compiled code.
     try:
         code = app(prog_name="lagid", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
@@ -84,7 +84,7 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
-    except Exception as error:  # the process border; what is no user's mistake goes on as it is
+    except Exception as error:  # the process border; other than user's mistakes, errors go on
         sentence = _user_message(error)
         if sentence is None:
             raise
@@ -92,12 +92,12 @@ def main() -> None:
 
 
 def _usage_message(error: TyperException) -> str:
-    """What is wrong with the words of a command, in our sentences; empty after a help text."""
+    """Describe wrong arguments in our own words; empty after a help text."""
     text = error.format_message()
-    if not text.strip() or "\n" in text.strip():  # a command without its words: the help is out
+    if not text.strip() or "\n" in text.strip():  # no arguments: the help was printed
         return ""
     cause: Any = error.__cause__
-    if hasattr(cause, "errors"):  # Pydantic's, by which the values of options are read
+    if hasattr(cause, "errors"):  # from Pydantic, which reads the values of options
         from service.core.validation import describe_error
 
         text = text.replace(error.message, describe_error(cause.errors()[0], ()))
@@ -113,12 +113,12 @@ def _exit_with_message(message: str, code: int = 1) -> None:
 
 
 def _user_message(error: Exception) -> str | None:
-    """What is told of a user's mistake that the core, the storage or a text's encoding finds."""
+    """Message of a user's mistake that the core, the storage or an encoding reports; else None."""
     from service.storage.errors import StorageError
     from sysid.core.errors import SysidError
 
     if isinstance(error, UnicodeEncodeError) and error.reason == SURROGATE_REASON:
-        return f"{error.object[:200]!r} is not UTF-8 text; write it in UTF-8"
+        return f"{error.object[:200]!r} is not UTF-8 text; encode it in UTF-8"
     return str(error) if isinstance(error, SysidError | StorageError) else None
 
 

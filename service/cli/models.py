@@ -1,4 +1,4 @@
-"""`lagid models`: list them, show one, check one's own."""
+"""`lagid models`: list, show, check and add models."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,12 +23,12 @@ from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
 
-app = typer.Typer(help="Built-in and own models.", invoke_without_command=True)
+app = typer.Typer(help="Built-in models and your own.", invoke_without_command=True)
 
 
 @app.callback()
 def list_by_default(context: typer.Context) -> None:
-    """Built-in and own models; without a command, a list of the built-in ones."""
+    """Built-in models and your own; without a command, list the built-in ones."""
     if context.invoked_subcommand is None:
         list_models()
 
@@ -36,12 +36,13 @@ def list_by_default(context: typer.Context) -> None:
 @app.command("list")
 def list_models(
     url: Annotated[
-        str | None, typer.Option("--url", envvar="LAGID_URL", help="Also those of a server.")
+        str | None,
+        typer.Option("--url", envvar="LAGID_URL", help="Include the models of this server."),
     ] = None,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the models: built-in ones, and own ones of a server if one is named."""
+    """List built-in models; with --url also those of a server."""
     found = _list_builtin_models()
     if url is not None:
         with connect_client(url, key) as client:
@@ -65,14 +66,14 @@ def list_models(
 
 @app.command("show")
 def show_model(
-    name: Annotated[str, typer.Argument(help="Name, or name@version of an own model.")],
+    name: Annotated[str, typer.Argument(help="Name, or name@version of your own model.")],
     url: Annotated[
-        str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of own list_by_default.")
+        str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of your own models.")
     ] = None,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print a model's document as YAML, to be copied and changed."""
+    """Print a model's document as YAML, to copy and change."""
     import yaml
 
     from sysid.models.catalogue import load as library
@@ -95,7 +96,7 @@ def check_model(
     file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
     as_json: AsJson = False,
 ) -> None:
-    """Check a model document; each error with its place and, in equations, its column."""
+    """Check a model document; each error has its place and, in equations, its column."""
     from service.models.models import check_model as checked
 
     try:
@@ -105,7 +106,7 @@ def check_model(
     if as_json:
         print_json(answer)
     elif answer["valid"]:
-        out.print(f"{file}: the model can be used", markup=False)
+        out.print(f"{file}: the model is valid", markup=False)
     else:
         for one in answer["errors"]:
             column = f", column {one['column']}" if one.get("column") else ""
@@ -121,7 +122,7 @@ def add_model(
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
-    """Store an own model on a server."""
+    """Store your own model on a server."""
     document = read_object(file, "a model (name, equations, …)")
     with connect_client(url, key) as client, report_faults(file_origins(file)):
         stored = client.add_model(document)

@@ -1,4 +1,4 @@
-"""`lagid paper`: the paper's tables and figures made anew by jobs, as tables and one report."""
+"""`lagid paper`: reproduce the paper's tables and figures by jobs, as tables and one report."""
 
 import os
 import time
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def reproduce_paper(
-    output: Annotated[Path, typer.Option(help="Where the report goes.")] = Path("paper.html"),
+    output: Annotated[Path, typer.Option(help="File of the report.")] = Path("paper.html"),
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer replicates; under a minute.")
     ] = False,
@@ -27,13 +27,11 @@ def reproduce_paper(
     ] = None,
     url: Annotated[
         str | None,
-        typer.Option(
-            help="A server that does the work; else one is started for it.", show_default=False
-        ),
+        typer.Option(help="Server that runs the jobs (default: start one).", show_default=False),
     ] = None,
     key: Key = None,
 ) -> None:
-    """Reproduce the paper's tables and figures with real jobs; print tables, write a report."""
+    """Reproduce the paper's tables and figures with real jobs; print tables and write a report."""
     from service.paper.bench import StudyBench
     from service.paper.document import to_markdown
     from service.paper.report import render_report
@@ -55,7 +53,7 @@ def reproduce_paper(
 
 @contextmanager
 def _client(url: str | None, key: str | None) -> "Iterator[Client]":
-    """A client of the given server, or of one that lives as long as the command."""
+    """Open a client of the named server, or of one that runs until the command ends."""
     from service.client.client import Client
     from service.client.embedded import run_embedded_service
 

@@ -1,6 +1,7 @@
-"""`lagid reidentify`: a batch over a label, warm-started, as one job and one table.
+"""`lagid reidentify` and `lagid references`.
 
-`lagid references`: runs that were accepted under a name.
+The first runs a warm-started batch over a label as one job with one table. The second lists and
+accepts reference runs by name.
 """
 
 import json
@@ -47,7 +48,7 @@ Experiments = Annotated[
     list[str],
     typer.Argument(
         metavar="X=DATA[,DATA] …",
-        help="For each value of the label its recordings, files or datasets on the server; those "
+        help="Recordings for each value of the label: files or datasets on the server. Those "
         "joined by a comma are fitted together.",
     ),
 ]
@@ -55,27 +56,27 @@ Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML 
 Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
 Reference = Annotated[
     str | None,
-    typer.Option(help="Run (run_…) or accepted reference to start from and compare with."),
+    typer.Option(help="Run (run_…) or accepted reference to start from and to compare with."),
 ]
 Parameters = Annotated[
-    str, typer.Option(help="Parameters to look at, by commas; by default all that are free.")
+    str, typer.Option(help="Parameters to report, separated by commas (default: all free ones).")
 ]
-Predict = Annotated[str, typer.Option(help="Values of X to predict at, by commas.")]
+Predict = Annotated[str, typer.Option(help="Values of X to predict at, separated by commas.")]
 WarmStart = Annotated[
-    str | None, typer.Option(help="reference, previous or none: where each run begins.")
+    str | None, typer.Option(help="Starting point of each run: reference, previous or none.")
 ]
 Channels = Annotated[str, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
 Changes = Annotated[
     list[str] | None,
-    typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
+    typer.Option("--set", help="path=value of the job: parameters.L.upper=0.5."),
 ]
 JobNameOption = Annotated[str | None, typer.Option(help="Name of the job.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
 Accept = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
+    str | None, typer.Option(metavar="NAME", help="Accept a run of the batch as this reference.")
 ]
 AcceptRun = Annotated[
-    str | None, typer.Option(metavar="X", help="Which: that of this value of the label.")
+    str | None, typer.Option(metavar="X", help="Value of the label of the run to accept.")
 ]
 JsonFile = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
@@ -100,9 +101,9 @@ def reidentify(
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
-    """Identify a model anew for several values of a label: estimates, trend, predictions, flags.
+    """Re-identify a model for several values of a label: estimates, trend, predictions, flags.
 
-    Each run begins at the reference, or at the result of its neighbour.
+    Each run starts at the reference, or at the result of its neighbour.
     """
     batch = [_parse_experiments(text) for text in experiments]
     chosen = _choose_label_value([x for x, _ in batch], label, accept, accept_run)
@@ -130,7 +131,7 @@ def reidentify(
 
 
 def _field_origins(experiments: list[str]) -> FieldOrigins:
-    """Where the fields of the body stand on the command line; entries of the batch as typed."""
+    """Map the fields of the body to options; entries of the batch are named as typed."""
     batch = {f"/batch/{number}": text for number, text in enumerate(experiments)}
     return FieldOrigins(
         {
@@ -162,35 +163,35 @@ def _print_outcome(client: "Client", job: dict[str, Any], json_file: str | None)
 def _choose_label_value(
     given: list[float], label: str, accept: str | None, accept_run: str | None
 ) -> float:
-    """The value of the label whose run is to be accepted: known before anything is computed."""
+    """Choose the label value of the run to accept, before anything is computed."""
     there = f"there are {', '.join(f'{x:g}' for x in sorted(set(given)))}"
     if accept is None:
         if accept_run is not None:
-            fail_usage("--accept-run needs --accept NAME, the reference that the run is to be")
+            fail_usage("--accept-run needs --accept NAME, the name of the reference")
         return given[0]
     if accept_run is None and len(set(given)) > 1:
         fail_usage(f"--accept needs --accept-run, a value of {label}; {there}")
     if accept_run is not None and accept_run.startswith("run_"):
         fail_usage(
-            f"--accept-run {accept_run}: need a value of {label}, since only a run of this batch "
-            f"can be meant; {there}. Another run: lagid references accept {accept} {accept_run}"
+            f"--accept-run {accept_run}: need a value of {label}; {there}. For a run of another "
+            f"batch: lagid references accept {accept} {accept_run}"
         )
     x = given[0] if accept_run is None else parse_number("--accept-run", accept_run)
     if given.count(x) != 1:
         found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
-        several = f". Accept one of their runs at the end: lagid references accept {accept} RUN"
+        several = f". Accept one of their runs afterwards: lagid references accept {accept} RUN"
         fail_usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
     return x
 
 
 def _accept_run(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
-    """Make a run of the batch the reference of a name."""
+    """Accept a run of the batch as the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
     _print_accepted(client.accept_reference(name, run["id"]))
 
 
 def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
-    """The batch with identifiers of datasets; files are stored first, each once."""
+    """Replace the files of a batch by dataset ids; each file is uploaded once."""
     known: dict[str, str] = {}
     for source in (one for _, sources in batch for one in sources):
         if source in known:
@@ -225,7 +226,7 @@ ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the 
 
 @app.command("list")
 def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
-    """List the references in use."""
+    """List the current references."""
     with connect_client(url, key) as client:
         found = client.references()
     print_listing(
@@ -248,7 +249,7 @@ def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = F
 def show_reference(
     name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
-    """Show a reference with what was accepted before it."""
+    """Show a reference and the runs accepted before it."""
     with connect_client(url, key) as client:
         found = client.reference(name)
     if as_json:
@@ -274,7 +275,7 @@ def accept_reference(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a run the reference of a name; the one before stays in the history."""
+    """Accept a run as the reference of a name; the previous run stays in the history."""
     with connect_client(url, key) as client, report_faults(REFERENCE_ORIGINS):
         found = client.accept_reference(name, run, by=by, note=note)
     if as_json:

@@ -1,6 +1,7 @@
-"""`lagid runs`: list the runs of a job, and what can be asked of single ones.
+"""`lagid runs` and `lagid export`.
 
-`lagid export`: the identified model of a run as a file for other programs.
+The first lists the runs of a job and analyses single runs. The second writes the identified model
+of a run for other programs.
 """
 
 from pathlib import Path
@@ -43,7 +44,7 @@ RunName = Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")]
 
 
 class _RunsGroup(TyperGroup):
-    """Commands on runs; without the name of one, the runs of a job are listed."""
+    """Group of commands on runs; without a command it lists the runs of a job."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if not args or args[0] not in (*self.commands, "--help"):
@@ -54,8 +55,8 @@ class _RunsGroup(TyperGroup):
 app = typer.Typer(
     cls=_RunsGroup,
     add_completion=False,
-    help="List the runs of a job with their estimates: lagid runs [JOB]; show one: "
-    "lagid runs RUN; or ask about it.",
+    help="List the runs of a job with their estimates: lagid runs [JOB]. Show one run: "
+    "lagid runs RUN. Or analyse a run with one of the commands.",
 )
 app.command(LIST_COMMAND)(listing)
 
@@ -64,7 +65,7 @@ app.command(LIST_COMMAND)(listing)
 def show_residuals(
     run: RunName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
-    """Tell whether a run's residuals are white and independent of the inputs."""
+    """Test whether a run's residuals are white and independent of the inputs."""
     with connect_client(url, key) as client:
         found = client.residuals(run)
     if as_json:
@@ -92,7 +93,7 @@ def show_residuals(
 def simulate_run(
     run: RunName,
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the body of the request.")],
-    max_points: Annotated[int, typer.Option(min=2, help="Points a line, at most.")] = 1000,
+    max_points: Annotated[int, typer.Option(min=2, help="Most points per line.")] = 1000,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
@@ -125,14 +126,15 @@ def simulate_run(
 def profile_run(
     run: RunName,
     parameters: Annotated[
-        list[str] | None, typer.Argument(metavar="PARAMETER…", help="All free ones if none.")
+        list[str] | None,
+        typer.Argument(metavar="PARAMETER…", help="Parameters (default: all free ones)."),
     ] = None,
-    points: Annotated[int, typer.Option(min=3, max=101, help="Values a parameter.")] = 21,
+    points: Annotated[int, typer.Option(min=3, max=101, help="Values per parameter.")] = 21,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Profile likelihood: 95 % intervals with all other parameters estimated anew."""
+    """Compute profile likelihoods: 95 % intervals, all other parameters re-estimated."""
     with connect_client(url, key) as client, report_faults(PROFILE_ORIGINS):
         found = client.profile(run, *(parameters or ()), points=points)
     if as_json:
@@ -190,8 +192,9 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         return
     if metrics["runs_away"]:
         out.print(
-            f"the loop runs away: at the end {metrics['output']} goes or swings farther "
-            "and farther from the reference; choose a smaller gain",
+            f"the loop diverges: {metrics['output']} drifts or oscillates ever farther from the "
+            "reference. "
+            "Choose a smaller gain.",
             markup=False,
         )
         return
@@ -213,7 +216,7 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
 def _print_controller(
     used: dict[str, Any] | None, tuning: dict[str, Any] | None, margins: dict[str, Any] | None
 ) -> None:
-    """The controller's numbers, where a rule has them from, and how stable the loop is."""
+    """Print the controller's settings, their tuning rule, and the stability margins."""
     if used is None:
         return
     parts = [f"K = {used['gain']:.6g}"]
@@ -289,10 +292,13 @@ def export_model(
         typer.Option(help="JSON document, Python or C99 source, or a script for python-control."),
     ] = "json",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write; without it to stdout.")
+        Path | None, typer.Option("--output", "-o", help="File to write (default: stdout).")
     ] = None,
     pade_order: Annotated[
-        int, typer.Option(min=1, max=20, help="Of the dead times' approximation in control.")
+        int,
+        typer.Option(
+            min=1, max=20, help="Order of the Padé approximation of dead times (control)."
+        ),
     ] = 3,
     url: Url = DEFAULT_URL,
     key: Key = None,

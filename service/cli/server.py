@@ -1,7 +1,4 @@
-"""`lagid serve` and `lagid dispatcher`.
-
-`lagid db …` and `lagid doctor`.
-"""
+"""`lagid serve`, `lagid dispatcher`, `lagid db …` and `lagid doctor`."""
 
 import errno
 import signal
@@ -29,10 +26,10 @@ if TYPE_CHECKING:
     from service.storage.sessions import Database
 
 
-SHUTDOWN_SECONDS = 3  # what an open answer may take once the process is asked to end
+SHUTDOWN_SECONDS = 3  # time for open answers once the process is asked to end
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
-Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 for any free one.")]
+Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 chooses a free one.")]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of database, objects and logs.")]
 Cpus = Annotated[int | None, typer.Option(min=1, help="Cores for the workers.")]
 
@@ -44,12 +41,10 @@ def serve(
     cpus: Cpus = None,
     with_dispatcher: Annotated[
         bool,
-        typer.Option(
-            "--run_dispatcher/--no-run_dispatcher", help="Keep a run_dispatcher running beside it."
-        ),
+        typer.Option("--dispatcher/--no-dispatcher", help="Also keep a dispatcher running."),
     ] = True,
 ) -> None:
-    """Serve REST and pages, with a dispatcher beside (defaults from LAGID_… variables)."""
+    """Serve REST and pages, and run a dispatcher (defaults from LAGID_… variables)."""
     settings = load_settings(host=host, port=port, data_dir=data_dir, cpus=cpus)
     settings.check_exposure()
     settings.prepare_data_folder()
@@ -60,7 +55,7 @@ def serve(
         child: AbstractContextManager[Supervisor | None] = nullcontext()
         if with_dispatcher:
             child = supervise_dispatcher(settings)
-        with child as supervisor:  # the dispatcher starts beside all that follows
+        with child as supervisor:  # the dispatcher starts while the following runs
             _check_storage(settings)
             from service.api.app import create_app
 
@@ -74,7 +69,7 @@ def serve(
 
 
 def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
-    """Claim jobs and have them computed, until told to end (`serve` starts one by itself)."""
+    """Claim jobs and compute them until stopped (`serve` starts a dispatcher itself)."""
     settings = load_settings(data_dir=data_dir, cpus=cpus)
     settings.prepare_data_folder()
     from service.dispatch.process import run_process
@@ -83,12 +78,12 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
 
 
 def load_settings(**given: Any) -> "Settings":
-    """Settings of the environment, with the options that were given.
+    """Read settings from the environment; options override them.
 
     Raises
     ------
     Misconfigured
-        If one cannot be used; the message names its variable.
+        If a setting is invalid; the message names its variable.
     """
     from pydantic import ValidationError
 
@@ -104,12 +99,12 @@ def load_settings(**given: Any) -> "Settings":
 
 
 def open_listener(host: str, port: int) -> socket.socket:
-    """A socket that listens there.
+    """Open a socket that listens on this host and port.
 
     Raises
     ------
     Misconfigured
-        If the port is in use, not allowed, or the host has no such address.
+        If the port is in use or not allowed, or the host has no such address.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
@@ -122,7 +117,7 @@ def open_listener(host: str, port: int) -> socket.socket:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise Misconfigured(
-                f"port {port} of {host} is in use; choose another with --port, or --port 0"
+                f"port {port} of {host} is in use; choose another with --port (0: any free port)"
             ) from None
         raise Misconfigured(f"cannot listen on {host}:{port}: {error.strerror}") from None
     return listener
@@ -132,7 +127,7 @@ def _run_server(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor
     import uvicorn
 
     class Server(uvicorn.Server):
-        """Tells open event streams and the dispatcher at once that the process is to end."""
+        """Server that stops open event streams and the dispatcher as soon as it must end."""
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             if supervisor is not None:
@@ -149,12 +144,12 @@ def _run_server(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor
 
 
 def _check_storage(settings: "Settings") -> None:
-    """Open database and objects once, so that what cannot be opened is told in one line.
+    """Open the database and the object store once, so that a failure prints one line.
 
     Raises
     ------
     Misconfigured, StorageError
-        If one cannot be opened.
+        If one of them cannot be opened.
     """
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -165,14 +160,14 @@ def _check_storage(settings: "Settings") -> None:
     except SQLAlchemyError as error:
         reason = str(error).splitlines()[0]
         raise Misconfigured(
-            f"the database cannot be opened: {reason}; is its server running, and is "
-            "LAGID_DATABASE_URL right?"
+            f"the database cannot be opened: {reason}. Check that its server runs and that "
+            "LAGID_DATABASE_URL is right."
         ) from None
     database.dispose()
 
 
 def _exit_on_signals() -> None:
-    """End by an exception, so that what is open is closed; uvicorn raises the signal again."""
+    """End by an exception, so that resources are closed; uvicorn raises the signal again."""
 
     def end(_signal: int, _frame: FrameType | None) -> None:
         raise SystemExit(0)
@@ -181,15 +176,15 @@ def _exit_on_signals() -> None:
     signal.signal(signal.SIGINT, end)
 
 
-database_app = typer.Typer(help="The tables of the database.", no_args_is_help=True)
+database_app = typer.Typer(help="Upgrade and check the database.", no_args_is_help=True)
 
 REQUIRED_PACKAGES = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", "mcap")
-Fix = Annotated[bool, typer.Option("--fix", help="Delete the objects that no row names.")]
+Fix = Annotated[bool, typer.Option("--fix", help="Delete objects that no row refers to.")]
 
 
 @database_app.command("upgrade")
 def upgrade_database(data_dir: DataDir = None) -> None:
-    """Create the tables, or bring them to this version."""
+    """Create the tables, or upgrade them to this version."""
     from service.storage import migrate
 
     settings = load_settings(data_dir=data_dir)
@@ -203,15 +198,15 @@ def upgrade_database(data_dir: DataDir = None) -> None:
 
 @database_app.command("check")
 def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
-    """Compare database and store: the revision, lost objects, objects that no row names."""
+    """Compare database and store: revision, lost objects, objects that no row refers to."""
     from service.storage import garbage, migrate
     from service.storage.objects import open_store
 
     settings = load_settings(data_dir=data_dir)
     if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
         raise Misconfigured(
-            f"there is no database in {settings.data_dir.absolute()}; `lagid serve` or "
-            "`lagid db upgrade` makes one, or name another folder with --data-dir"
+            f"there is no database in {settings.data_dir.absolute()}. Create one with "
+            "`lagid serve` or `lagid db upgrade`, or name another folder with --data-dir."
         )
     with open_database(settings) as found:
         migrate.check_revision(found)
@@ -252,12 +247,12 @@ def check_installation(data_dir: DataDir = None) -> None:
 
 @contextmanager
 def open_database(settings: "Settings") -> Iterator["Database"]:
-    """The database, for the length of a command.
+    """Open the database until the command ends.
 
     Raises
     ------
     Unavailable
-        In one line, if it does not answer.
+        If it does not answer; the message has one line.
     """
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -282,7 +277,7 @@ def _check_packages() -> str:
 
 
 def _check_kernels() -> str:
-    """Compile a model and simulate it: the harmonic oscillator without force rests."""
+    """Compile a model and simulate it: without force, the oscillator stays at rest."""
     import numpy as np
 
     from sysid.data.records import Channel
@@ -295,7 +290,7 @@ def _check_kernels() -> str:
     values = {p.name: p.lower for p in model.parameters}
     rest = simulate(model, [force], values, times=times).channels[-1].values
     if np.any(rest != 0.0):
-        raise ArithmeticError("a system at rest without a force moves: the compiler is at fault")
+        raise ArithmeticError("a system at rest moves without a force; the compiler is faulty")
     return "compiled, and a system at rest stays at rest"
 
 
@@ -306,7 +301,7 @@ def _check_folder(settings: "Settings") -> str:
         return str(folder)
     above = next(parent for parent in folder.parents if parent.is_dir())
     _check_writable(above)
-    return f"{folder} (will be made)"
+    return f"{folder} (will be created)"
 
 
 def _check_writable(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""`lagid sweep noise`: how far noise moves what is found, as one job and one table."""
+"""`lagid sweep noise`: errors of the estimates under noise, as one job and one table."""
 
 from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=True)
+app = typer.Typer(help="Recipes: sweeps for one purpose.", no_args_is_help=True)
 
 MAX_SIGMA_VALUES = 100_000
 SIGMA_PATH, RELATIVE_KEY, METHOD_PATH = "/noise/sigma", "relative", "/algorithm/method"
-# Of a relative σ the rows tell what was typed beside what it is in the output's unit.
+# With a relative σ, rows show the typed value and the value in the output's unit.
 GROUP_KEYS = {False: None, True: [RELATIVE_KEY, SIGMA_PATH, METHOD_PATH]}
-RELATIVE_NOTE = "a relative σ is in standard deviations of the output, the σ beside it in its unit"
-PARAMETERS_PER_TABLE = 4  # parameters beside each other
+RELATIVE_NOTE = "relative σ is in standard deviations of the output, σ is in the output's unit"
+PARAMETERS_PER_TABLE = 4
 LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX = (
     0,
     2,
@@ -70,31 +70,41 @@ FIELD_ORIGINS = FieldOrigins(
 )
 
 Data = Annotated[
-    str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
+    str | None,
+    typer.Option("--data", help="Datasets on the server: ids or names, separated by commas."),
 ]
 Sigma = Annotated[
     list[str],
-    typer.Option("--sigma", help="start:stop:step with both ends, or numbers: 0,0.1,0.3."),
+    typer.Option("--sigma", help="start:stop:step including stop, or numbers: 0,0.1,0.3."),
 ]
 TrueParameters = Annotated[
-    NamedValues, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
+    NamedValues,
+    typer.Option(
+        "--true", metavar="NAME=VALUE", help="True value of a parameter of the simulation."
+    ),
 ]
 Input = Annotated[
     NamedValues,
-    typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'."),
+    typer.Option(
+        "--input", metavar="NAME=EXPRESSION", help="Input as a function of t: 'q=10*cos(5*t)'."
+    ),
 ]
 Relative = Annotated[
-    bool, typer.Option("--relative", help="σ in standard deviations of the output.")
+    bool, typer.Option("--relative", help="σ is in standard deviations of the output.")
 ]
-Replicates = Annotated[int, typer.Option(help="Draws of noise and of the search for each σ.")]
-ClientMethods = Annotated[str, typer.Option(help=f"Of {', '.join(SEARCH_METHODS)}.")]
-Seed = Annotated[int, typer.Option(help="Of all draws; each replicate has its own from it.")]
+Replicates = Annotated[
+    int, typer.Option(help="Runs per σ and method, each with its own noise and search seed.")
+]
+ClientMethods = Annotated[str, typer.Option(help=f"Search methods: {', '.join(SEARCH_METHODS)}.")]
+Seed = Annotated[
+    int, typer.Option(help="Seed of the sweep; the replicates' seeds are derived from it.")
+]
 Channels = Annotated[str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
 Changes = Annotated[
-    NamedValues, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
+    NamedValues, typer.Option("--set", help="path=value of the job: algorithm.population=100.")
 ]
 Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
-IdempotencyKey = Annotated[str | None, typer.Option(help="The same key again: the same job.")]
+IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns the same job.")]
 
 
 @app.command("noise")
@@ -104,8 +114,8 @@ def sweep_noise(
     data: Data = None,
     true: TrueParameters = None,
     inputs: Input = None,
-    samples: Annotated[int | None, typer.Option(help="Samples to simulate.")] = None,
-    sample_time: Annotated[float | None, typer.Option(help="Their period in s.")] = None,
+    samples: Annotated[int | None, typer.Option(help="Number of samples to simulate.")] = None,
+    sample_time: Annotated[float | None, typer.Option(help="Sampling period in s.")] = None,
     relative: Relative = False,
     replicates: Replicates = 20,
     methods: ClientMethods = "simple,improved",
@@ -119,10 +129,10 @@ def sweep_noise(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Identify under noise: σ × replicates × methods, each parameter's error beside its floor.
+    """Identify under noise: σ × replicates × methods; errors and Cramér–Rao bounds.
 
-    The record is simulated (--true, --input, --samples, --sample-time) or a dataset's (--data).
-    With more replicates, or another grid, only the runs that are new are computed.
+    The record is simulated (--true, --input, --samples, --sample-time) or a dataset (--data).
+    With more replicates, or another grid, only new runs are computed.
     """
     truth = _build_truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
@@ -147,9 +157,9 @@ def sweep_noise(
 
 
 def parse_sigma_grid(text: str) -> list[float]:
-    """Values of σ from ``0:1:0.05``, both ends taken, or from ``0,0.1,0.3``.
+    """Parse values of σ from ``0:1:0.05`` (including both ends) or from ``0,0.1,0.3``.
 
-    Counted in decimals, so that the third of 0:1:0.05 is 0.15 and no number beside it.
+    The steps are computed in decimals, so that the fourth value of 0:1:0.05 is exactly 0.15.
     """
     found: list[float] = []
     for part in split_names(text):
@@ -160,7 +170,9 @@ def parse_sigma_grid(text: str) -> list[float]:
             start, stop, step = ends
             count = int((stop - start) / step) + 1
             if count > MAX_SIGMA_VALUES:
-                fail_usage(f"--sigma {text}: {count} values; at most {MAX_SIGMA_VALUES}")
+                fail_usage(
+                    f"--sigma {text}: {count} values; at most {MAX_SIGMA_VALUES} are allowed"
+                )
             found += [float(start + step * number) for number in range(count)]
         else:
             fail_usage(
@@ -173,9 +185,10 @@ def parse_sigma_grid(text: str) -> list[float]:
 
 
 def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
-    """Headings and rows of the tables of a noise sweep, a row for each σ and method.
+    """Build headings and rows of the tables of a noise sweep, a row for each σ and method.
 
-    The first has the runs and the error of the response, the others those of the parameters.
+    The first table has the runs and the error of the response. The others have the errors of the
+    parameters.
     """
     groups = summary["groups"]
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
@@ -288,7 +301,7 @@ def _choose_source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
     given = {name: value for name, value in truth.items() if value}
     if (data is None) == (not given):
         fail_usage(
-            "give either --data, or --true, --input, --samples and --sample-time to simulate"
+            "need either --data, or --true, --input, --samples and --sample-time to simulate"
         )
     return {"truth": given} if data is None else {"datasets": split_names(data)}
 

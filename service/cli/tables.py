@@ -1,8 +1,7 @@
-"""One run in a terminal: what distinguishes it, its estimates, its fit, its warnings.
+"""Print results in a terminal: one run, a summary of many runs, a trend.
 
-What a terminal tells at the end of a job of many runs: counts, groups, kinds of warnings.
-
-A trend as tables: the batch, the laws, the predictions.
+One run is printed with its coordinates, estimates, fit and warnings. Many runs are summarised by
+counts, groups and kinds of warnings. A trend is printed as tables: batch, laws, predictions.
 """
 
 import re
@@ -28,11 +27,11 @@ if TYPE_CHECKING:
 
 
 DATASETS_PATH = "/datasets"
-REUSE_NOTE = "the same run was computed before: the result of {} is shown"
+REUSE_NOTE = "this run was computed before; the result of {} is shown"
 
 
 def run_coordinates(run: dict[str, Any]) -> dict[str, object]:
-    """Labels and values of axes of a run; where labels tell of the data, their ids are left out."""
+    """Return labels and axis values of a run; labels replace the ids of datasets."""
     labels = run["labels"]
     cell = {
         path.removeprefix("/").replace("/", "."): value
@@ -43,7 +42,7 @@ def run_coordinates(run: dict[str, Any]) -> dict[str, object]:
 
 
 def print_run(run: dict[str, Any], as_json: bool) -> None:
-    """Print what `GET /v1/runs/{id}` tells."""
+    """Print the answer of `GET /v1/runs/{id}`."""
     if as_json:
         print_json(run)
         return
@@ -75,15 +74,15 @@ def print_run(run: dict[str, Any], as_json: bool) -> None:
 
 
 def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
-    """Say which results of a job were computed for others before, and how to have them anew."""
+    """Print which results were computed by earlier jobs, and how to compute them again."""
     reused, n_runs = job["progress"]["reused"], job["progress"]["runs"]
     if not reused:
         return
     if n_runs == 1 and runs:
         text = REUSE_NOTE.format(runs[0]["reused_from"])
     else:
-        text = f"{reused} of {n_runs} runs were computed before: their results are shown"
-    print_line(f"note: {text}; to compute anew: {cure}")
+        text = f"{reused} of {n_runs} runs were computed before; their results are shown"
+    print_line(f"note: {text}. To compute again: {cure}")
 
 
 def _format_fit(run: dict[str, Any]) -> str:
@@ -113,7 +112,7 @@ def _format_interval(ends: list[float | None] | None) -> str:
 
 
 MAX_PRINTED = 50
-"""Runs, and groups of runs, that are printed one by one."""
+"""Most runs, or groups of runs, that are printed one by one."""
 MAX_WARNING_KINDS = 10
 NUMBER_PATTERN = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 LOW_QUANTILE, MEDIAN, HIGH_QUANTILE = 0.05, 0.5, 0.95
@@ -132,7 +131,7 @@ def print_run_summary(client: "Client", job: dict[str, Any], runs: list[dict[str
 def _print_groups(client: "Client", job: dict[str, Any]) -> None:
     try:
         summary = client.summary(job["id"])
-    except ProblemError as error:  # more groups than the server parts runs into
+    except ProblemError as error:  # more groups than the server allows
         print_line(f"no groups: {error}")
         return
     groups, places = (
@@ -151,7 +150,7 @@ def _print_groups(client: "Client", job: dict[str, Any]) -> None:
         headings, [_group_row(one, units, places) for one in groups[:MAX_PRINTED]], empty="no runs"
     )
     if len(groups) > MAX_PRINTED:
-        print_line(f"… and {len(groups) - MAX_PRINTED} groups more")
+        print_line(f"… and {len(groups) - MAX_PRINTED} more groups")
 
 
 def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
@@ -173,17 +172,17 @@ def _format_band(quantiles: Sequence[float] | None, places: Sequence[int]) -> st
 
 
 def _print_warning_kinds(warnings: list[str]) -> None:
-    """Warnings that differ in their numbers only are of one kind, told by its first."""
+    """Print the first warning of each kind; warnings of one kind differ only in numbers."""
     kinds = Counter(NUMBER_PATTERN.sub("…", one) for one in warnings)
     first = {NUMBER_PATTERN.sub("…", one): one for one in reversed(warnings)}
     for kind, count in kinds.most_common(MAX_WARNING_KINDS):
-        print_line(f"note ({count} ×, such as): {first[kind]}")
+        print_line(f"note ({count} ×, for example): {first[kind]}")
     if len(kinds) > MAX_WARNING_KINDS:
-        print_line(f"… and {len(kinds) - MAX_WARNING_KINDS} kinds of notes more")
+        print_line(f"… and {len(kinds) - MAX_WARNING_KINDS} more kinds of notes")
 
 
 def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
-    """Print what `GET /v1/jobs/{id}/trend` tells, with notes that name the user's `places`."""
+    """Print the answer of `GET /v1/jobs/{id}/trend`; notes name the options of `places`."""
     tables = build_tables(trend, PLAIN)
     headings = [
         f">{trend['x']}",

@@ -1,8 +1,8 @@
-"""Live progress of a job: one bar a run, with its RMS; one bar for all where there are many.
+"""Show the progress of a job: one bar per run with its RMS, or one bar for many runs.
 
-Where nobody looks (a file, a pipe) there are lines instead: at every change of state, and every
-`LOG_INTERVAL_SECONDS` at most. Of many runs both tell how many are done and how fast, not the best
-RMS: on other data or under other noise it tells nothing.
+In a file or a pipe, lines replace the bars: one at every change of state, and at most one every
+`LOG_INTERVAL_SECONDS`. For many runs both show how many are done and how fast. They omit the best
+RMS, since RMS on different data or under different noise cannot be compared.
 """
 
 import time
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MAX_BARS = 12
 LOG_INTERVAL_SECONDS = 10.0
 RUN_POLL_SECONDS = 1.0
-"""The run that ended last is asked for no more often."""
+"""Shortest interval between two requests for the run that ended last."""
 BAR_COLUMNS = (
     TextColumn("{task.description:<24.24}", markup=False),
     BarColumn(bar_width=30),
@@ -37,7 +37,7 @@ Clock = Callable[[], float]
 
 
 def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
-    """Show a job until it ends; its last state."""
+    """Show a job until it ends; return its last state."""
     if quiet:
         return client.wait(job_id)
     first = client.job(job_id)
@@ -52,16 +52,16 @@ def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Documen
 
 
 class RunsProgress:
-    """What is told of the runs of a job: failed and reused, their pace, the one that ended last.
+    """Progress text of a job's runs: failed and reused, their pace, the run that ended last.
 
     Parameters
     ----------
     newest : callable
-        Gives the run that ended last, or None.
+        Returns the run that ended last, or None.
     unit : str or None
-        Of the RMS.
+        Unit of the RMS.
     clock : callable
-        Seconds that never go back.
+        Monotonic clock in seconds.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class RunsProgress:
         self._looked, self._seen, self._text = 0.0, 0, ""
 
     def describe_progress(self, job: Document) -> list[str]:
-        """The parts of a line about a job of several runs."""
+        """Return the parts of a progress line of a job with several runs."""
         done, is_over = job["progress"], job["state"] in TERMINAL_STATES
         parts = [f"{done[what]} {what}" for what in ("failed", "reused") if done[what]]
         if is_over:
@@ -87,11 +87,11 @@ class RunsProgress:
         return [*parts, *([text] if (text := self._describe_last_run(done["finished"])) else [])]
 
     def format_rms(self, value: float | None) -> str:
-        """An RMS with its unit."""
+        """Format an RMS with its unit."""
         return "RMS –" if value is None else f"RMS {value:.6g}{plain_unit(self.unit)}"
 
     def _runs_per_second(self, finished: int) -> float:
-        """Runs a second since the first look at the running job."""
+        """Return the runs per second since the running job was first seen."""
         now = self.clock()
         if self._begun is None:
             self._begun = now, finished
@@ -113,14 +113,14 @@ class RunsProgress:
 
 
 class ProgressLog:
-    """Lines of one job for a log; `tell` takes a line."""
+    """Progress lines of one job for a log; `tell` writes a line."""
 
     def __init__(self, tell: Callable[[str], object], many: RunsProgress) -> None:
         self._tell, self._many = tell, many
         self._state, self._last, self._text = "", 0.0, ""
 
     def log_progress(self, job: Document) -> None:
-        """Tell what is new, if its state changed or the last line is old enough."""
+        """Write a line if the state has changed or the last line is old enough."""
         now = self._many.clock()
         if job["state"] == self._state and now - self._last < LOG_INTERVAL_SECONDS:
             return
@@ -143,7 +143,7 @@ class ProgressLog:
 
 
 class _ProgressBars:
-    """The bars of one job, one for all its runs or one each, brought up to date at every look."""
+    """Progress bars of one job: one for all runs, or one per run."""
 
     def __init__(
         self, client: "Client", progress: Progress, many: RunsProgress, *, is_one: bool
@@ -176,13 +176,13 @@ class _ProgressBars:
 
 
 def _find_newest_run(client: "Client", job_id: str) -> Document | None:
-    """The run with the highest number of those that have ended: they begin in that order."""
+    """Find the ended run with the highest number; runs start in the order of their numbers."""
     ended = ["succeeded", "failed"]
     found = client.runs(job_id, at_most=1, state=ended, order="number", descending=True)
     return found[0] if found else None
 
 
 def _describe_cell(run: Document) -> str:
-    """Labels and values of axes of a run, without those that are data or models."""
+    """Describe a run by its labels and axis values, except datasets and models."""
     values = [*run["labels"].values(), *run["cell"].values()]
     return ", ".join(format_value(one) for one in values if not isinstance(one, dict | list))

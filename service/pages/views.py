@@ -165,7 +165,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         warnings=result.get("warnings", ()),
         has_signals=run.signals_sha256 is not None,
         heights=heights,
-        findings=to_diagnostics(result),
+        diagnostics=to_diagnostics(result),
     )
 
 

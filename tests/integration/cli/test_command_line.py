@@ -177,7 +177,7 @@ def test_a_command_without_its_words_shows_the_help() -> None:
         (["--set", "model=tube"], "--model"),
         (["--set", f"algorithm.stagnation={10**30}"], "lagid: --set algorithm.stagnation: "),
         (["--set", f"algorithm.stagnation={'9' * 5000}"], "lagid: "),
-        (["--validation", "{data}"], "the recording that is fitted"),
+        (["--validation", "{data}"], "this is the estimation recording"),
     ],
 )
 def test_what_identify_cannot_do_in_this_process_is_refused(

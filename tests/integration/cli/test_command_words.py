@@ -26,4 +26,4 @@ def test_a_word_that_is_no_text_is_one_line(words: list[str], tmp_path: Path) ->
     )
     told = refused(done)
     assert r"\udcf6" in told
-    assert told.endswith("is not UTF-8 text; write it in UTF-8")
+    assert told.endswith("is not UTF-8 text; encode it in UTF-8")

@@ -191,7 +191,7 @@ def test_a_result_that_was_computed_before_is_said_to_be(
     taken = {**served.client.run(before), "reused_from": "run_before"}
     monkeypatch.setattr(served.client, "run", lambda _: taken)
     assert (
-        "note: the same run was computed before: the result of run_before"
+        "note: this run was computed before; the result of run_before"
         in lagid("runs", before).stdout
     )
 

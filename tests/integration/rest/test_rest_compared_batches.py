@@ -167,7 +167,7 @@ def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_mo
         (["5=ds_a", "5=ds_b", "--accept", "x"], "2 experiments have length_m = 5"),
         (
             ["5=ds_a", "--accept", "x", "--accept-run", "run_1"],
-            "only a run of this batch can be meant",
+            "For a run of another batch: lagid references accept",
         ),
         (["5=ds_a", "--accept-run", "5"], "--accept-run needs --accept NAME"),
     ],

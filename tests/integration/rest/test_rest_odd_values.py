@@ -129,4 +129,4 @@ def test_of_very_many_faults_a_thousand_are_told(server: TestClient, dataset: st
     body = {"model": "fopdt", "datasets": [dataset], "parameters": names}
     faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
     assert len(faults) == 1002
-    assert faults[-1]["detail"] == "and more faults, not told here"
+    assert faults[-1]["detail"] == "more faults follow; they are not listed"

@@ -34,7 +34,7 @@ def test_a_full_disk_is_a_part_that_is_down(
     monkeypatch.setattr("service.api.content._save_body", full)
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
-    assert "no space left" in answer.json()["detail"]
+    assert "a disk of the server is full" in answer.json()["detail"]
 
 
 def test_a_mistake_in_a_statement_is_not_told_as_a_database_that_is_away(

@@ -127,14 +127,14 @@ def test_nothing_new_is_not_told_again():
         (
             1,
             1,
-            "note: the same run was computed before: the result of run_0 is shown; to compute "
-            "anew: reuse: false in the job",
+            "note: this run was computed before; the result of run_0 is shown. To compute "
+            "again: reuse: false in the job",
         ),
         (
             40,
             3,
-            "note: 3 of 40 runs were computed before: their results are shown; to compute "
-            "anew: reuse: false in the job",
+            "note: 3 of 40 runs were computed before; their results are shown. To compute "
+            "again: reuse: false in the job",
         ),
         (40, 0, ""),
     ],
