@@ -85,8 +85,10 @@ class FairShare(Generic[Key]):
             (name for name in self._projects.keys() - active if self._projects[name].level > floor),
             key=lambda name: (-self._projects[name].level, name),
         )
-        kept = active | set(ahead[:MAX_ABSENT_PROJECTS]) if active else set()
-        self._projects = {name: one for name, one in self._projects.items() if name in kept}
+        retained = active | set(ahead[:MAX_ABSENT_PROJECTS]) if active else set()
+        self._projects = {
+            name: account for name, account in self._projects.items() if name in retained
+        }
 
     def get_project(self, job: Key) -> str:
         """The project that a job belongs to."""
@@ -99,15 +101,17 @@ class FairShare(Generic[Key]):
 
     def charge_seconds(self, job: Key, seconds: float) -> None:
         """A pack of this job has taken `seconds` of compute time."""
-        one = self._jobs[job]
-        was_fresh = one.received_seconds < HEADSTART_SECONDS
-        one.received_seconds += seconds
-        one.level += seconds
-        mates = [self._jobs[mate] for mate in self._list_past_headstart(one.project) if mate != job]
-        if was_fresh and one.received_seconds >= HEADSTART_SECONDS:
-            one.level = max(one.level, min((mate.level for mate in mates), default=0.0))
-        _raise_levels(one, mates)
-        project = self._projects[one.project]
+        account = self._jobs[job]
+        was_fresh = account.received_seconds < HEADSTART_SECONDS
+        account.received_seconds += seconds
+        account.level += seconds
+        mates = [
+            self._jobs[mate] for mate in self._list_past_headstart(account.project) if mate != job
+        ]
+        if was_fresh and account.received_seconds >= HEADSTART_SECONDS:
+            account.level = max(account.level, min((mate.level for mate in mates), default=0.0))
+        _raise_levels(account, mates)
+        project = self._projects[account.project]
         project.level += seconds
         _raise_levels(project, self._projects.values())
 
@@ -123,17 +127,24 @@ class FairShare(Generic[Key]):
         in_flight : mapping
             Packs that each job has with the workers; they count as if they were charged.
         """
-        of_project: dict[str, int] = dict.fromkeys(self._projects, 0)
+        project_packs: dict[str, int] = dict.fromkeys(self._projects, 0)
         for job, count in in_flight.items():
-            of_project[self._jobs[job].project] += count
+            project_packs[self._jobs[job].project] += count
         floor = self._find_lowest_level()
 
-        def turn(job: Key) -> tuple[Rank, float, float]:
-            one = self._jobs[job]
-            of_all = self._projects[one.project].level + PACK_SECONDS * of_project[one.project]
-            return self._rank_account(one, floor), of_all, one.level + PACK_SECONDS * in_flight[job]
+        def sort_key(job: Key) -> tuple[Rank, float, float]:
+            account = self._jobs[job]
+            project_level = (
+                self._projects[account.project].level
+                + PACK_SECONDS * project_packs[account.project]
+            )
+            return (
+                self._rank_account(account, floor),
+                project_level,
+                account.level + PACK_SECONDS * in_flight[job],
+            )
 
-        ordered = sorted(in_flight, key=turn)
+        ordered = sorted(in_flight, key=sort_key)
         if ordered and self._n_packs % LONGEST_WAIT_INTERVAL == LONGEST_WAIT_INTERVAL - 1:
             patient = min(ordered, key=lambda job: self._jobs[job].last_pack)
             ordered.remove(patient)
@@ -142,7 +153,7 @@ class FairShare(Generic[Key]):
 
     def _list_active_projects(self) -> set[str]:
         """Projects with jobs."""
-        return {one.project for one in self._jobs.values()}
+        return {account.project for account in self._jobs.values()}
 
     def _find_lowest_level(self) -> float:
         """The least that a project with jobs has had."""
@@ -150,19 +161,19 @@ class FairShare(Generic[Key]):
             (self._projects[name].level for name in self._list_active_projects()), default=0.0
         )
 
-    def _rank_account(self, one: _JobAccount, floor: float) -> Rank:
-        privileged = self._projects[one.project].level - floor < HEADSTART_SECONDS
-        return -one.priority, not (privileged and one.received_seconds < HEADSTART_SECONDS)
+    def _rank_account(self, account: _JobAccount, floor: float) -> Rank:
+        privileged = self._projects[account.project].level - floor < HEADSTART_SECONDS
+        return -account.priority, not (privileged and account.received_seconds < HEADSTART_SECONDS)
 
     def _list_past_headstart(self, project: str) -> list[Key]:
         """Jobs of a project that have had their head start."""
         return [
             job
-            for job, one in self._jobs.items()
-            if one.project == project and one.received_seconds >= HEADSTART_SECONDS
+            for job, account in self._jobs.items()
+            if account.project == project and account.received_seconds >= HEADSTART_SECONDS
         ]
 
 
 def _raise_levels(ahead: _Account, others: Iterable[_Account]) -> None:
-    for one in others:
-        one.level = max(one.level, ahead.level - MAX_SAVED_SECONDS)
+    for account in others:
+        account.level = max(account.level, ahead.level - MAX_SAVED_SECONDS)

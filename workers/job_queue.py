@@ -39,10 +39,10 @@ class JobQueue:
         Items of each pack in flight.
     """
 
-    def __init__(self, source: JobSource, observer: RunObserver, crew: Executor) -> None:
+    def __init__(self, source: JobSource, observer: RunObserver, executor: Executor) -> None:
         self.observer = observer
         self.in_flight: dict[PackHandle, tuple[WorkItem, ...]] = {}
-        self._source, self._executor = source, crew
+        self._source, self._executor = source, executor
         self._entries: Iterator[JobEntry] = iter(source.iterate_runs())
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
@@ -109,20 +109,20 @@ class JobQueue:
             size = choose_pack_size(self._cost, len(self._ready), shared_by)
             self._submit_items([run.make_slice(self._cost) for run in self._take_unstarted(size)])
 
-    def absorb_pack(self, handle: PackHandle, done: tuple[ItemResult, ...]) -> None:
+    def absorb_pack(self, handle: PackHandle, results: tuple[ItemResult, ...]) -> None:
         """Take in what a pack gave; islands whose turn did not come are sent again."""
         items = self.in_flight.pop(handle)
         waiting = self._release_runs(handle, items)
         again: list[WorkItem] = []
-        for item, one in zip(items, done, strict=True):
-            run = self._active.get(one.run)
+        for item, result in zip(items, results, strict=True):
+            run = self._active.get(result.run)
             if run is None:
                 continue  # it failed while another of its islands was still out
-            run.seconds += one.seconds
+            run.seconds += result.seconds
             if run not in waiting:
                 continue
-            if one.outcome is not None:
-                self._take_result(run, one)
+            if result.outcome is not None:
+                self._take_result(run, result)
             elif isinstance(item, EvolveIsland):
                 again.append(item)
             else:
@@ -199,11 +199,11 @@ class JobQueue:
     def _release_runs(self, handle: PackHandle, items: Sequence[WorkItem]) -> list[ActiveRun]:
         """The runs that wait for this pack, which is back; not those that go on without it."""
         names = dict.fromkeys(item.run for item in items)
-        found = [self._active[name] for name in names if name in self._active]
-        found = [run for run in found if handle in run.pack_handles]
-        for run in found:
+        runs = [self._active[name] for name in names if name in self._active]
+        runs = [run for run in runs if handle in run.pack_handles]
+        for run in runs:
             run.pack_handles.discard(handle)
-        return found
+        return runs
 
     def _report_start(self, run: ActiveRun) -> None:
         if not run.has_begun:
@@ -217,20 +217,20 @@ class JobQueue:
             self._shared[key] = self._executor.share_records(self._source.load_records(key))
         return self._shared[key]
 
-    def _take_result(self, run: ActiveRun, one: ItemResult) -> None:
-        match one.outcome:
+    def _take_result(self, run: ActiveRun, result: ItemResult) -> None:
+        match result.outcome:
             case RunFailure() as failure:
-                self._cost = self._cost.add_measurement(one.seconds)
+                self._cost = self._cost.add_measurement(result.seconds)
                 self._fail_run(run.run, failure)
             case RunConclusion() as concluded:
                 self._cost = self._cost.add_measurement(run.seconds)
                 del self._active[run.run]
                 self._unreported.append((run.run, concluded, run.seconds))
             case RunProgress(state):
-                run.absorb_slice(state, one.seconds)
+                run.absorb_slice(state, result.seconds)
                 self._continue_run(run)
             case IslandProgress() as evolved:
-                if run.absorb_island(evolved, one.seconds):
+                if run.absorb_island(evolved, result.seconds):
                     self._continue_run(run)
 
     def _retry_or_fail(self, run: ActiveRun, reason: str) -> bool:

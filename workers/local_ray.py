@@ -132,13 +132,13 @@ def _skip_unused_programs() -> Iterator[None]:
     """
     from ray._private.node import Node
 
-    kept = {name: getattr(Node, name) for name in _UNUSED_STARTS if hasattr(Node, name)}
+    originals = {name: getattr(Node, name) for name in _UNUSED_STARTS if hasattr(Node, name)}
     try:
-        for name in kept:
+        for name in originals:
             setattr(Node, name, _start_nothing)
         yield
     finally:
-        for name, method in kept.items():
+        for name, method in originals.items():
             setattr(Node, name, method)
 
 

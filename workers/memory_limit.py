@@ -49,4 +49,4 @@ def _read_used_memory() -> int:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return 0
-    return next((1024 * int(one.split()[1]) for one in lines if one.startswith("VmData")), 0)
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmData")), 0)

@@ -61,7 +61,9 @@ class ProblemSpec:
         What is written in another order is another one: the parameters' order is that in which a
         search draws them.
         """
-        parts = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "noise"}
+        parts = {
+            item.name: getattr(self, item.name) for item in fields(self) if item.name != "noise"
+        }
         text = json.dumps(parts, default=_to_json_value)
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -96,8 +98,10 @@ class RunSpec:
             self.seed,
             [*map(dict, self.warm_starts)],
         )
-        known = compute_fingerprint(Path(__file__).parent)  # workers split records and add noise
-        return blake2b(f"{parts}{known}".encode(), digest_size=16).hexdigest()
+        fingerprint = compute_fingerprint(
+            Path(__file__).parent
+        )  # workers split records and add noise
+        return blake2b(f"{parts}{fingerprint}".encode(), digest_size=16).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +151,10 @@ class RunConclusion:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Improvements and migrants as plain tuples: named ones cost several times as much."""
-        found = self.identification
-        histories = [[tuple(one) for one in island] for island in found.history]
-        migrants = [tuple(one) for one in found.migrations]
-        rest = replace(found, history=(), migrations=())
+        identification = self.identification
+        histories = [[tuple(item) for item in island] for island in identification.history]
+        migrants = [tuple(item) for item in identification.migrations]
+        rest = replace(identification, history=(), migrations=())
         return _rebuild_conclusion, (rest, histories, migrants, self.rms_noise_free)
 
 
@@ -161,8 +165,8 @@ def _rebuild_conclusion(
     rms_noise_free: float | None,
 ) -> RunConclusion:
     history = tuple(tuple(map(Improvement._make, island)) for island in histories)
-    found = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
-    return RunConclusion(found, rms_noise_free)
+    identification = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
+    return RunConclusion(identification, rms_noise_free)
 
 
 @dataclass(frozen=True, slots=True)

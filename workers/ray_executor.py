@@ -125,14 +125,14 @@ class RayExecutor:
         if not ready:
             raise ClusterUnavailable(f"no worker of Ray came up within {START_SECONDS:.0f} s")
         try:
-            found = self._ray.get(ready, timeout=FETCH_SECONDS)
+            fingerprints = self._ray.get(ready, timeout=FETCH_SECONDS)
         except self._ray.exceptions.RayError as error:
             last = str(error).strip().splitlines()[-1]
             raise ClusterUnavailable(f"Ray's workers do not come up: {last}") from error
-        for one in late:
-            self._ray.cancel(one, force=False)
+        for pending in late:
+            self._ray.cancel(pending, force=False)
         if self._local is None:
-            _require_same_program(found)
+            _require_same_program(fingerprints)
         self._last_answer = time.monotonic()
 
     def share_records(self, records: Records) -> Any:
@@ -234,20 +234,20 @@ class RayExecutor:
                 raise ClusterLost("a process of the local Ray is gone")
 
     def _count_slots(self) -> int:
-        there = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-        return there if self._most_slots is None else min(there, self._most_slots)
+        available = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        return available if self._most_slots is None else min(available, self._most_slots)
 
     def _watch_slot_count(self) -> None:
         """In a thread, as the call may hang; the feeder sees the new number at its next step."""
         while not self._closing.wait(SLOT_COUNT_SECONDS):
             try:
-                there = self._count_slots()
+                slots = self._count_slots()
             except (self._ray.exceptions.RayError, RuntimeError, ConnectionError) as error:
                 _log.warning("the cores of the cluster could not be counted: %s", error)
                 continue
-            if there != self.slots:
-                _log.info("the cluster has %d cores now, before %d", there, self.slots)
-                self.slots = there
+            if slots != self.slots:
+                _log.info("the cluster has %d cores now, before %d", slots, self.slots)
+                self.slots = slots
 
     def _remove_folder(self) -> None:
         if self._local is not None:
@@ -279,8 +279,8 @@ def _join_cluster(ray: Any, address: str) -> None:
         raise ClusterUnavailable(explain_failure(address, error)) from error
 
 
-def _require_same_program(found: Sequence[str]) -> None:
-    others = set(found) - {compute_fingerprint(Path(__file__).parent)}
+def _require_same_program(fingerprints: Sequence[str]) -> None:
+    others = set(fingerprints) - {compute_fingerprint(Path(__file__).parent)}
     if others:
         raise ClusterUnavailable(
             "some Ray workers differ from the dispatcher in the version of lagid, in its "

@@ -45,12 +45,12 @@ class Scheduler(Generic[Key]):
 
     def __init__(
         self,
-        crew: Executor,
+        executor: Executor,
         *,
         grace_seconds: float = GRACE_SECONDS,
         project_cores: int | None = None,
     ) -> None:
-        self._executor = crew
+        self._executor = executor
         self._grace, self._project_cores = grace_seconds, project_cores
         self._shares: FairShare[Key] = FairShare()
         self._reported_at = time.monotonic()
@@ -160,12 +160,12 @@ class Scheduler(Generic[Key]):
         if self._project_cores is None:
             return True
         project = self._shares.get_project(job)
-        flying = (
+        in_flight = (
             len(work.in_flight)
             for mate, work in self._jobs.items()
             if self._shares.get_project(mate) == project
         )
-        return sum(flying) < self._project_cores
+        return sum(in_flight) < self._project_cores
 
     def _has_report_backlog(self, work: JobQueue) -> bool:
         return work.unreported_seconds > MAX_UNREPORTED_SECONDS * self._executor.slots
@@ -184,7 +184,7 @@ class Scheduler(Generic[Key]):
     def _collect_pack(self, handle: PackHandle) -> None:
         owner = next((j for j, work in self._jobs.items() if handle in work.in_flight), None)
         try:
-            done = self._executor.fetch_results(handle)
+            results = self._executor.fetch_results(handle)
         except PackLost as error:
             if owner is not None:
                 self._record_lost_task(owner, self._jobs[owner], handle, error)
@@ -192,11 +192,11 @@ class Scheduler(Generic[Key]):
         if owner is None:  # the crew does not know it any more, that is all
             _log.warning("a pack of no job came back")
             return
-        self._shares.charge_seconds(owner, sum(one.seconds for one in done))
+        self._shares.charge_seconds(owner, sum(result.seconds for result in results))
         if owner in self._stopped:
             del self._jobs[owner].in_flight[handle]
         else:
-            self._jobs[owner].absorb_pack(handle, done)
+            self._jobs[owner].absorb_pack(handle, results)
 
     def _record_lost_task(
         self, job: Key, work: JobQueue, handle: PackHandle, error: PackLost

@@ -103,15 +103,15 @@ def _advance_item(
         return RunProgress(state)
     noise_free = _load_noise_free_records(item.spec.problem, records)
     try:
-        found = conclude_run(problem, algorithm, state, validation)
+        identification = conclude_run(problem, algorithm, state, validation)
     except SysidError as error:
         return RunFailure(str(error), type(error).__name__, state.evaluations)
-    without = (
-        found.rms
+    rms_noise_free = (
+        identification.rms
         if noise_free is None
-        else compute_reference_rms(problem, found.simulated, noise_free)
+        else compute_reference_rms(problem, identification.simulated, noise_free)
     )
-    return RunConclusion(found, without)
+    return RunConclusion(identification, rms_noise_free)
 
 
 def _evolve_item(item: EvolveIsland, problem: Problem) -> Island:
@@ -173,9 +173,9 @@ def build_pack_problems(
     """
     fit_records = prepare_run_records(spec, records)
     if alike is not None and alike[0].model.selection is None:  # else noise may select others
-        posed = alike[0].replace_outputs(fit_records.estimation)
-        if posed.output_weights == alike[0].output_weights:  # which are those of the validation
-            return posed, alike[1]
+        problem = alike[0].replace_outputs(fit_records.estimation)
+        if problem.output_weights == alike[0].output_weights:  # which are those of the validation
+            return problem, alike[1]
     return build_problems(_parse_cached_model(json.dumps(spec.model)), fit_records, spec.settings)
 
 

@@ -79,11 +79,11 @@ class ClosedLoop:
         values : mapping of str to float
             The plant's parameters and starts, by the plant's names.
         """
-        known = self.rename_values(values)
+        loop_values = self.rename_values(values)
         return simulate(
             self.model,
             inputs,
-            self._compute_filter_start(inputs, known, times) | known,
+            self._compute_filter_start(inputs, loop_values, times) | loop_values,
             times=times,
         )
 
@@ -95,7 +95,7 @@ class ClosedLoop:
             return {}
         name, followed, lag = self.derivative_filter
         is_sampled = self.model.form != "differential"
-        begins = [times[0]] if is_sampled else [times[0], *(one.times[0] for one in inputs)]
+        begins = [times[0]] if is_sampled else [times[0], *(channel.times[0] for channel in inputs)]
         start = float(min(begins))
         before = self._evaluate_start(followed, inputs, values, start, "left")
         if is_sampled:  # its first value is that of a first step, not of the time before
@@ -109,29 +109,31 @@ class ClosedLoop:
         tree: Expression,
         inputs: Sequence[Channel],
         values: Mapping[str, float],
-        at: float,
+        time: float,
         side: str,
     ) -> float:
         """Value of an expression where the loop starts, just before or just after."""
-        given = {one.name: _interpolate_channel(one, at, side) for one in inputs}
+        input_values = {
+            channel.name: _interpolate_channel(channel, time, side) for channel in inputs
+        }
         starts = {
             state.name: start.value
             for state, start in zip(self.model.states, self.model.initial, strict=True)
             if isinstance(start, FixedInitial)
         }
 
-        def known(node: Expression) -> Expression | None:
+        def substitute_values(node: Expression) -> Expression | None:
             match node:
                 case PastValue(name):
                     start = values.get(name_initial_state(name, 0), starts.get(name, 0.0))
-                    return Number(given.get(name, start))
+                    return Number(input_values.get(name, start))
                 case Symbol(_, "time" | "index"):
-                    return Number(at if node.kind == "time" else 0.0)
+                    return Number(time if node.kind == "time" else 0.0)
                 case _:
                     return None
 
         fixed = {p.name: p.fixed for p in self.model.parameters if p.fixed is not None}
-        return value_of(substitute(tree, known), {**fixed, **values})
+        return value_of(substitute(tree, substitute_values), {**fixed, **values})
 
 
 def close_loop(model: Model, control: PidControl, period: float | None = None) -> ClosedLoop:
@@ -185,7 +187,7 @@ def _choose_parameter_names(model: Model) -> dict[str, str]:
 def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
     """The model with parameters of other names."""
 
-    def other(node: Expression) -> Expression | None:
+    def rename_symbol(node: Expression) -> Expression | None:
         match node:
             case Symbol(name, "parameter") if name in renamed:
                 return Symbol(renamed[name], "parameter")
@@ -195,14 +197,14 @@ def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
     if not renamed:
         return model
     parameters = tuple(replace(p, name=renamed.get(p.name, p.name)) for p in model.parameters)
-    trees = tuple(substitute(tree, other) for tree in model.equations)
+    trees = tuple(substitute(tree, rename_symbol) for tree in model.equations)
     return replace(model, parameters=parameters, equations=trees)
 
 
-def _interpolate_channel(channel: Channel, at: float, side: str) -> float:
+def _interpolate_channel(channel: Channel, time: float, side: str) -> float:
     """Value of a signal just before ("left") or just after ("right") a time."""
     times, values = channel.history_and_samples.times, channel.history_and_samples.values
     if channel.hold != "zero":
-        return float(np.interp(at, times, values))
-    last = int(np.searchsorted(times, at, side=side)) - 1  # type: ignore[call-overload]
+        return float(np.interp(time, times, values))
+    last = int(np.searchsorted(times, time, side=side)) - 1  # type: ignore[call-overload]
     return float(values[max(last, 0)])

@@ -149,7 +149,7 @@ class PidControl:
     @property
     def active_tracking_time(self) -> float | None:
         """T_t in s; None where nothing winds up, or nothing is done about it."""
-        is_limited = any(one is not None for one in self.output_limits)
+        is_limited = any(limit is not None for limit in self.output_limits)
         if not (self.has_integral_action and is_limited and self.anti_windup == "back-calculation"):
             return None
         if self.tracking_time is not None:

@@ -77,11 +77,11 @@ class IdentifiedModel:
     @property
     def value_by_name(self) -> dict[str, float]:
         """Value of each name."""
-        return {one.name: one.value for one in self.values}
+        return {value.name: value.value for value in self.values}
 
     def find_value(self, name: str) -> IdentifiedValue | None:
         """The value of that name, if there is one."""
-        return next((one for one in self.values if one.name == name), None)
+        return next((value for value in self.values if value.name == name), None)
 
     def get_hold(self, signal: str) -> Hold:
         """How an input was held between its samples."""
@@ -112,8 +112,8 @@ class AffineForm:
         terms = dict(self.terms)
         for signal, coefficient in other.terms.items():
             terms[signal] = terms.get(signal, 0.0) + factor * coefficient
-        found = {signal: value for signal, value in terms.items() if value != 0.0}
-        return AffineForm(found, self.constant + factor * other.constant)
+        nonzero = {signal: value for signal, value in terms.items() if value != 0.0}
+        return AffineForm(nonzero, self.constant + factor * other.constant)
 
     def scale_by(self, factor: float) -> "AffineForm":
         """Product with a number."""
@@ -146,7 +146,7 @@ def to_linear_form(identified: IdentifiedModel, period: float | None) -> LinearF
     clock = "k" if is_difference(model) else "t"
     numbers = identified.value_by_name
 
-    def known(node: Expression) -> Expression | None:
+    def substitute_known(node: Expression) -> Expression | None:
         match node:
             case Symbol(name, "parameter"):
                 return Number(numbers[name])
@@ -156,12 +156,14 @@ def to_linear_form(identified: IdentifiedModel, period: float | None) -> LinearF
 
     return LinearForm(
         tuple(
-            _AffineReader(f"the equation of {state.name}", clock, known).to_affine(tree)
+            _AffineReader(f"the equation of {state.name}", clock, substitute_known).to_affine(tree)
             for state, tree in zip(model.states, model.equations, strict=True)
         ),
         tuple(
-            _AffineReader(f"the output {one.name}", clock, known).to_affine(one.expression)
-            for one in model.outputs
+            _AffineReader(f"the output {output.name}", clock, substitute_known).to_affine(
+                output.expression
+            )
+            for output in model.outputs
         ),
     )
 
@@ -208,9 +210,9 @@ class _AffineReader:
 
     def _read_product(self, tree: Expression, left: Expression, right: Expression) -> AffineForm:
         """A factor that is 0 takes its term away, whatever that is."""
-        for one, other in ((left, right), (right, left)):
-            if not self._has_signals(one):
-                factor = self._evaluate_constant(one)
+        for factor_tree, other in ((left, right), (right, left)):
+            if not self._has_signals(factor_tree):
+                factor = self._evaluate_constant(factor_tree)
                 return self.to_affine(other).scale_by(factor) if factor != 0.0 else AffineForm({})
         raise self._make_refusal(tree)
 

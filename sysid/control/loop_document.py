@@ -97,10 +97,10 @@ class LoopDocumentBuilder:
     def build_difference(self) -> dict[str, Any]:
         """Document of a closed loop in the difference form (a polynomial becomes one)."""
         if self.transport.time_constant > 0:
-            kept = f"exp(-h/{self._add_time_constant()})"
+            decay = f"exp(-h/{self._add_time_constant()})"
             drive = format_expression(self._build_plant_input(1, self.delay))
             before = f"{self.input.name}(k-1)"
-            return self._build_document(f"{drive} + {kept}*({before} - ({drive}))", None)
+            return self._build_document(f"{drive} + {decay}*({before} - ({drive}))", None)
         if self._has_algebraic_loop():
             self.steps, self.delay = self._split_whole_steps()
             self.controller_delay_steps = int(self.steps == 0)
@@ -175,29 +175,34 @@ class LoopDocumentBuilder:
         """The closed loop, with an equation of the plant's input or with its reads replaced."""
         model, name = self.model, self.input.name
 
-        def written(tree: Expression) -> str:
+        def write_tree(tree: Expression) -> str:
             return format_expression(
                 tree if change is None else substitute(tree, change), self.clock
             )
 
         states = {state.name: state.unit for state in model.states}
         equations = {
-            state.name: written(tree)
+            state.name: write_tree(tree)
             for state, tree in zip(model.states, model.equations, strict=True)
         }
         initial = {
-            s.name: _to_initial_value(one)
-            for s, one in zip(model.states, model.initial, strict=True)
+            s.name: _to_initial_value(start)
+            for s, start in zip(model.states, model.initial, strict=True)
         }
         if equation is not None:
             states[name], equations[name], initial[name] = self.input.unit, equation, 0.0
-        for own in self.law.states:
-            states[own.name] = self.input.unit if own.has_input_unit else self.output.unit
-            equations[own.name], initial[own.name] = written(own.equation), 0.0
+        for controller_state in self.law.states:
+            states[controller_state.name] = (
+                self.input.unit if controller_state.has_input_unit else self.output.unit
+            )
+            equations[controller_state.name], initial[controller_state.name] = (
+                write_tree(controller_state.equation),
+                0.0,
+            )
         inputs = {q.name: q.unit for q in model.inputs if q.name != name}
         command = format_expression(self._build_command(0, None), self.clock)
-        entering = name if equation is not None else written(PastValue(name, "input"))
-        outputs = {o.name: (written(o.expression), o.unit) for o in model.outputs}
+        entering = name if equation is not None else write_tree(PastValue(name, "input"))
+        outputs = {o.name: (write_tree(o.expression), o.unit) for o in model.outputs}
         outputs |= {name: (entering, self.input.unit), self.command: (command, self.input.unit)}
         return {
             "name": f"{model.name[:50]}-closed-loop",
@@ -230,17 +235,19 @@ class LoopDocumentBuilder:
             if wanted * self.model.solver.substeps > _MAX_SUBSTEPS:
                 raise InvalidSettings(f"/{name}", self._describe_short_time(name, time))
             if wanted > 1:
-                more = self.model.solver.substeps * 2 ** ceil(log2(wanted))
-                substeps = max(substeps, min(more, _MAX_SUBSTEPS))
+                refined = self.model.solver.substeps * 2 ** ceil(log2(wanted))
+                substeps = max(substeps, min(refined, _MAX_SUBSTEPS))
         return {"substeps": substeps} if substeps > self.model.solver.substeps else {}
 
     def _describe_short_time(self, name: str, time: float) -> str:
         sampling = (self.period or 0.0) * self.model.solver.substeps
-        told = "the filter's time constant T_d/N is" if name == "derivative_filter" else "T_t is"
-        right = "a smaller N" if name == "derivative_filter" else "a longer one"
+        quantity = (
+            "the filter's time constant T_d/N is" if name == "derivative_filter" else "T_t is"
+        )
+        remedy = "a smaller N" if name == "derivative_filter" else "a longer one"
         return (
-            f"{told} {time:.4g} s, too short for steps of {sampling:.4g} s even if each is "
-            f"divided into {_MAX_SUBSTEPS}. Give {right}, or a shorter sampling period."
+            f"{quantity} {time:.4g} s, too short for steps of {sampling:.4g} s even if each is "
+            f"divided into {_MAX_SUBSTEPS}. Give {remedy}, or a shorter sampling period."
         )
 
 
@@ -248,9 +255,9 @@ def _find_signal(signals: Any, name: str, role: str) -> Any:
     for signal in signals:
         if signal.name == name:
             return signal
-    known = [signal.name for signal in signals]
+    names = [signal.name for signal in signals]
     raise InvalidSettings(
-        f"/{role}", f"the model has no {role} {name!r}{suggest_name(name, known)}"
+        f"/{role}", f"the model has no {role} {name!r}{suggest_name(name, names)}"
     )
 
 

@@ -77,7 +77,7 @@ def compute_margins(identified: IdentifiedModel, control: PidControl) -> Margins
         raise NotLinear("margins need a model in the differential form; this one is a recursion")
     signals = (control.input, control.output)
     pairs = compute_transfer_functions(identified).pairs
-    [pair] = [one for one in pairs if (one.input, one.output) == signals]
+    [pair] = [candidate for candidate in pairs if (candidate.input, candidate.output) == signals]
     loop = _LoopGain(pair, control)
     omega, end = _choose_frequencies(loop, pair, control)
     return _measure_margins(loop, omega[omega <= end], is_stable=_is_stable(loop, omega))
@@ -101,8 +101,8 @@ class _LoopGain:
     def evaluate_static_gain(self) -> FloatArray:
         """L(0), (1,), a real number; (0,) where something integrates."""
         above, below = self.evaluate_fraction(np.zeros(1))
-        found: FloatArray = (above[below != 0] / below[below != 0]).real
-        return found[np.isfinite(found)]
+        gains: FloatArray = (above[below != 0] / below[below != 0]).real
+        return gains[np.isfinite(gains)]
 
     def evaluate_fraction(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Numerator and denominator of L(iω), without the poles that they have."""
@@ -115,8 +115,8 @@ class _LoopGain:
         if control.has_integral_action and control.integral_time is not None:
             actions = actions * s + filtered / control.integral_time
             below = below * s
-        given = control.gain * transport.gain * late * actions
-        above: ComplexArray = given * _evaluate_quasi_polynomial(self._pair.numerator, s)
+        controller = control.gain * transport.gain * late * actions
+        above: ComplexArray = controller * _evaluate_quasi_polynomial(self._pair.numerator, s)
         return above, below * filtered * _evaluate_quasi_polynomial(self._pair.denominator, s)
 
 
@@ -174,8 +174,8 @@ def _choose_frequencies(
 
 def _find_last_frequency(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
     """The frequency behind the last one where something holds."""
-    found = np.flatnonzero(where)
-    return float(omega[min(int(found[-1]) + 2, omega.size - 1)]) if found.size else otherwise
+    matches = np.flatnonzero(where)
+    return float(omega[min(int(matches[-1]) + 2, omega.size - 1)]) if matches.size else otherwise
 
 
 def _space_frequencies(start: float, stop: float, step: float) -> FloatArray:
@@ -191,13 +191,13 @@ def _refine_frequencies(loop: _LoopGain, omega: FloatArray) -> FloatArray:
     """
     for _ in range(_MAX_REFINEMENTS):
         above, below = loop.evaluate_fraction(omega)
-        steps = [np.diff(np.unwrap(np.angle(one))) for one in (below, above + below)]
+        steps = [np.diff(np.unwrap(np.angle(values))) for values in (below, above + below)]
         far = np.flatnonzero(np.max(np.abs(steps), axis=0) > _UNRESOLVED_TURN)
         if not 0 < far.size <= _MAX_UNRESOLVED_STEPS:
             break
         parts = np.linspace(0.0, 1.0, _REFINEMENT_PARTS, endpoint=False)[1:, None]
-        more = omega[far] + parts * (omega[far + 1] - omega[far])
-        omega = np.unique(np.concatenate([omega, more.ravel()]))
+        added = omega[far] + parts * (omega[far + 1] - omega[far])
+        omega = np.unique(np.concatenate([omega, added.ravel()]))
     return omega
 
 
@@ -227,12 +227,12 @@ def _measure_margins(loop: _LoopGain, omega: FloatArray, *, is_stable: bool) -> 
     turned = _find_sign_changes(lambda w: loop.evaluate_gain(w).imag, omega, gains.imag)
     at_turned = np.append(loop.evaluate_gain(turned).real, loop.evaluate_static_gain())
     factors = -1.0 / at_turned[at_turned < 0]
-    bears = float(np.min(np.maximum(lefts, 0.0) / crossings, initial=inf))
+    delay_margin = float(np.min(np.maximum(lefts, 0.0) / crossings, initial=inf))
     return Margins(
         is_stable=is_stable,
         gain_margin=float(factors[np.argmin(np.abs(np.log(factors)))]) if factors.size else inf,
         phase_margin=inf if nearest is None else float(np.degrees(lefts[nearest])),
-        delay_margin=bears if is_stable else 0.0,
+        delay_margin=delay_margin if is_stable else 0.0,
         crossover_frequency=np.nan if nearest is None else float(crossings[nearest]),
         sensitivity_peak=float(np.max(1.0 / np.abs(1.0 + gains))),
     )
@@ -242,13 +242,13 @@ def _find_sign_changes(
     function: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
 ) -> FloatArray:
     """Where a function changes its sign, by secants of the steps in which it does."""
-    at = np.flatnonzero(values[:-1] * values[1:] < 0)
-    low, high, below, above = omega[at], omega[at + 1], values[at], values[at + 1]
+    before = np.flatnonzero(values[:-1] * values[1:] < 0)
+    low, high, below, above = omega[before], omega[before + 1], values[before], values[before + 1]
     for _ in range(_SECANT_STEPS):
         middle = low - below * (high - low) / (above - below)
         value = function(middle)
         is_before = value * below > 0
         low, below = np.where(is_before, middle, low), np.where(is_before, value, below)
         high, above = np.where(is_before, high, middle), np.where(is_before, above, value)
-    found: FloatArray = low - below * (high - low) / (above - below)
-    return found
+    crossings: FloatArray = low - below * (high - low) / (above - below)
+    return crossings

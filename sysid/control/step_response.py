@@ -187,8 +187,8 @@ def _is_growing(sizes: FloatArray, least: float) -> bool:
     """Whether each of the sizes is `least` times the one before, and growth does not slow down."""
     if not np.all(sizes[:-1] > 0.0) or not np.all(sizes[1:] > least * sizes[:-1]):
         return False
-    more = np.diff(sizes)
-    return bool(np.all(more[1:] >= _STEADY_GROWTH * more[:-1]))
+    increments = np.diff(sizes)
+    return bool(np.all(increments[1:] >= _STEADY_GROWTH * increments[:-1]))
 
 
 def _measure_swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -198,21 +198,21 @@ def _measure_swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArra
     a limit cycle would seem to grow.
     """
     slope = np.diff(y)
-    at = np.flatnonzero(slope[:-1] * slope[1:] < 0.0) + 1
-    bend = slope[at] - slope[at - 1]
-    peaks = y[at] - (slope[at] + slope[at - 1]) ** 2 / (8.0 * bend)
-    return t[at[1:]], np.abs(np.diff(peaks))
+    turning = np.flatnonzero(slope[:-1] * slope[1:] < 0.0) + 1
+    bend = slope[turning] - slope[turning - 1]
+    peaks = y[turning] - (slope[turning] + slope[turning - 1]) ** 2 / (8.0 * bend)
+    return t[turning[1:]], np.abs(np.diff(peaks))
 
 
-def _find_level_crossing(t: FloatArray, way: FloatArray, level: float) -> float:
+def _find_level_crossing(t: FloatArray, progress: FloatArray, level: float) -> float:
     """When the way first reaches a level, on a line between samples."""
-    reached = np.flatnonzero(way >= level)
+    reached = np.flatnonzero(progress >= level)
     if reached.size == 0:
         return nan
     i = int(reached[0])
     if i == 0:
         return float(t[0])
-    part = (level - way[i - 1]) / (way[i] - way[i - 1])
+    part = (level - progress[i - 1]) / (progress[i] - progress[i - 1])
     return float(t[i - 1] + part * (t[i] - t[i - 1]))
 
 

@@ -30,53 +30,53 @@ def add_polynomials(
     first: QuasiPolynomial, second: QuasiPolynomial, factor: float = 1.0
 ) -> QuasiPolynomial:
     """Sum with a multiple of another; what is left of terms that cancel is left out."""
-    found = dict(first)
+    terms = dict(first)
     for key, value in second.items():
-        before, change = found.get(key, 0.0), factor * value
+        before, change = terms.get(key, 0.0), factor * value
         total = before + change
         if abs(total) > _CANCELLATION_TOLERANCE * (abs(before) + abs(change)):
-            found[key] = total
+            terms[key] = total
         else:
-            found.pop(key, None)
-    return found
+            terms.pop(key, None)
+    return terms
 
 
 def multiply_polynomials(first: QuasiPolynomial, second: QuasiPolynomial) -> QuasiPolynomial:
     """Product of two."""
-    found: QuasiPolynomial = {}
+    product: QuasiPolynomial = {}
     for (power, delay), value in first.items():
         shifted = {(power + p, delay + d): value * v for (p, d), v in second.items()}
-        found = add_polynomials(found, shifted)
-    return found
+        product = add_polynomials(product, shifted)
+    return product
 
 
 def compute_determinant(matrix: Sequence[Sequence[QuasiPolynomial]]) -> QuasiPolynomial:
     """Determinant of a small square matrix, by its first row."""
     if not matrix:
         return {(0, 0.0): 1.0}
-    found: QuasiPolynomial = {}
+    determinant: QuasiPolynomial = {}
     for j, entry in enumerate(matrix[0]):
         if entry:
             minor = [[*row[:j], *row[j + 1 :]] for row in matrix[1:]]
-            found = add_polynomials(
-                found,
+            determinant = add_polynomials(
+                determinant,
                 multiply_polynomials(entry, compute_determinant(minor)),
                 -1.0 if j % 2 else 1.0,
             )
-    return found
+    return determinant
 
 
 def replace_column(
     matrix: Sequence[Sequence[QuasiPolynomial]], j: int, column: Sequence[QuasiPolynomial]
 ) -> list[list[QuasiPolynomial]]:
     """The matrix with another column j."""
-    return [[*row[:j], one, *row[j + 1 :]] for row, one in zip(matrix, column, strict=True)]
+    return [[*row[:j], entry, *row[j + 1 :]] for row, entry in zip(matrix, column, strict=True)]
 
 
-def group_by_delay(found: QuasiPolynomial) -> list[tuple[float, list[float]]]:
+def group_by_delay(polynomial: QuasiPolynomial) -> list[tuple[float, list[float]]]:
     """Coefficients of falling powers for each dead time, the shortest dead time first."""
     parts: dict[float, dict[int, float]] = {}
-    for (power, delay), value in found.items():
+    for (power, delay), value in polynomial.items():
         parts.setdefault(delay, {})[power] = value
     return [
         (delay, [powers.get(p, 0.0) for p in range(max(powers), -1, -1)])
@@ -100,12 +100,12 @@ def compute_taps(
         Whether a state's present sample is known; if not, the one before stands for it.
     """
     if signal.kind == "input":
-        found = _compute_input_taps(identified, signal)
+        taps = _compute_input_taps(identified, signal)
     else:
-        found = _compute_state_taps(identified, signal.delay, finished)
-    if signal.kind == "state" and not updated and 0 in found:
-        found[1] = found.get(1, 0.0) + found.pop(0)
-    return {back: weight for back, weight in found.items() if weight != 0.0}
+        taps = _compute_state_taps(identified, signal.delay, finished)
+    if signal.kind == "state" and not updated and 0 in taps:
+        taps[1] = taps.get(1, 0.0) + taps.pop(0)
+    return {back: weight for back, weight in taps.items() if weight != 0.0}
 
 
 def _compute_input_taps(identified: IdentifiedModel, signal: DelayedSignal) -> dict[int, float]:
@@ -239,9 +239,9 @@ def _build_equations(
     for i, form in enumerate(linear.equations):
         read = _make_coefficient_reader(identified, i)
         row = [read(form, "state", name) for name in states]
-        own: QuasiPolynomial = {(power, 0.0): 1.0}
+        derivative: QuasiPolynomial = {(power, 0.0): 1.0}
         matrix.append(
-            [add_polynomials(own if i == j else {}, one, -1.0) for j, one in enumerate(row)]
+            [add_polynomials(derivative if i == j else {}, one, -1.0) for j, one in enumerate(row)]
         )
         for name, column in columns.items():
             column.append(read(form, "input", name))
@@ -256,12 +256,12 @@ def _compute_numerator(
     denominator: QuasiPolynomial,
 ) -> QuasiPolynomial:
     read = _make_coefficient_reader(identified, None)
-    found = multiply_polynomials(read(form, "input", name), denominator)
-    for state, inside in zip(identified.model.states, states, strict=True):
-        found = add_polynomials(
-            found, multiply_polynomials(read(form, "state", state.name), inside)
+    numerator = multiply_polynomials(read(form, "input", name), denominator)
+    for state, states_part in zip(identified.model.states, states, strict=True):
+        numerator = add_polynomials(
+            numerator, multiply_polynomials(read(form, "state", state.name), states_part)
         )
-    return found
+    return numerator
 
 
 def _make_coefficient_reader(

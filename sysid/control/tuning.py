@@ -134,21 +134,21 @@ def tune_controller(
     factors = factor_transfer_function(identified, input, output, transport)
     process = factors.reduce_order(2 if controller == "PID" and rule == "simc" else 1)
     try:
-        found = (
+        tuning = (
             _tune_amigo(process, controller)
             if rule == "amigo"
             else _tune_simc(process, controller, closed_loop_time_constant)
         )
     except ZeroDivisionError:  # of numbers whose product is too small to be one
         raise _make_refusal(_describe_impossible_gain(inf, process)) from None
-    if not 0.0 < abs(found.gain) < LARGEST_NUMBER:
-        raise _make_refusal(_describe_impossible_gain(found.gain, process))
-    return found
+    if not 0.0 < abs(tuning.gain) < LARGEST_NUMBER:
+        raise _make_refusal(_describe_impossible_gain(tuning.gain, process))
+    return tuning
 
 
-def _describe_impossible_gain(found: float, process: ProcessModel) -> str:
+def _describe_impossible_gain(gain: float, process: ProcessModel) -> str:
     return (
-        f"the rule gives a gain of {found:g}, which no controller can have. The process has a gain "
+        f"the rule gives a gain of {gain:g}, which no controller can have. The process has a gain "
         f"of {process.gain:g} and a dead time of {process.delay:g} s."
     )
 
@@ -166,13 +166,13 @@ class TransferFactors:
         """The process of first or second order by the half rule."""
         times = [inf, *self.time_constants] if self.is_integrating else list(self.time_constants)
         times += [0.0] * (order + 1 - len(times))
-        kept, lost = times[:order], times[order:]
-        half = lost[0] / 2
-        last = kept[-1] + half
-        delay = self.delay + half + sum(lost[1:])
+        leading, neglected = times[:order], times[order:]
+        half = neglected[0] / 2
+        last = leading[-1] + half
+        delay = self.delay + half + sum(neglected[1:])
         if order == 1:
             return ProcessModel(self.gain, delay, last)
-        return ProcessModel(self.gain, delay, kept[0], last)
+        return ProcessModel(self.gain, delay, leading[0], last)
 
 
 def factor_transfer_function(
@@ -194,7 +194,9 @@ def factor_transfer_function(
         pairs = compute_transfer_functions(identified).pairs
     except NotLinear as error:
         raise _make_refusal(f"a tuning rule needs a linear model: {error}") from None
-    [pair] = [one for one in pairs if (one.input, one.output) == (input, output)]
+    [pair] = [
+        candidate for candidate in pairs if (candidate.input, candidate.output) == (input, output)
+    ]
     return _factor_pair(pair, transport or Transport())
 
 
@@ -254,18 +256,20 @@ def _cancel_common_roots(
     zeros: ComplexArray, poles: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Roots without those that numerator and denominator share: of states that have no effect."""
-    left, kept = list(poles), []
+    remaining_poles, remaining_zeros = list(poles), []
     for zero in zeros:
         near = [
             i
-            for i, pole in enumerate(left)
+            for i, pole in enumerate(remaining_poles)
             if abs(pole - zero) <= _CANCELLATION_TOLERANCE * abs(pole)
         ]
         if near:
-            left.pop(near[0])
+            remaining_poles.pop(near[0])
         else:
-            kept.append(zero)
-    return np.array(kept, dtype=np.complex128), np.array(left, dtype=np.complex128)
+            remaining_zeros.append(zero)
+    return np.array(remaining_zeros, dtype=np.complex128), np.array(
+        remaining_poles, dtype=np.complex128
+    )
 
 
 def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float | None) -> Tuning:

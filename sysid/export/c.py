@@ -118,7 +118,9 @@ def write_c_source(identified: IdentifiedModel) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers([*_RESERVED_WORDS.split(), *(one.c for one in FUNCTIONS.values())])
+    names = Identifiers(
+        [*_RESERVED_WORDS.split(), *(function.c for function in FUNCTIONS.values())]
+    )
     stem = names.make_identifier(identified.model.name)
     for suffix in ("parameters", "identified", "simulate"):
         names.make_identifier(f"{stem}_{suffix}")
@@ -156,8 +158,8 @@ def _write_header(identified: IdentifiedModel, stem: str) -> str:
         f"{stem}_identified() returns the identified values.",
         f"{stem}_simulate() runs the model freely; link with -lm.",
     ]
-    told = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
-    return f"/*\n{told}\n */"
+    comment = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
+    return f"/*\n{comment}\n */"
 
 
 def _write_struct(program: GeneratedProgram, stem: str) -> str:
@@ -181,14 +183,14 @@ def _write_array_size(program: GeneratedProgram, name: str) -> str:
 
 
 def _write_identified_function(program: GeneratedProgram, stem: str) -> str:
-    found = program.identified
+    identified = program.identified
     lines = [f"{stem}_parameters {stem}_identified(void)", "{", f"    {stem}_parameters p;"]
-    numbers = found.value_by_name
+    numbers = identified.value_by_name
     lines += [
-        f"    p.{program.parameter_names[one.name]} = {write_number(numbers[one.name])};"
-        for one in found.model.parameters
+        f"    p.{program.parameter_names[parameter.name]} = {write_number(numbers[parameter.name])};"
+        for parameter in identified.model.parameters
     ]
-    for i, state in enumerate(found.model.states):
+    for i, state in enumerate(identified.model.states):
         start, name = program.find_initial_value(i), program.start_names[state.name]
         value = write_number(0.0 if start is None else start)
         note = " /* give the measured value */" if start is None else ""
@@ -210,8 +212,8 @@ def _write_simulate_comment(program: GeneratedProgram) -> str:
     ):
         lines += [f"{kind} {names[q.name]}: {q.name}, {describe_unit(q.unit)}." for q in signals]
     lines += ["Returns 0; 1 if n, the times or a time lag cannot be used; 2 if memory is short."]
-    told = "\n".join(f" * {escape_c_comment(line)}" for line in lines)
-    return f"/*\n{told}\n */"
+    comment = "\n".join(f" * {escape_c_comment(line)}" for line in lines)
+    return f"/*\n{comment}\n */"
 
 
 def _write_signature(program: GeneratedProgram, stem: str) -> str:
@@ -243,10 +245,10 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
         divided = f"/{write_number(substeps)}" if substeps > 1 else ""
         lines = [f"const double {period} = sample_time{divided};", f"const long steps = {count};"]
     else:
-        own = write_number(program.grid_step)
+        grid_step = write_number(program.grid_step)
         lines = [
-            f"const double dt = {own}/{write_number(substeps)};",
-            f"const long points = (long)ceil((t[n - 1] - t[0])/{own} - 0.01);",
+            f"const double dt = {grid_step}/{write_number(substeps)};",
+            f"const long points = (long)ceil((t[n - 1] - t[0])/{grid_step} - 0.01);",
             "if (points < 1)",
             "    return 1;",
             f"const long steps = points*{substeps};",
@@ -341,7 +343,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
 def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
     """The samples lie between the points of the simulation's own grid."""
     program.helper_names.add("between")
-    model, own = program.identified.model, write_number(program.grid_step or 1.0)
+    model, grid_step = program.identified.model, write_number(program.grid_step or 1.0)
     lines = []
     for output in model.outputs:
         text = write_expression(output.expression, program.language, LoopScope(program, "output"))
@@ -359,7 +361,7 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
             *indented(_wrap_statement("grid[i] = ", text), 2),
             "    }",
             "    for (long i = 0; i < n; ++i)",
-            f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{own});",
+            f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{grid_step});",
             "    free(grid);",
             "}",
         ]

@@ -39,12 +39,12 @@ def describe_model(identified: IdentifiedModel) -> list[str]:
         lines.append(f"The data had a sampling period of {identified.sample_time:.10g} s.")
     if model.form == "polynomial":
         lines.append("The coefficients hold for that sampling period only.")
-    lines += [_describe_hold(identified, one.name) for one in model.inputs]
+    lines += [_describe_hold(identified, signal.name) for signal in model.inputs]
     if identified.version:
         lines.append(f"Written by lagid {identified.version}.")
     for key, value in identified.provenance.items():
-        told = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        lines.append(f"{key}: {told}")
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        lines.append(f"{key}: {text}")
     return [part for line in lines for part in textwrap.wrap(to_one_line(line), 94) or [""]]
 
 
@@ -66,14 +66,14 @@ def describe_values(
     """Identifier and description of every parameter and start."""
     model = identified.model
     texts = model.document.get("parameters") or {}
-    for one in model.parameters:
-        value = identified.find_value(one.name)
-        about = (texts.get(one.name) or {}).get("description", "")
-        name = f"{one.name}: " if parameters[one.name] != one.name else ""
+    for parameter in model.parameters:
+        value = identified.find_value(parameter.name)
+        about = (texts.get(parameter.name) or {}).get("description", "")
+        name = f"{parameter.name}: " if parameters[parameter.name] != parameter.name else ""
         head = name + (f"{about}, " if about else "")
         yield (
-            parameters[one.name],
-            head + _describe_value(value or IdentifiedValue(one.name, 0.0, one.unit)),
+            parameters[parameter.name],
+            head + _describe_value(value or IdentifiedValue(parameter.name, 0.0, parameter.unit)),
         )
     for state, initial in zip(model.states, model.initial, strict=True):
         name = name_initial_state(state.name, 0)
@@ -118,7 +118,7 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
         "format": JSON_FORMAT,
         "lagid": identified.version or None,
         "model": dict(identified.model.document),
-        "values": [_to_value_document(one) for one in identified.values],
+        "values": [_to_value_document(item) for item in identified.values],
         "covariance": None
         if covariance is None
         else {
@@ -127,19 +127,19 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
         },
         "data": {
             "sample_time": identified.sample_time,
-            "hold": {one.name: identified.get_hold(one.name) for one in identified.model.inputs},
+            "hold": {item.name: identified.get_hold(item.name) for item in identified.model.inputs},
         },
         "provenance": dict(identified.provenance),
     }
 
 
-def _to_value_document(one: IdentifiedValue) -> dict[str, Any]:
+def _to_value_document(value: IdentifiedValue) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "value": float(one.value),
-        "unit": one.unit,
-        "stderr": _to_finite(one.stderr),
-        "status": one.status,
+        "name": value.name,
+        "value": float(value.value),
+        "unit": value.unit,
+        "stderr": _to_finite(value.stderr),
+        "status": value.status,
     }
 
 

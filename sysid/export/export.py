@@ -112,12 +112,14 @@ def _collect_values(
 ) -> tuple[tuple[IdentifiedValue, ...], Covariance | None]:
     if isinstance(found, Identification):
         values = tuple(
-            IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
-            for one in found.estimates
+            IdentifiedValue(
+                estimate.name, estimate.value, estimate.unit, estimate.stderr, estimate.status
+            )
+            for estimate in found.estimates
         )
         known = found.uncertainty
         return values, None if known is None else Covariance(known.names, known.covariance)
-    units = {one.name: one.unit for one in model.parameters}
+    units = {estimate.name: estimate.unit for estimate in model.parameters}
     units |= {name_initial_state(state.name, 0): state.unit for state in model.states}
     numbers = _add_tied_values(model, found)
     return tuple(IdentifiedValue(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
@@ -126,9 +128,9 @@ def _collect_values(
 def _add_tied_values(model: Model, found: Mapping[str, float]) -> dict[str, float]:
     """The values, and those of tied parameters that are not among them."""
     free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
-    for one in free:
-        if one.tied is None and one.name not in found:
-            raise InvalidSettings(f"/values/{one.name}", "a value is missing")
+    for parameter in free:
+        if parameter.tied is None and parameter.name not in found:
+            raise InvalidSettings(f"/values/{parameter.name}", "a value is missing")
     return {
         **{name: value_of(tie, found) for name, tie in resolve_ties(model, free).items()},
         **found,
@@ -154,7 +156,7 @@ def _check_options(
 
 
 def _check_values(model: Model, numbers: Mapping[str, float]) -> None:
-    names = [one.name for one in model.parameters]
+    names = [parameter.name for parameter in model.parameters]
     starts = {state.name for state in model.states}
     for name, value in numbers.items():
         if name not in names and name.partition("(0)")[0] not in starts:

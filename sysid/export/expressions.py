@@ -119,7 +119,7 @@ def _write_unary(tree: Unary, language: TargetLanguage, scope: ExportScope) -> t
 
 
 def _write_call(tree: FunctionCall, language: TargetLanguage, scope: ExportScope) -> str:
-    arguments = [write_expression(one, language, scope) for one in tree.arguments]
+    arguments = [write_expression(argument, language, scope) for argument in tree.arguments]
     if tree.function == "where":
         condition, first, second = arguments
         return language.write_choice(condition, first, second)
@@ -129,9 +129,9 @@ def _write_call(tree: FunctionCall, language: TargetLanguage, scope: ExportScope
 def _write_binary(tree: Binary, language: TargetLanguage, scope: ExportScope) -> str:
     level = OPERATORS[tree.operator].level
     logical = level <= Level.COMPARISON
-    beside = Level.COMPARISON + (level == Level.COMPARISON)
-    before = write_expression(tree.left, language, scope, beside if logical else level)
-    after = write_expression(tree.right, language, scope, beside if logical else level + 1)
+    operand_level = Level.COMPARISON + (level == Level.COMPARISON)
+    before = write_expression(tree.left, language, scope, operand_level if logical else level)
+    after = write_expression(tree.right, language, scope, operand_level if logical else level + 1)
     if tree.operator == "/" and is_constant(tree):
         before = language.write_constant_dividend(before)
     operator = language.logical_operators.get(tree.operator, tree.operator)

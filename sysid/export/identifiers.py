@@ -42,12 +42,12 @@ class Identifiers:
     def make_identifier(self, name: str) -> str:
         """An identifier like the name, that no one else has."""
         stem = _to_ascii(name)
-        found, number = stem, 1
-        while found in self._taken:
+        identifier, number = stem, 1
+        while identifier in self._taken:
             number += 1
-            found = f"{stem}_{number}"
-        self._taken.add(found)
-        return found
+            identifier = f"{stem}_{number}"
+        self._taken.add(identifier)
+        return identifier
 
 
 def _to_ascii(name: str) -> str:

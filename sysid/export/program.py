@@ -43,23 +43,26 @@ class GeneratedProgram:
     helper_names: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        model, of = self.identified.model, self.identifiers.make_identifier
-        self.input_names = {one.name: of(one.name) for one in model.inputs}
-        self.parameter_names = {one.name: of(one.name) for one in model.parameters}
-        self.present_names = {one.name: of(one.name) for one in model.states}
+        model, make_identifier = self.identified.model, self.identifiers.make_identifier
+        self.input_names = {item.name: make_identifier(item.name) for item in model.inputs}
+        self.parameter_names = {item.name: make_identifier(item.name) for item in model.parameters}
+        self.present_names = {item.name: make_identifier(item.name) for item in model.states}
         self.start_names = {
-            one.name: of(f"{self.present_names[one.name]}_0") for one in model.states
+            item.name: make_identifier(f"{self.present_names[item.name]}_0")
+            for item in model.states
         }
         self.array_names = {
-            one.name: of(f"{self.present_names[one.name]}_all") for one in model.states
+            item.name: make_identifier(f"{self.present_names[item.name]}_all")
+            for item in model.states
         }
         self.next_names = {
-            one.name: of(f"{self.present_names[one.name]}_next") for one in model.states
+            item.name: make_identifier(f"{self.present_names[item.name]}_next")
+            for item in model.states
         }
         states = set(self.present_names)
         self.output_names = {
-            one.name: of(f"{one.name}_out" if one.name in states else one.name)
-            for one in model.outputs
+            item.name: make_identifier(f"{item.name}_out" if item.name in states else item.name)
+            for item in model.outputs
         }
 
     @property
@@ -134,10 +137,10 @@ class GeneratedProgram:
         if self.grid_step is not None:
             points = f"2*ceil({POINTS_PER_SAMPLE // 2}*ratio - 1e-3)"
             return f"ratio/{self.language.write_clamp(points, 4, MAX_POINTS_PER_STEP)}"
-        points_ = min(
+        n_points = min(
             max(2 * ceil(POINTS_PER_SAMPLE / self.substeps / 2 - 1e-3), 4), MAX_POINTS_PER_STEP
         )
-        return write_number(1.0 / (points_ * self.substeps))
+        return write_number(1.0 / (n_points * self.substeps))
 
     def write_half_step(self) -> str:
         """Half an integration step, in samples: a held input with a lag is a mean over a step."""
@@ -194,8 +197,8 @@ class LoopScope(ExportScope):
         early = self.stage == "output" and past.offset > 0  # may lie before the record
         if past.delay is None and program.grid_step is None and not early:
             if held:
-                at = "step" if self.stage == "slope" else self._write_position(past)
-                return program.language.write_element(name, at, substeps)
+                index = "step" if self.stage == "slope" else self._write_position(past)
+                return program.language.write_element(name, index, substeps)
             if substeps == 1 and self.stage != "slope":
                 return program.language.write_element(name, self._write_position(past), 1)
         place = self._write_sample_position(past)
@@ -275,10 +278,10 @@ class LoopScope(ExportScope):
     def _is_updated(self, name: str) -> bool:
         """Whether the state's next value is known when the equation asks."""
         model = self.program.identified.model
-        number_ = [state.name for state in model.states].index(name)
+        index = [state.name for state in model.states].index(name)
         if self.program.is_recursion:
-            return model.order.index(number_) < model.order.index(self.equation)
-        return model.solver.method == "semi-implicit" and number_ < self.equation
+            return model.order.index(index) < model.order.index(self.equation)
+        return model.solver.method == "semi-implicit" and index < self.equation
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,10 +347,10 @@ def _write_euler(program: GeneratedProgram) -> list[str]:
     return [head, *indented(body), *language.close_loop()]
 
 
-def equation(program: GeneratedProgram, kind: EvaluationStage, number_: int, floor: int = 0) -> str:
+def equation(program: GeneratedProgram, kind: EvaluationStage, index: int, floor: int = 0) -> str:
     """Text of an equation's right-hand side; in parentheses if it binds less than `floor`."""
-    tree = program.identified.model.equations[number_]
-    return write_expression(tree, program.language, LoopScope(program, kind, number_), floor)
+    tree = program.identified.model.equations[index]
+    return write_expression(tree, program.language, LoopScope(program, kind, index), floor)
 
 
 def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
@@ -371,7 +374,7 @@ def needed_helpers(
 def _variants_of(identified: IdentifiedModel) -> Mapping[str, str]:
     """Which helpers of a program are written in another way, by the solver of its model."""
     solver = identified.model.solver
-    found = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
+    variants = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
     if identified.model.form == "differential" and solver.step is not None:
-        found["held"] = "held on grid"  # its points need not meet the jumps
-    return found
+        variants["held"] = "held on grid"  # its points need not meet the jumps
+    return variants

@@ -123,7 +123,11 @@ def write_python_source(identified: IdentifiedModel) -> str:
     helpers = needed_helpers(HELPERS, program.helper_names, identified)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indented(loop)
-    parts = [_write_docstring(identified), "import numpy as np\n", *(f"\n{one}" for one in helpers)]
+    parts = [
+        _write_docstring(identified),
+        "import numpy as np\n",
+        *(f"\n{helper}" for helper in helpers),
+    ]
     parts.append("\n" + _write_signature(program))
     parts += [textwrap.indent("\n".join(_write_function_docstring(program)), "    ")]
     parts += [textwrap.indent("\n".join(body), "    ")]
@@ -136,23 +140,23 @@ def _write_docstring(identified: IdentifiedModel) -> str:
 
 
 def _write_signature(program: GeneratedProgram) -> str:
-    found = program.identified
-    numbers = found.value_by_name
+    identified = program.identified
+    numbers = identified.value_by_name
     required = [
         program.start_names[state.name]
-        for i, state in enumerate(found.model.states)
+        for i, state in enumerate(identified.model.states)
         if program.find_initial_value(i) is None
     ]
-    given = [
-        f"{program.parameter_names[one.name]}={write_number(numbers[one.name])}"
-        for one in found.model.parameters
+    defaults = [
+        f"{program.parameter_names[parameter.name]}={write_number(numbers[parameter.name])}"
+        for parameter in identified.model.parameters
     ]
     starts = [
         f"{program.start_names[state.name]}={write_number(start)}"
-        for i, state in enumerate(found.model.states)
+        for i, state in enumerate(identified.model.states)
         if (start := program.find_initial_value(i)) is not None
     ]
-    named = [*required, *given, *starts]
+    named = [*required, *defaults, *starts]
     arguments = ["t", *program.input_names.values(), *(["*"] if named else []), *named]
     return "def simulate(\n" + _wrap_lines(", ".join(arguments) + ",", "    ") + "\n):"
 
@@ -167,8 +171,8 @@ def _write_function_docstring(program: GeneratedProgram) -> list[str]:
         "t : array (N,)",
         "    Times in s, one sampling period apart.",
     ]
-    for one in model.inputs:
-        lines += _describe_signal(program.input_names[one.name], "Input", one)
+    for signal in model.inputs:
+        lines += _describe_signal(program.input_names[signal.name], "Input", signal)
     for name, line in describe_values(
         program.identified, program.parameter_names, program.start_names
     ):
@@ -217,10 +221,10 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
         count = f"(t.size - 1){times}" if substeps > 1 else "t.size - 1"
         lines = [f"{period} = sample_time{divided}", f"steps = {count}"]
     else:
-        own = write_number(program.grid_step)
+        grid_step = write_number(program.grid_step)
         lines = [
-            f"dt = {own}/{substeps}" if substeps > 1 else f"dt = {own}",
-            f"points = int(np.ceil((t[-1] - t[0])/{own} - 0.01))",
+            f"dt = {grid_step}/{substeps}" if substeps > 1 else f"dt = {grid_step}",
+            f"points = int(np.ceil((t[-1] - t[0])/{grid_step} - 0.01))",
             f"steps = points*{substeps}",
             "ratio = dt/sample_time",
         ]

@@ -82,41 +82,42 @@ def write_control_source(identified: IdentifiedModel, pade_order: int) -> str:
     NotLinear
         If the model has no transfer function; the message says which term is in the way.
     """
-    found = compute_transfer_functions(identified)
-    if found.period is None:
+    functions = compute_transfer_functions(identified)
+    if functions.period is None:
         body = _CONTINUOUS_TEMPLATE.replace("@ORDER@", str(pade_order))
-        pairs = [_write_pair(one, *map(_write_delayed_terms, one[2:])) for one in found.pairs]
+        pairs = [_write_pair(one, *map(_write_delayed_terms, one[2:])) for one in functions.pairs]
     else:
-        body = _DISCRETE_TEMPLATE.replace("@PERIOD@", write_number(found.period))
-        pairs = [_write_pair(one, *_write_fraction(one)) for one in found.pairs]
+        body = _DISCRETE_TEMPLATE.replace("@PERIOD@", write_number(functions.period))
+        pairs = [_write_pair(one, *_write_fraction(one)) for one in functions.pairs]
     body = body.replace("@PAIRS@", "\n".join(pairs))
-    lines = [*describe_model(identified), *_describe_constants(identified, found)]
+    lines = [*describe_model(identified), *_describe_constants(identified, functions)]
     title, *others = map(escape_docstring, lines)
-    told = "\n".join([title, "", *others])
-    return f'"""{told}\n"""\n\nimport control\nimport numpy as np\n\n{body}'
+    docstring = "\n".join([title, "", *others])
+    return f'"""{docstring}\n"""\n\nimport control\nimport numpy as np\n\n{body}'
 
 
 def _write_pair(pair: TransferFunction, numerator: str, denominator: str) -> str:
     lines = []
     for text in (numerator, denominator):
         first, *others = wrap_source(text, _LINE_WIDTH - 12)
-        lines += [f"        {first}", *(f"         {one}" for one in others)]
+        lines += [f"        {first}", *(f"         {line}" for line in others)]
         lines[-1] += ","
     return "\n".join([f"    ({pair.input!r}, {pair.output!r}): (", *lines, "    ),"])
 
 
-def _write_delayed_terms(found: QuasiPolynomial) -> str:
+def _write_delayed_terms(polynomial: QuasiPolynomial) -> str:
     """Terms of a quasi-polynomial; that without dead time first, even if it is zero."""
-    terms = group_by_delay(found)
+    terms = group_by_delay(polynomial)
     parts = [f"({write_number(delay)}, {_write_list(powers)})" for delay, powers in terms]
     return f"[{', '.join(parts)}]"
 
 
 def _write_fraction(pair: TransferFunction) -> tuple[str, str]:
     both = (pair.numerator, pair.denominator)
-    most = max((int(back) for one in both for _, back in one), default=0)
+    most = max((int(back) for polynomial in both for _, back in polynomial), default=0)
     numerator, denominator = (
-        _write_list([one.get((0, float(back)), 0.0) for back in range(most + 1)]) for one in both
+        _write_list([polynomial.get((0, float(back)), 0.0) for back in range(most + 1)])
+        for polynomial in both
     )
     return numerator, denominator
 
@@ -125,16 +126,16 @@ def _write_list(values: list[float]) -> str:
     return f"[{', '.join(map(write_number, values))}]"
 
 
-def _describe_constants(identified: IdentifiedModel, found: TransferFunctions) -> list[str]:
+def _describe_constants(identified: IdentifiedModel, functions: TransferFunctions) -> list[str]:
     """What the transfer functions leave out."""
     model = identified.model
     constants = [
         f"the output {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.outputs, found.linear_form.outputs, strict=True)
+        for one, form in zip(model.outputs, functions.linear_form.outputs, strict=True)
         if form.constant
     ] + [
         f"the equation of {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.states, found.linear_form.equations, strict=True)
+        for one, form in zip(model.states, functions.linear_form.equations, strict=True)
         if form.constant
     ]
     if not constants:

@@ -90,19 +90,23 @@ def _build_identification(
     simulated = problem.predict(theta[None])[0]
     metrics = compute_metrics(problem, simulated)
     times = noise.correlation_times
-    kept = (
+    validated = (
         None
         if validation is None
         else _validate_estimates(validation, problem, analysis.estimates, times)
     )
-    tests = kept.tests if kept else run_residual_tests(problem, simulated, "estimation", times)
+    tests = (
+        validated.tests
+        if validated
+        else run_residual_tests(problem, simulated, "estimation", times)
+    )
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
         fit_percent=metrics.fit_percent,
-        rms_validation=None if kept is None else kept.metrics.rms,
-        fit_percent_validation=None if kept is None else kept.metrics.fit_percent,
+        rms_validation=None if validated is None else validated.metrics.rms,
+        fit_percent_validation=None if validated is None else validated.metrics.fit_percent,
         valid=limit is None or metrics.rms <= limit,
         evaluations=_count_evaluations(state, refined, analysis),
         generations=max(island.generation for island in state.islands),
@@ -111,9 +115,9 @@ def _build_identification(
         migrations=state.migrations,
         uncertainty=analysis.uncertainty,
         simulated=_split_outputs(problem, simulated),
-        simulated_validation=() if kept is None else kept.simulated,
+        simulated_validation=() if validated is None else validated.simulated,
         agreement=metrics.channels,
-        agreement_validation=() if kept is None else kept.metrics.channels,
+        agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
             *describe_exchanges(
@@ -143,17 +147,17 @@ def _build_identification(
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:
     """For how long (s) the inputs are known before what is scored of each experiment."""
-    since = problem.settings.scored_from or tuple(one.start for one in problem.records)
+    scored_from = problem.settings.scored_from or tuple(record.start for record in problem.records)
     return tuple(
-        one.history_duration + max(first - one.start, 0.0)
-        for one, first in zip(problem.records, since, strict=True)
+        record.history_duration + max(start - record.start, 0.0)
+        for record, start in zip(problem.records, scored_from, strict=True)
     )
 
 
 def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
     """Whether a controller made an input; past white residuals it does the estimates no harm."""
-    known = analysis.uncertainty
-    if known is not None and known.noise_colour == "white":
+    uncertainty = analysis.uncertainty
+    if uncertainty is not None and uncertainty.noise_colour == "white":
         return []
     advises = problem.prediction == "simulation" and problem.loss.noise_model != "ar1"
     return describe_feedback(list_residual_series(problem, simulated), advises_noise_model=advises)
@@ -180,8 +184,8 @@ def _refine_and_analyse(
     groups, spent = find_exchanges(problem, ends[best][0], spare)
     ends = [(order_exchangeable(problem, theta, groups), rms) for theta, rms in ends]
     refined = tuple(
-        None if one is None else replace(one, theta=end)
-        for one, (end, _) in zip(refined, ends, strict=True)
+        None if candidate is None else replace(candidate, theta=end)
+        for candidate, (end, _) in zip(refined, ends, strict=True)
     )
     theta = ends[best][0]
     analysis = analyse_estimate(problem, theta, None if left is None else left - spent)
@@ -215,9 +219,9 @@ def _refine_champions(
     if not _should_refine(algorithm, len(champions)):
         return (None,) * len(champions)
     left = _count_budget_left(algorithm, state, ())
-    kept = compute_analysis_budget(len(champions[0]))
-    most = None if left is None else max(0, left - kept)
-    return refine_candidates(problem, champions, most, deadline.is_past_grace)
+    reserved = compute_analysis_budget(len(champions[0]))
+    max_simulations = None if left is None else max(0, left - reserved)
+    return refine_candidates(problem, champions, max_simulations, deadline.is_past_grace)
 
 
 def _should_refine(algorithm: GeneticAlgorithm, islands: int) -> bool:
@@ -240,39 +244,46 @@ def _search_local_minima(
     The evaluations of it are those of all the islands' ends in its place, and of the search here.
     """
     theta, rms = end
-    known = next((one for one in refined if one is not None and one.theta is theta), None)
-    before, is_cut = (0, False) if known is None else (known.evaluations, known.is_cut_short)
+    previous = next(
+        (candidate for candidate in refined if candidate is not None and candidate.theta is theta),
+        None,
+    )
+    before, is_cut = (
+        (0, False) if previous is None else (previous.evaluations, previous.is_cut_short)
+    )
     unchanged = RefinedCandidate(theta, rms, before, is_cut)
     if analysis.linear_model is None:
         return unchanged, analysis
     left = _count_budget_left(algorithm, state, refined)
-    kept = analysis.evaluations + compute_analysis_budget(theta.size)
+    reserved = analysis.evaluations + compute_analysis_budget(theta.size)
     is_late = deadline.is_over()
-    most = count_affordable_simulations(problem, is_late)
-    if most == 0 and is_late:
+    max_simulations = count_affordable_simulations(problem, is_late)
+    if max_simulations == 0 and is_late:
         return unchanged, replace(analysis, is_cut_short=True)
     if left is not None:
         shared = 2 if problem.loss.noise_model == "ar1" else 1  # with the noise model
-        most = min(most, max(0, left - kept) // shared)
-    found = find_local_minima(problem, theta, rms, analysis.linear_model, state.seed, most)
-    spent = before + found.evaluations
-    if found.best is not None:
+        max_simulations = min(max_simulations, max(0, left - reserved) // shared)
+    minima = find_local_minima(
+        problem, theta, rms, analysis.linear_model, state.seed, max_simulations
+    )
+    spent = before + minima.evaluations
+    if minima.best is not None:
         spent += analysis.evaluations
         groups = analysis.exchanges
-        theta, rms = order_exchangeable(problem, found.best.theta, groups), found.best.rms
-        left = None if left is None else left - analysis.evaluations - found.evaluations
+        theta, rms = order_exchangeable(problem, minima.best.theta, groups), minima.best.rms
+        left = None if left is None else left - analysis.evaluations - minima.evaluations
         analysis = replace(analyse_estimate(problem, theta, left), exchanges=groups)
-    return RefinedCandidate(theta, rms, spent, is_cut), _widen_intervals(problem, analysis, found)
+    return RefinedCandidate(theta, rms, spent, is_cut), _widen_intervals(problem, analysis, minima)
 
 
-def _widen_intervals(problem: Problem, analysis: Analysis, found: LocalMinima) -> Analysis:
+def _widen_intervals(problem: Problem, analysis: Analysis, minima: LocalMinima) -> Analysis:
     """The analysis with intervals that hold those of all minima found."""
     if analysis.linear_model is None:
         return analysis
     share = analysis.linear_model.variance_ratio
-    found = replace(found, values=order_exchangeable(problem, found.values, analysis.exchanges))
+    minima = replace(minima, values=order_exchangeable(problem, minima.values, analysis.exchanges))
     estimates = widen_intervals(
-        analysis.estimates, problem.free_names, problem.n_scored, found, share
+        analysis.estimates, problem.free_names, problem.n_scored, minima, share
     )
     return replace(analysis, estimates=estimates)
 
@@ -290,38 +301,40 @@ def _apply_noise_model(
 
     Those of the paper's methods stay as found; so do all where residuals may as well be white.
     """
-    asked = problem.loss.noise_model
-    if asked == "white" or not _should_refine(algorithm, len(state.islands)):
-        return GeneralisedEstimate(theta, {}, 0, asked != "ar1"), analysis
+    requested = problem.loss.noise_model
+    if requested == "white" or not _should_refine(algorithm, len(state.islands)):
+        return GeneralisedEstimate(theta, {}, 0, requested != "ar1"), analysis
     in_time = deadline.count_simulations_left(state.seconds, state.evaluations, problem.n_steps)
-    late = deadline.is_past_grace
-    if asked == "auto" and not is_ar1_indicated(problem, theta, analysis, late, in_time):
+    is_late = deadline.is_past_grace
+    if requested == "auto" and not is_ar1_indicated(problem, theta, analysis, is_late, in_time):
         return GeneralisedEstimate(theta, {}, 0, True), analysis
     left = _count_budget_left(algorithm, state, refined)
-    kept = analysis.evaluations + compute_analysis_budget(theta.size)
-    limits = None if left is None else max(0, left - kept), in_time
-    most = min((one for one in limits if one is not None), default=None)
+    reserved = analysis.evaluations + compute_analysis_budget(theta.size)
+    limits = None if left is None else max(0, left - reserved), in_time
+    max_simulations = min((limit for limit in limits if limit is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
     covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance
     is_cut_short = analysis.is_cut_short
-    found = fit_generalised_least_squares(problem, theta, covariance, state.seed, most)
-    spent = analysis.evaluations + found.evaluations
-    if asked == "auto":
-        found = confirm_noise_model(problem, theta, found)
-    if any(found.correlation_times.values()):
-        white = make_whitening(problem, found.correlation_times)
+    estimate = fit_generalised_least_squares(
+        problem, theta, covariance, state.seed, max_simulations
+    )
+    spent = analysis.evaluations + estimate.evaluations
+    if requested == "auto":
+        estimate = confirm_noise_model(problem, theta, estimate)
+    if any(estimate.correlation_times.values()):
+        white = make_whitening(problem, estimate.correlation_times)
         groups, theta = (
             analysis.exchanges,
-            order_exchangeable(problem, found.theta, analysis.exchanges),
+            order_exchangeable(problem, estimate.theta, analysis.exchanges),
         )
-        found = found._replace(theta=theta)
+        estimate = estimate._replace(theta=theta)
         analysis = analyse_estimate(problem, theta, None if left is None else left - spent, white)
         analysis = replace(analysis, exchanges=groups)
         spent += analysis.evaluations
         analysis = _widen_intervals(
-            problem, analysis, LocalMinima(None, found.minima, found.rms, 0)
+            problem, analysis, LocalMinima(None, estimate.minima, estimate.rms, 0)
         )
-    return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
+    return estimate, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
 
 
 def _count_budget_left(
@@ -403,20 +416,22 @@ def _validate_estimates(
     """
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
-    own = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
-    fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in own}
-    kept = {name: fields for name, fields in changes.items() if name not in own}
-    known = validation.rebuild(parameters={**kept, **fixed}, weights=estimation.output_weights)
+    shared = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
+    fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in shared}
+    other_changes = {name: fields for name, fields in changes.items() if name not in shared}
+    fixed_problem = validation.rebuild(
+        parameters={**other_changes, **fixed}, weights=estimation.output_weights
+    )
     theta = np.zeros(0)
-    if known.free_parameters:
-        middle = 0.5 * (known.evaluator.lower + known.evaluator.upper)
-        start = refine_candidates(known, [middle])[0]
+    if fixed_problem.free_parameters:
+        middle = 0.5 * (fixed_problem.evaluator.lower + fixed_problem.evaluator.upper)
+        start = refine_candidates(fixed_problem, [middle])[0]
         theta = middle if start is None else start.theta
-    simulated = known.predict(theta[None])[0]
+    simulated = fixed_problem.predict(theta[None])[0]
     return _ValidationResult(
-        compute_metrics(known, simulated),
-        _select_scored_part(known, _split_outputs(known, simulated)),
-        run_residual_tests(known, simulated, "validation", correlation_times),
+        compute_metrics(fixed_problem, simulated),
+        _select_scored_part(fixed_problem, _split_outputs(fixed_problem, simulated)),
+        run_residual_tests(fixed_problem, simulated, "validation", correlation_times),
     )
 
 
@@ -428,16 +443,16 @@ def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:
 
 
 def _select_scored_part(
-    known: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
+    problem: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> tuple[tuple[FloatArray, ...], ...]:
     """The part from the time on at which the records are scored, at its measured times."""
-    scored_from = known.settings.scored_from
+    scored_from = problem.settings.scored_from
     if scored_from is None:
         return simulated
-    names = [output.name for output in known.model.outputs]
-    kept = []
-    for record, since, outputs in zip(known.records, scored_from, simulated, strict=True):
+    names = [output.name for output in problem.model.outputs]
+    scored = []
+    for record, since, outputs in zip(problem.records, scored_from, simulated, strict=True):
         times = {channel.name: channel.times for channel in record.outputs}
         late = [times[name] >= since for name in names]
-        kept.append(tuple(part[mask] for part, mask in zip(outputs, late, strict=True)))
-    return tuple(kept)
+        scored.append(tuple(part[mask] for part, mask in zip(outputs, late, strict=True)))
+    return tuple(scored)

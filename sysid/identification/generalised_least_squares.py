@@ -90,17 +90,22 @@ class GeneralisedEstimate(NamedTuple):
 
 def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
     """The whitening of a problem's scored samples."""
-    each = [
-        compute_ar1_coefficient(one.times, correlation_times.get(one.output, 0.0))
-        for one in iterate_parts(problem)
+    coefficients = [
+        compute_ar1_coefficient(part.times, correlation_times.get(part.output, 0.0))
+        for part in iterate_parts(problem)
     ]
     return Whitening(
-        np.concatenate([np.zeros(0), *each]), sum(time > 0 for time in correlation_times.values())
+        np.concatenate([np.zeros(0), *coefficients]),
+        sum(time > 0 for time in correlation_times.values()),
     )
 
 
 def fit_generalised_least_squares(
-    problem: Problem, theta: FloatArray, covariance: FloatArray, seed: int, most: int | None = None
+    problem: Problem,
+    theta: FloatArray,
+    covariance: FloatArray,
+    seed: int,
+    max_simulations: int | None = None,
 ) -> GeneralisedEstimate:
     """Estimates under first-order noise, from those of least squares (D,).
 
@@ -114,31 +119,33 @@ def fit_generalised_least_squares(
     seed : int
         Of the places that are drawn along it.
     """
-    search = _WhitenedLeastSquares(problem, 2**62 if most is None else most)
+    search = _WhitenedLeastSquares(problem, 2**62 if max_simulations is None else max_simulations)
     if search.simulations_left < 1:
         return GeneralisedEstimate(theta, {}, 0, False)
     place = to_unit(problem.evaluator, theta[None])[0]
     error = search.compute_residuals(place[None])[0]
     coloured = _select_coloured_outputs(problem, error)
-    known: Mapping[str, float] = {}
+    times: Mapping[str, float] = {}
     random = make_move_generator(seed)
     for i in range(_MAX_ROUNDS if coloured else 0):
-        found = _estimate_correlation_times(problem, coloured, error, None)
-        is_last = i == _MAX_ROUNDS - 1 or _have_converged(found, known)
+        new_times = _estimate_correlation_times(problem, coloured, error, None)
+        is_last = i == _MAX_ROUNDS - 1 or _have_converged(new_times, times)
         if search.simulations_left < search.round_simulations:
-            return _to_estimate(problem, theta, place, known, search, False)
+            return _to_estimate(problem, theta, place, times, search, False)
         if is_last:
             spread = _factor_output_covariance(
-                search.compute_slopes(place, error), error, make_whitening(problem, known)
+                search.compute_slopes(place, error), error, make_whitening(problem, times)
             )
-            found = _estimate_correlation_times(problem, coloured, error, spread)
-        known, white = found, make_whitening(problem, found)
-        starts = _draw_starts(search, place, white, covariance, random) if i == 0 or is_last else []
-        place = search.find_lowest_minimum([place, *starts], white)
+            new_times = _estimate_correlation_times(problem, coloured, error, spread)
+        times, whitening = new_times, make_whitening(problem, new_times)
+        starts = (
+            _draw_starts(search, place, whitening, covariance, random) if i == 0 or is_last else []
+        )
+        place = search.find_lowest_minimum([place, *starts], whitening)
         error = search.compute_residuals(place[None])[0]
         if is_last:
             break
-    return _to_estimate(problem, theta, place, known, search, not search.is_cut)
+    return _to_estimate(problem, theta, place, times, search, not search.is_cut)
 
 
 def find_coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
@@ -150,28 +157,28 @@ def find_coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
 
 
 def _select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
-    return {one.output for one in iterate_parts(problem) if is_coloured(one, error[one.rows])}
+    return {part.output for part in iterate_parts(problem) if is_coloured(part, error[part.rows])}
 
 
 def _to_estimate(
     problem: Problem,
     theta: FloatArray,
     place: FloatArray,
-    known: Mapping[str, float],
+    times: Mapping[str, float],
     search: "_WhitenedLeastSquares",
     is_complete: bool,
 ) -> GeneralisedEstimate:
     """The estimates at a place, those there were where no correlation was found."""
-    if any(known.values()):
+    if any(times.values()):
         theta = from_unit(problem.evaluator, place[None])[0]
     minima = from_unit(problem.evaluator, search.ends)
-    return GeneralisedEstimate(theta, known, search.evaluations, is_complete, minima, search.rms)
+    return GeneralisedEstimate(theta, times, search.evaluations, is_complete, minima, search.rms)
 
 
 def _draw_starts(
     search: "_WhitenedLeastSquares",
     place: FloatArray,
-    white: Whitening,
+    whitening: Whitening,
     covariance: FloatArray,
     random: np.random.Generator,
 ) -> list[FloatArray]:
@@ -184,39 +191,39 @@ def _draw_starts(
     moves = moves * random.standard_normal((_N_DRAWN, place.size)) @ factor_covariance(covariance).T
     theta = from_unit(evaluator, place[None]) + moves
     places = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
-    totals = _sum_squares(white.whiten(search.compute_residuals(places)))
+    totals = _sum_squares(whitening.whiten(search.compute_residuals(places)))
     return [places[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
 
 
-def _have_converged(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
-    return bool(known) and all(
-        abs(found[name] - known[name]) <= _TIME_TOLERANCE * known[name] for name in found
+def _have_converged(times: Mapping[str, float], previous: Mapping[str, float]) -> bool:
+    return bool(previous) and all(
+        abs(times[name] - previous[name]) <= _TIME_TOLERANCE * previous[name] for name in times
     )
 
 
 def _factor_output_covariance(
-    columns: FloatArray, error: FloatArray, white: Whitening
+    columns: FloatArray, error: FloatArray, whitening: Whitening
 ) -> FloatArray:
     """L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
-    seen, left = white.whiten(columns.T).T, white.whiten(error)
-    _, singular, rows, kept = truncated_svd(seen)
-    deviation = np.sqrt(float(left @ left) / max(error.size - columns.shape[1], 1))
-    return np.asarray(deviation * columns @ (rows[kept].T / singular[kept]))
+    whitened, residuals = whitening.whiten(columns.T).T, whitening.whiten(error)
+    _, singular, rows, retained = truncated_svd(whitened)
+    deviation = np.sqrt(float(residuals @ residuals) / max(error.size - columns.shape[1], 1))
+    return np.asarray(deviation * columns @ (rows[retained].T / singular[retained]))
 
 
 def _estimate_correlation_times(
     problem: Problem, coloured: set[str], error: FloatArray, spread: FloatArray | None
 ) -> dict[str, float]:
     """Of each output in s: the mean over its series, by their samples."""
-    found: dict[str, list[tuple[float, int]]] = {}
-    for one in iterate_parts(problem):
-        if one.output in coloured:
-            also = None if spread is None else spread[one.rows]
-            time = _estimate_correlation_time(one, error[one.rows], also)
-            found.setdefault(one.output, []).append((time, one.times.size))
+    times: dict[str, list[tuple[float, int]]] = {}
+    for part in iterate_parts(problem):
+        if part.output in coloured:
+            part_spread = None if spread is None else spread[part.rows]
+            time = _estimate_correlation_time(part, error[part.rows], part_spread)
+            times.setdefault(part.output, []).append((time, part.times.size))
     return {
-        name: sum(time * n for time, n in each) / sum(n for _, n in each)
-        for name, each in found.items()
+        name: sum(time * n for time, n in estimates) / sum(n for _, n in estimates)
+        for name, estimates in times.items()
     }
 
 
@@ -224,19 +231,19 @@ def _estimate_correlation_time(
     part: ResidualPart, error: FloatArray, spread: FloatArray | None
 ) -> float:
     """Time (s) at which the autocorrelation of one series has fallen to 1/e, half of it at most."""
-    laid = space_residuals(part.times, error)
-    present = laid.present.astype(np.float64)
-    covariance = _autocorrelate(laid.values)
+    series = space_residuals(part.times, error)
+    present = series.present.astype(np.float64)
+    covariance = _autocorrelate(series.values)
     for column in () if spread is None else spread.T:
-        values = np.zeros(laid.values.size)
-        values[laid.present] = column
+        values = np.zeros(series.values.size)
+        values[series.present] = column
         covariance += _autocorrelate(values)
-    n = laid.values.size
+    n = series.values.size
     pairs = np.maximum(np.rint(_autocorrelate(present)), 1.0)
     covariance *= np.arange(n, n - pairs.size, -1.0) / pairs  # as if no sample were missing
     if not covariance.size or not covariance[0] > 0:
         return 0.0
-    return laid.period * _find_decay_lag(covariance / covariance[0])
+    return series.period * _find_decay_lag(covariance / covariance[0])
 
 
 def _autocorrelate(values: FloatArray) -> FloatArray:
@@ -294,24 +301,24 @@ class _WhitenedLeastSquares:
         self.evaluations += place.size
         return columns.T
 
-    def find_lowest_minimum(self, starts: Sequence[FloatArray], white: Whitening) -> FloatArray:
+    def find_lowest_minimum(self, starts: Sequence[FloatArray], whitening: Whitening) -> FloatArray:
         """The lowest minimum from places (D,), of which the first is sure to be searched from."""
-        found = []
+        solutions = []
         for start in starts:
             steps = min(_MAX_STEPS, (self.simulations_left - 2) // self._step_simulations)
             if steps < 1:
                 self.is_cut = True
                 break
-            solution = self._solve(start, white, steps)
+            solution = self._solve(start, whitening, steps)
             self.is_cut |= steps < _MAX_STEPS and not solution.is_converged
-            found.append(solution)
-        self.ends = np.array([one.place for one in found])
-        self.rms = np.sqrt([one.loss for one in found])
-        return found[int(np.argmin(self.rms))].place
+            solutions.append(solution)
+        self.ends = np.array([one.place for one in solutions])
+        self.rms = np.sqrt([one.loss for one in solutions])
+        return solutions[int(np.argmin(self.rms))].place
 
-    def _solve(self, place: FloatArray, white: Whitening, steps: int) -> LeastSquaresSolution:
+    def _solve(self, place: FloatArray, whitening: Whitening, steps: int) -> LeastSquaresSolution:
         at_once = steps_at_once(place.size, self.problem.n_steps)
-        scored = self._scored._replace(owed=white.ar1_coefficient)
+        scored = self._scored._replace(owed=whitening.ar1_coefficient)
         solution = solve_least_squares(scored, place, 0.0, steps=steps, at_once=at_once)
         self.evaluations += solution.evaluations
         return solution

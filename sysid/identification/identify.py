@@ -69,14 +69,20 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-    whole, other = _to_records(records), None if validation is None else _to_records(validation)
+    whole, validation_records = (
+        _to_records(records),
+        None if validation is None else _to_records(validation),
+    )
     check_unused_settings(model, len(whole), parameters, weights)
-    check_signal_units(model, (*whole, *(other or ())))
+    check_signal_units(model, (*whole, *(validation_records or ())))
     fit = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip)
-    prepared = prepare_records(whole, other, validation_fraction, noise)
-    problem, judged = build_problems(model, prepared, fit)
+    prepared = prepare_records(whole, validation_records, validation_fraction, noise)
+    problem, validation_problem = build_problems(model, prepared, fit)
     return conclude_run(
-        problem, algorithm, _run_search(problem, algorithm, seed, warm, progress), judged
+        problem,
+        algorithm,
+        _run_search(problem, algorithm, seed, warm, progress),
+        validation_problem,
     )
 
 

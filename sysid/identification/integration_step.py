@@ -66,14 +66,14 @@ def warn_integration_step(
         else _refit_estimate(fine, theta, is_late)
     )
     gain = n * np.log(max(end.squares, _TINY) / max(float(error @ error), _TINY))
-    told = _describe_shifts(
+    shifts = _describe_shifts(
         problem, theta, estimates, end.theta, _NOTABLE_SHARE if gain > _LIKELIHOOD_GAIN else 0.0
     )
-    if not told:
+    if not shifts:
         return []
     substeps = problem.model.solver.substeps
     return [
-        f"the integration step is too long for these estimates: with half of it {', '.join(told)}. "
+        f"the integration step is too long for these estimates: with half of it {', '.join(shifts)}. "
         f"Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
     ]
 
@@ -105,11 +105,11 @@ def _predict_estimate(
     error: FloatArray,
 ) -> _FineEstimate:
     """Where it would end if outputs that move by so little (n,) are linear."""
-    held = {one.name for one in estimates if one.status == "at bound"}
-    found = compute_sensitivities(problem, theta)
-    sloping = (found.plateau_width == 0.0) & ~found.one_sided
-    sloping &= [name not in held for name in problem.free_names]
-    columns = found.columns * sloping
+    at_bound = {estimate.name for estimate in estimates if estimate.status == "at bound"}
+    sensitivities = compute_sensitivities(problem, theta)
+    sloping = (sensitivities.plateau_width == 0.0) & ~sensitivities.one_sided
+    sloping &= [name not in at_bound for name in problem.free_names]
+    columns = sensitivities.columns * sloping
     shift = -np.linalg.lstsq(columns, move, rcond=RANK_TOLERANCE)[0]
     left = error + move + columns @ shift
     return _FineEstimate(theta + shift * compute_physical_scale(problem, theta), float(left @ left))
@@ -123,19 +123,19 @@ def _describe_shifts(
     share: float,
 ) -> list[str]:
     """Estimates that move by much of their standard error, and by that share of themselves."""
-    by = dict(zip(problem.free_names, (end - theta).tolist(), strict=True))
-    told = []
-    for one in estimates:
-        shift = by.get(one.name, 0.0)
-        if one.stderr and abs(shift) > max(one.stderr, share * abs(one.value)):
-            digits = max(4, 2 + ceil(log10(abs(one.value / shift)))) if one.value else 4
+    shift_by_name = dict(zip(problem.free_names, (end - theta).tolist(), strict=True))
+    messages = []
+    for estimate in estimates:
+        shift = shift_by_name.get(estimate.name, 0.0)
+        if estimate.stderr and abs(shift) > max(estimate.stderr, share * abs(estimate.value)):
+            digits = max(4, 2 + ceil(log10(abs(estimate.value / shift)))) if estimate.value else 4
             values = (
-                f"{value:.{digits}g}{format_unit(one.unit)}"
-                for value in (one.value + shift, one.value)
+                f"{value:.{digits}g}{format_unit(estimate.unit)}"
+                for value in (estimate.value + shift, estimate.value)
             )
-            often = f"{abs(shift) / one.stderr:.2g} of its standard errors away"
-            told.append(f"{one.name} = {' instead of '.join(values)}, {often}")
-    return told
+            often = f"{abs(shift) / estimate.stderr:.2g} of its standard errors away"
+            messages.append(f"{estimate.name} = {' instead of '.join(values)}, {often}")
+    return messages
 
 
 def _halve_step(problem: Problem) -> Problem:

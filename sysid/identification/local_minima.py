@@ -77,9 +77,11 @@ def count_affordable_simulations(problem: Problem, is_late: bool) -> int:
 
     By the steps of a simulation, not by the clock, so that the same run has the same result.
     """
-    steps = sum(one.grid.points * one.grid.substeps for one in problem.experiments)
-    most = min(_MAX_SIMULATIONS, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
-    return most if most >= _ROUGHNESS_PLACES else 0
+    steps = sum(
+        experiment.grid.points * experiment.grid.substeps for experiment in problem.experiments
+    )
+    limit = min(_MAX_SIMULATIONS, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
+    return limit if limit >= _ROUGHNESS_PLACES else 0
 
 
 def find_local_minima(
@@ -88,29 +90,31 @@ def find_local_minima(
     rms: float,
     linear: LinearOutputModel,
     seed: int,
-    left: int | None = None,
+    max_simulations: int | None = None,
 ) -> LocalMinima:
     """Look for minima around an estimate (D,) with a linear model, in at most `left` runs."""
-    look = _LocalSearch(problem, linear, seed, 2**62 if left is None else left)
+    search = _LocalSearch(
+        problem, linear, seed, 2**62 if max_simulations is None else max_simulations
+    )
     first = best = RefinedCandidate(theta, rms, 0)
-    found = [first]
-    if rms > 0 and look.root.any() and look.is_rough(best):
+    minima = [first]
+    if rms > 0 and search.root.any() and search.is_rough(best):
         for _ in range(_MAX_ROUNDS):
-            ends = look.refine_starts(best)
-            found += ends
-            reached = min((best, *ends), key=lambda one: one.rms)
+            ends = search.refine_starts(best)
+            minima += ends
+            reached = min((best, *ends), key=lambda candidate: candidate.rms)
             gains = reached.rms < best.rms * (1.0 - _GAIN_TOLERANCE)
             best = reached  # also where it is lower by rounding only: what follows ends the lowest
             if not gains or best.rms == 0:
                 break
-        found.append(look.run_evolution_strategy(best) if best.rms > 0 else best)
-        best = found[-1]
+        minima.append(search.run_evolution_strategy(best) if best.rms > 0 else best)
+        best = minima[-1]
     better = best if best.rms < rms * (1.0 - _GAIN_TOLERANCE) else None
     return LocalMinima(
         better,
-        np.array([one.theta for one in found]),
-        np.array([one.rms for one in found]),
-        look.evaluations,
+        np.array([candidate.theta for candidate in minima]),
+        np.array([candidate.rms for candidate in minima]),
+        search.evaluations,
     )
 
 
@@ -188,27 +192,27 @@ def widen_intervals(
     estimates: tuple[Estimate, ...],
     names: tuple[str, ...],
     n: int,
-    found: LocalMinima,
-    share: FloatArray,
+    minima: LocalMinima,
+    variance_ratio: FloatArray,
 ) -> tuple[Estimate, ...]:
     """Estimates whose intervals hold those of all minima that the data do not rule out.
 
     `share` (D,) is that of `LinearOutputModel`, of the parameters of these names.
     """
-    least = found.rms.min()
+    least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = 2.0 * n * np.log(np.where(found.rms > least, found.rms / least, 1.0))
+        ratio = 2.0 * n * np.log(np.where(minima.rms > least, minima.rms / least, 1.0))
     changed = []
-    told = {name: d for d, name in enumerate(names) if np.isfinite(share[d])}
-    for one in estimates:
-        if one.name in told and one.stderr and one.interval95 is not None:
-            d = told[one.name]
-            lower, upper = one.interval95
-            quantile, own = (upper - lower) / (2.0 * one.stderr), ratio * share[d]
-            kept = own <= quantile**2
-            half = one.stderr * np.sqrt(quantile**2 - own[kept])
-            middle = found.values[kept, d]
+    index_by_name = {name: d for d, name in enumerate(names) if np.isfinite(variance_ratio[d])}
+    for estimate in estimates:
+        if estimate.name in index_by_name and estimate.stderr and estimate.interval95 is not None:
+            d = index_by_name[estimate.name]
+            lower, upper = estimate.interval95
+            quantile, ratios = (upper - lower) / (2.0 * estimate.stderr), ratio * variance_ratio[d]
+            is_compatible = ratios <= quantile**2
+            half = estimate.stderr * np.sqrt(quantile**2 - ratios[is_compatible])
+            middle = minima.values[is_compatible, d]
             low, high = float(np.min(middle - half)), float(np.max(middle + half))
-            one = replace(one, interval95=(min(lower, low), max(upper, high)))
-        changed.append(one)
+            estimate = replace(estimate, interval95=(min(lower, low), max(upper, high)))
+        changed.append(estimate)
     return tuple(changed)

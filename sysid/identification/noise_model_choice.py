@@ -101,15 +101,17 @@ def _simulate_shifted_start(
     """Outputs (M,) where a state starts elsewhere, in every experiment."""
     evaluator, layout = problem.evaluator, ExperimentLayout.from_model(problem.model)
     floats, template, values = evaluator.floats.copy(), evaluator.template.copy(), theta.copy()
-    for laid, (ints, first, _) in zip(problem.experiments, evaluator.offsets.tolist(), strict=True):
-        start = laid.starts[state]
+    for experiment, (ints, first, _) in zip(
+        problem.experiments, evaluator.offsets.tolist(), strict=True
+    ):
+        start = experiment.starts[state]
         if start.row >= 0:
             template[start.row] += move
             values[evaluator.free_rows == start.row] += move
         else:
             floats[first + layout.locate_initial(state)] += move
-            given = first + int(evaluator.ints[ints + layout.locate_state(state, "given")])
-            floats[given : given + start.first_values.size] += move
+            first_value = first + int(evaluator.ints[ints + layout.locate_state(state, "given")])
+            floats[first_value : first_value + start.first_values.size] += move
     elsewhere = evaluator._replace(floats=floats, template=template)
     return np.asarray(predict_population(elsewhere, values[None])[0])
 
@@ -119,10 +121,10 @@ def _find_lasting_changes(problem: Problem, change: FloatArray) -> set[str]:
     lasts: dict[str, bool] = {}
     weights = problem.split_by_output(problem.evaluator.weight)
     for changes, weight in zip(problem.split_by_output(change), weights, strict=True):
-        seen = {name: one[weight[name] > 0] for name, one in changes.items()}
-        largest = max(float(np.max(np.abs(one), initial=0.0)) for one in seen.values())
-        for name, one in seen.items():
-            late = one[int(_LATE_PART * one.size) :]
+        scored = {name: values[weight[name] > 0] for name, values in changes.items()}
+        largest = max(float(np.max(np.abs(values), initial=0.0)) for values in scored.values())
+        for name, values in scored.items():
+            late = values[int(_LATE_PART * values.size) :]
             if late.size:
                 is_left = max(np.min(late), np.min(-late)) > _LASTING_SHARE * largest
                 lasts[name] = lasts.get(name, True) and bool(is_left)
@@ -137,7 +139,7 @@ def is_ar1_indicated(
     theta: FloatArray,
     analysis: Analysis,
     is_late: Callable[[], bool] | None = None,
-    most: int | None = None,
+    max_simulations: int | None = None,
 ) -> bool:
     """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
 
@@ -145,11 +147,11 @@ def is_ar1_indicated(
     comes of too long a step of the integration is no noise. `most` are the simulations that the
     time leaves: where the look may take more there is none.
     """
-    known = analysis.uncertainty
+    uncertainty = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
-    if not is_free or known is None or known.noise_colour == "white":
+    if not is_free or uncertainty is None or uncertainty.noise_colour == "white":
         return False
-    if most is not None and most < 2 + MAX_TRIES * len(problem.model.states):
+    if max_simulations is not None and max_simulations < 2 + MAX_TRIES * len(problem.model.states):
         return False
     coloured = find_coloured_outputs(problem, theta)
     if not coloured or not coloured <= find_integrating_outputs(problem, theta):
@@ -159,22 +161,22 @@ def is_ar1_indicated(
 
 
 def confirm_noise_model(
-    problem: Problem, theta: FloatArray, found: GeneralisedEstimate
+    problem: Problem, theta: FloatArray, estimate: GeneralisedEstimate
 ) -> GeneralisedEstimate:
     """What was found under first-order noise, or squares again where it is not known well."""
     longest: dict[str, float] = {}
-    for one in iterate_parts(problem):
-        span = float(one.times[-1] - one.times[0])
-        longest[one.output] = max(span, longest.get(one.output, 0.0))
-    times = found.correlation_times
-    squares = GeneralisedEstimate(theta, {}, found.evaluations, True)
-    if not found.is_complete or not any(times.values()):
+    for part in iterate_parts(problem):
+        span = float(part.times[-1] - part.times[0])
+        longest[part.output] = max(span, longest.get(part.output, 0.0))
+    times = estimate.correlation_times
+    squares = GeneralisedEstimate(theta, {}, estimate.evaluations, True)
+    if not estimate.is_complete or not any(times.values()):
         return squares
     slow = {name: time for name, time in times.items() if _MIN_RECORD_TIMES * time > longest[name]}
     return (
         squares._replace(unresolved_times=slow)
         if slow
-        else found._replace(least_squares_theta=theta)
+        else estimate._replace(least_squares_theta=theta)
     )
 
 
@@ -190,17 +192,17 @@ def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem
 def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> tuple[str, ...]:
     """Why there is a noise model that nobody asked for, and what squares gave; or why not."""
     if noise.unresolved_times:
-        found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
+        times = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
         return (
             "noise_model auto keeps least squares, although the residuals drift and the model "
-            f"integrates. With ar1 the noise would have a correlation time of {found}. "
+            f"integrates. With ar1 the noise would have a correlation time of {times}. "
             f"The record is not {_MIN_RECORD_TIMES:g} times as long.",
         )
     if noise.least_squares_theta is None:
         return ()
     squares = ", ".join(
-        f"{one.name} = {value:.4g}{format_unit(one.unit)}"
-        for one, value in zip(
+        f"{parameter.name} = {value:.4g}{format_unit(parameter.unit)}"
+        for parameter, value in zip(
             problem.free_parameters, noise.least_squares_theta.tolist(), strict=True
         )
     )

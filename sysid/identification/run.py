@@ -54,11 +54,13 @@ def begin_run(
     all free parameters are taken for an earlier result, behind which a run settles sooner; those
     of some of them seed the search, and no more.
     """
-    given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
-    given = tuple(one for one in given if one)
-    is_warm = any(all(name in one for name in problem.free_names) for one in given)
+    warm_starts = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
+    warm_starts = tuple(values for values in warm_starts if values)
+    is_warm = any(all(name in values for name in problem.free_names) for values in warm_starts)
     starts = find_equation_error_starts(problem, algorithm)
-    islands = create_islands(problem, algorithm, seed, given, starts.values, starts.evaluations)
+    islands = create_islands(
+        problem, algorithm, seed, warm_starts, starts.values, starts.evaluations
+    )
     for island in islands:
         island.search.is_warm_start = is_warm
     return RunState(seed, islands, is_warm=is_warm)
@@ -118,35 +120,35 @@ def advance_run(
 
     `should_stop` is asked between compiled calls, about every 0.1 s.
     """
-    way = make_search_plan(problem, algorithm, state.seed, is_warm=state.is_warm)
+    plan = make_search_plan(problem, algorithm, state.seed, is_warm=state.is_warm)
     size = algorithm.population // algorithm.n_islands
-    pace = _CallBudget(
+    budget = _CallBudget(
         seconds,
         algorithm.stop.seconds,
         state.seconds,
         should_stop,
         FIRST_CALL_STEPS // (size * max(problem.n_steps, 1)),
     )
-    while not is_finished(algorithm, state) and not pace.is_over():
+    while not is_finished(algorithm, state) and not budget.is_over():
         before, left = _count_generations(state), algorithm.generations - state.generation
-        stand = evolve_islands(
+        archipelago = evolve_islands(
             problem.evaluator,
-            way,
+            plan,
             state.islands,
             state.generation,
             state.epoch,
-            pace.count_affordable_generations(left * algorithm.n_islands),
+            budget.count_affordable_generations(left * algorithm.n_islands),
         )
         state = replace(
             state,
-            islands=stand.islands,
-            generation=stand.generation,
-            epoch=stand.epoch,
-            migrations=state.migrations + stand.migrants,
+            islands=archipelago.islands,
+            generation=archipelago.generation,
+            epoch=archipelago.epoch,
+            migrations=state.migrations + archipelago.migrants,
         )
-        pace.record_call(_count_generations(state) - before)
-        ended = stand.has_crossed and _has_ended(algorithm, state)
-        state = replace(state, has_ended=ended, seconds=pace.measure_used_seconds())
+        budget.record_call(_count_generations(state) - before)
+        ended = archipelago.has_crossed and _has_ended(algorithm, state)
+        state = replace(state, has_ended=ended, seconds=budget.measure_used_seconds())
     return state
 
 

@@ -49,13 +49,15 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
         return []
     if not _would_move(problem, analysis, assumed):
         return []
-    told = _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
-    if not told:
+    moves = _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
+    if not moves:
         return []
-    what, them = ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
+    subject, pronoun = (
+        ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
+    )
     return [
-        f"{what} an input from before the record, which was not recorded. Its first value is "
-        f"assumed there. Without {them} {', '.join(told)}. Give the input before the record "
+        f"{subject} an input from before the record, which was not recorded. Its first value is "
+        f"assumed there. Without {pronoun} {', '.join(moves)}. Give the input before the record "
         "(trim a longer recording, or put rows with an empty output before it), or skip: "
         f"{max(int(np.count_nonzero(one)) for one in parts)}"
     ]
@@ -104,14 +106,14 @@ def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> boo
     if analysis.residuals_and_sensitivities is None:
         return False
     error, columns = analysis.residuals_and_sensitivities
-    known = columns[~assumed]
-    move = -np.linalg.lstsq(known, error[~assumed], rcond=RANK_TOLERANCE)[0]
-    by_all, by_known = _compute_variances(columns), _compute_variances(known)
+    recorded = columns[~assumed]
+    move = -np.linalg.lstsq(recorded, error[~assumed], rcond=RANK_TOLERANCE)[0]
+    by_all, by_recorded = _compute_variances(columns), _compute_variances(recorded)
     scale = compute_physical_scale(problem, _to_theta(problem, analysis))
     for d, estimate in enumerate(_select_identified(problem, analysis)):
         if estimate is None or not estimate.stderr or not 0.0 < by_all[d] < np.inf:
             continue
-        chance = np.sqrt(max(by_known[d] / by_all[d] - 1.0, 0.0))
+        chance = np.sqrt(max(by_recorded[d] / by_all[d] - 1.0, 0.0))
         if abs(move[d] * scale[d]) / estimate.stderr > max(_NOTABLE_MOVE, _UNLIKELY_MOVE * chance):
             return True
     return False
@@ -119,21 +121,25 @@ def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> boo
 
 def _select_identified(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
     """The estimates in the order of the free parameters (D,); None of starts, and of vague ones."""
-    own = {one.name for one in problem.model.parameters}
-    by = {one.name: one for one in analysis.estimates if one.status == "identified"}
-    return [by.get(name) if name in own else None for name in problem.free_names]
+    names = {estimate.name for estimate in problem.model.parameters}
+    by_name = {
+        estimate.name: estimate
+        for estimate in analysis.estimates
+        if estimate.status == "identified"
+    }
+    return [by_name.get(name) if name in names else None for name in problem.free_names]
 
 
 def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
-    by = {one.name: one.value for one in analysis.estimates}
-    return np.array([by[name] for name in problem.free_names])
+    by_name = {estimate.name: estimate.value for estimate in analysis.estimates}
+    return np.array([by_name[name] for name in problem.free_names])
 
 
 def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
     """The estimate (D,) from the other samples, from where it is; itself if there is none."""
     theta = _to_theta(problem, analysis)
-    since = problem.settings.scored_from or [-np.inf] * len(problem.records)
-    from_then = zip(_find_recorded_starts(problem, analysis), since, strict=True)
+    scored_from = problem.settings.scored_from or [-np.inf] * len(problem.records)
+    from_then = zip(_find_recorded_starts(problem, analysis), scored_from, strict=True)
     try:
         others = problem.rebuild(
             weights=problem.output_weights, scored_from=tuple(max(pair) for pair in from_then)
@@ -146,23 +152,23 @@ def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
 
 def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
     """Estimates that would be others, with their moves in standard errors."""
-    told = []
+    moves = []
     for estimate, value in zip(_select_identified(problem, analysis), end.tolist(), strict=True):
         if estimate is None or not estimate.stderr:
             continue
         shift = abs(value - estimate.value) / estimate.stderr
         if shift > _NOTABLE_MOVE:
-            told.append(
+            moves.append(
                 f"{estimate.name} is {value:.4g} instead of {estimate.value:.4g}, {shift:.2g} of "
                 "its standard errors away"
             )
-    return told
+    return moves
 
 
 def _compute_variances(columns: FloatArray) -> FloatArray:
     """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
-    _, singular, rows, kept = truncated_svd(triangle)
-    found: FloatArray = np.sum((rows[kept].T / singular[kept]) ** 2, axis=1)
-    is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK_TOLERANCE
-    return np.where(is_open, np.inf, found)
+    _, singular, rows, retained = truncated_svd(triangle)
+    variances: FloatArray = np.sum((rows[retained].T / singular[retained]) ** 2, axis=1)
+    is_open = np.max(np.abs(rows[~retained]), axis=0, initial=0.0) > RANK_TOLERANCE
+    return np.where(is_open, np.inf, variances)

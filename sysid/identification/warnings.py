@@ -59,41 +59,45 @@ def collect_warnings(
     tests: ResidualTests | None = None,
 ) -> tuple[str, ...]:
     """All warnings, the weightiest first; `tests` are those of the residuals."""
-    found = []
+    messages = []
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
-        found.append(
+        messages.append(
             f"the RMS error {rms:.4g} is above the safe limit {limit:g}, so the model is not valid"
         )
-    found += list_mixed_unit_warnings(problem.model, problem.records)
-    found += list_time_unit_warnings(problem.model)
-    found += _warn_active_bounds(analysis)
-    found += _warn_no_prediction(problem)
-    found += _warn_constant_outputs(problem)
-    found += _warn_worse_than_line(problem, simulated)
-    found += _warn_constant_inputs(problem, analysis.estimates)
-    found += _warn_held_inputs(problem)
-    found += _warn_early_response(problem) or warn_unrecorded_input(problem, analysis)
-    found += [text for e in analysis.estimates if (text := _warn_unidentified(e))]
-    lagged = find_delay_parameters(problem)
+    messages += list_mixed_unit_warnings(problem.model, problem.records)
+    messages += list_time_unit_warnings(problem.model)
+    messages += _warn_active_bounds(analysis)
+    messages += _warn_no_prediction(problem)
+    messages += _warn_constant_outputs(problem)
+    messages += _warn_worse_than_line(problem, simulated)
+    messages += _warn_constant_inputs(problem, analysis.estimates)
+    messages += _warn_held_inputs(problem)
+    messages += _warn_early_response(problem) or warn_unrecorded_input(problem, analysis)
+    messages += [text for estimate in analysis.estimates if (text := _warn_unidentified(estimate))]
+    delay_names = find_delay_parameters(problem)
     if analysis.uncertainty is not None:
-        found += [text for e in analysis.estimates if (text := _warn_insignificant(e))]
-        found += [
+        messages += [
+            text for estimate in analysis.estimates if (text := _warn_insignificant(estimate))
+        ]
+        messages += [
             text for group in analysis.uncertainty.groups if (text := _warn_vague_group(group))
         ]
-        found += _warn_correlations(analysis.uncertainty, analysis.estimates, lagged)
+        messages += _warn_correlations(analysis.uncertainty, analysis.estimates, delay_names)
     if analysis.is_cut_short:
-        found.append(
+        messages.append(
             "the time limit left no search for minima near the estimate. Where the loss is rough, "
             "the intervals are too narrow."
         )
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING_SHARE * problem.output_scale:
-        found.append(_warn_not_optimal(algorithm, analysis.possible_gain))
+        messages.append(_warn_not_optimal(algorithm, analysis.possible_gain))
     elif tests is not None:
         loss = problem.loss
-        plain = loss.kind == "squares" and loss.noise_model != "ar1"
-        found += _warn_coloured_residuals(tests, lagged, analysis.uncertainty, may_be_noise=plain)
-    return (*found, *list_unread_unit_warnings(problem.model, problem.records))
+        is_plain = loss.kind == "squares" and loss.noise_model != "ar1"
+        messages += _warn_coloured_residuals(
+            tests, delay_names, analysis.uncertainty, may_be_noise=is_plain
+        )
+    return (*messages, *list_unread_unit_warnings(problem.model, problem.records))
 
 
 def _warn_active_bounds(analysis: Analysis) -> list[str]:
@@ -101,9 +105,9 @@ def _warn_active_bounds(analysis: Analysis) -> list[str]:
     if not analysis.active_bounds:
         return []
     first, *others = analysis.active_bounds
-    more = f", and {', '.join(map(str, others))}" if others else ""
-    cures = " and ".join(one.advice for one in analysis.active_bounds)
-    return [f"the data pull {first}{more}. To widen: {cures}, unless it is a physical limit."]
+    also = f", and {', '.join(map(str, others))}" if others else ""
+    cures = " and ".join(bound.advice for bound in analysis.active_bounds)
+    return [f"the data pull {first}{also}. To widen: {cures}, unless it is a physical limit."]
 
 
 def _warn_held_inputs(problem: Problem) -> list[str]:
@@ -113,11 +117,11 @@ def _warn_held_inputs(problem: Problem) -> list[str]:
     """
     if is_difference(problem.model):
         return []  # a recursion reads inputs at the samples only
-    channels = [one for record in problem.records for one in record.inputs]
+    channels = [channel for record in problem.records for channel in record.inputs]
     names = {
-        one.name
-        for one in channels
-        if one.hold == "first" and _HELD_SHARE <= np.mean(np.diff(one.values) == 0) < 1
+        channel.name
+        for channel in channels
+        if channel.hold == "first" and _HELD_SHARE <= np.mean(np.diff(channel.values) == 0) < 1
     }
     return [
         f"input {name!r} looks piecewise constant, but is interpolated linearly. This shifts an "
@@ -131,17 +135,17 @@ def _warn_early_response(problem: Problem) -> list[str]:
     """Records of a lagged input whose output leaves its rest while no input has moved."""
     if not list_delayed_values(problem.model, "input"):
         return []
-    found = []
+    messages = []
     for number, record in enumerate(problem.records, 1):
-        if alone := find_unprompted_output(record):
+        if unprompted := find_unprompted_output(record):
             where = f" in experiment {number}" if len(problem.records) > 1 else ""
-            found.append(
-                f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where}, before any "
+            messages.append(
+                f"output {unprompted[0]!r} begins to move at t = {unprompted[1]:.4g} s{where}, before any "
                 "input. If the record begins with the step itself, the estimated time lag is "
                 "wrong: the input is assumed constant before the record. Put some rows of the "
                 "input at rest before the record."
             )
-    return found
+    return messages
 
 
 def _warn_no_prediction(problem: Problem) -> list[str]:
@@ -159,18 +163,18 @@ def _warn_constant_outputs(problem: Problem) -> list[str]:
     """Outputs whose scored samples are all the same, in every experiment."""
     measured = problem.split_by_output(problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
-    found = []
+    messages = []
     for output in problem.model.outputs:
         values = np.concatenate(
             [y[output.name][w[output.name] > 0] for y, w in zip(measured, weights, strict=True)]
         )
         if np.ptp(values) == 0.0:
             unit = format_unit(output.unit)
-            found.append(
+            messages.append(
                 f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it contains no "
                 "dynamics, and the fit % is undefined"
             )
-    return found
+    return messages
 
 
 def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
@@ -178,7 +182,7 @@ def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
     measured = problem.split_by_output(problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
     models = problem.split_by_output(simulated)
-    found = []
+    messages = []
     for e, experiment in enumerate(problem.experiments):
         for output, samples in zip(problem.model.outputs, experiment.outputs, strict=True):
             scored = weights[e][output.name] > 0
@@ -190,11 +194,11 @@ def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
             if rms > line:
                 where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
                 unit = format_unit(output.unit)
-                found.append(
+                messages.append(
                     f"the model fits {output.name}{where} worse than a straight line "
                     f"(RMS {rms:.4g} against {line:.4g}{unit})"
                 )
-    return found
+    return messages
 
 
 def _fit_line(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -213,12 +217,12 @@ def _warn_unidentified(estimate: Estimate) -> str:
     low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
     side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
     unit = format_unit(estimate.unit)
-    place = f"lies at its {side} bound {bound:g}{unit}"
+    position = f"lies at its {side} bound {bound:g}{unit}"
     match estimate.status:
         case "at bound":
-            return f"{estimate.name} {place}"
+            return f"{estimate.name} {position}"
         case "group" | "unidentifiable":
-            also = f"; it {place}" if estimate.value == bound else ""
+            also = f"; it {position}" if estimate.value == bound else ""
             return f"{estimate.name} is not identified: {estimate.reason}{also}"
     return ""
 
@@ -250,50 +254,52 @@ def _warn_vague_group(group: IdentifiableCombination) -> str:
 
 def find_delay_parameters(problem: Problem) -> set[str]:
     """Names of the parameters that lags are made of."""
-    past = [
+    past_values = [
         *list_delayed_values(problem.model, "input"),
         *list_delayed_values(problem.model, "state"),
     ]
-    found: set[str] = set()
-    for one in past:
-        if one.delay is not None:
-            found |= collect_parameter_names(one.delay)
-    return found & set(problem.free_names)
+    names: set[str] = set()
+    for past_value in past_values:
+        if past_value.delay is not None:
+            names |= collect_parameter_names(past_value.delay)
+    return names & set(problem.free_names)
 
 
 def _warn_correlations(
-    uncertainty: Uncertainty, estimates: tuple[Estimate, ...], lagged: set[str]
+    uncertainty: Uncertainty, estimates: tuple[Estimate, ...], delay_names: set[str]
 ) -> list[str]:
     """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
 
     Coloured residuals turn the ellipsoid of the estimates; what one sensitivity makes up for in
     another stays. Of parameters that have no standard error their groups tell.
     """
-    blind = {e.name for e in estimates if e.stderr is None}
-    vague = {e.name for e in estimates if e.name in lagged and _is_insignificant_delay(e)}
-    found = []
+    without_stderr = {e.name for e in estimates if e.stderr is None}
+    insignificant = {
+        e.name for e in estimates if e.name in delay_names and _is_insignificant_delay(e)
+    }
+    messages = []
     for i, first in enumerate(uncertainty.names):
         for j in range(i + 1, len(uncertainty.names)):
             second, r = uncertainty.names[j], float(uncertainty.correlation[i, j])
-            if {first, second} & blind:
+            if {first, second} & without_stderr:
                 continue
             alike = float(uncertainty.sensitivity_correlation[i, j])
-            if {first, second} & vague and max(abs(r), abs(alike)) > _RIDGE_CORRELATION:
+            if {first, second} & insignificant and max(abs(r), abs(alike)) > _RIDGE_CORRELATION:
                 plain = (
                     ""
                     if abs(r) > _RIDGE_CORRELATION
                     else f", {alike:.3f} if the residuals were white"
                 )
-                found.append(
+                messages.append(
                     f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix only a "
                     "combination of them. The time lag is less than two of its standard errors."
                 )
             elif abs(r) > _STRONG_CORRELATION:
-                found.append(
+                messages.append(
                     f"{first} and {second} are strongly correlated (r = {r:.3f}): "
                     "the data fix a combination of them better than each alone"
                 )
-    return found
+    return messages
 
 
 def _is_insignificant_delay(estimate: Estimate) -> bool:
@@ -303,7 +309,11 @@ def _is_insignificant_delay(estimate: Estimate) -> bool:
 
 
 def _warn_coloured_residuals(
-    tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None, *, may_be_noise: bool
+    tests: ResidualTests,
+    delay_names: set[str],
+    uncertainty: Uncertainty | None,
+    *,
+    may_be_noise: bool,
 ) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
@@ -315,23 +325,24 @@ def _warn_coloured_residuals(
     errors then.
     """
     if all(
-        one.kind != "whiteness" or one.p is None or one.p > _WHITENESS_LEVEL for one in tests.tests
+        test.kind != "whiteness" or test.p is None or test.p > _WHITENESS_LEVEL
+        for test in tests.tests
     ):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
-    depends = any(one.kind == "independence" and one.outcome == "failed" for one in tests.tests)
+    depends = any(test.kind == "independence" and test.outcome == "failed" for test in tests.tests)
     advises = may_be_noise and colour in ("coloured", "drifting") and not depends
-    if lagged and uncertainty and (tests.data, colour) == ("validation", "white"):
+    if delay_names and uncertainty and (tests.data, colour) == ("validation", "white"):
         return [
             "the residuals are consistent with white noise on the estimation data, but not on the "
             "validation data. Either dynamics are missing from the model, or parameters are known "
             "too roughly. Estimate from data that cover both."
         ]
-    if lagged:
+    if delay_names:
         suggestion = _NOISE_MODEL_SUGGESTION if advises else ""
         return [
             f"the residuals are not white (on the {tests.data} data): dynamics are missing from "
-            f"the model. The estimate of {', '.join(sorted(lagged))} depends on the order of the "
+            f"the model. The estimate of {', '.join(sorted(delay_names))} depends on the order of the "
             f"model. {_STDERR_MEANINGS[colour]}{suggestion}"
         ]
     if not advises:
@@ -359,12 +370,12 @@ def warn_noise_model(
     """What a noise model did, or why it did nothing."""
     if problem.loss.noise_model != "ar1":
         return ()
-    found = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
+    times = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
     notes = []
-    if found:
+    if times:
         notes.append(
             "estimates and standard errors assume first-order noise with a correlation time of "
-            f"{', '.join(found)}. Least squares alone would give a smaller RMS."
+            f"{', '.join(times)}. Least squares alone would give a smaller RMS."
         )
     elif is_complete:
         notes.append(
@@ -380,10 +391,10 @@ def warn_noise_model(
 
 def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
     """Inputs that stay constant in every record, and what they leave open."""
-    blind = ", ".join(
+    unidentified = ", ".join(
         e.name for e in estimates if e.status in ("group", "unidentifiable") and e.stderr is None
     )
-    found = []
+    messages = []
     for quantity in problem.model.inputs:
         values = [
             one.values
@@ -391,12 +402,12 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
             for one in record.inputs
             if one.name == quantity.name
         ]
-        if blind and all(float(np.ptp(one)) == 0.0 for one in values):
-            found.append(
+        if unidentified and all(float(np.ptp(one)) == 0.0 for one in values):
+            messages.append(
                 f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
-                f"unidentified: {blind}"
+                f"unidentified: {unidentified}"
             )
-    return found
+    return messages
 
 
 def _warn_not_optimal(algorithm: GeneticAlgorithm, gain: float) -> str:

@@ -91,7 +91,10 @@ class Analysis:
 
 
 def analyse_estimate(
-    problem: Problem, theta: FloatArray, most: int | None = None, white: Whitening | None = None
+    problem: Problem,
+    theta: FloatArray,
+    max_simulations: int | None = None,
+    whitening: Whitening | None = None,
 ) -> Analysis:
     """Standard errors, correlations and identifiability at an estimate (D,).
 
@@ -99,20 +102,24 @@ def analyse_estimate(
     With a whitening all is of the whitened residuals and sensitivities.
     """
     try:
-        sensitive = compute_sensitivities(problem, theta, most)
+        sensitivities = compute_sensitivities(problem, theta, max_simulations)
     except BudgetSpentError as spent:
-        return _analyse_without_sensitivities(problem, theta, spent, white)
-    if white is not None:
-        columns = white.whiten(sensitive.columns.T).T
-        sensitive = sensitive._replace(residuals=white.whiten(sensitive.residuals), columns=columns)
-    analysis = _analyse_sensitivities(problem, theta, sensitive, most, white)
-    if white is not None:
+        return _analyse_without_sensitivities(problem, theta, spent, whitening)
+    if whitening is not None:
+        columns = whitening.whiten(sensitivities.columns.T).T
+        sensitivities = sensitivities._replace(
+            residuals=whitening.whiten(sensitivities.residuals), columns=columns
+        )
+    analysis = _analyse_sensitivities(problem, theta, sensitivities, max_simulations, whitening)
+    if whitening is not None:
         return analysis
-    return replace(analysis, residuals_and_sensitivities=(sensitive.residuals, sensitive.columns))
+    return replace(
+        analysis, residuals_and_sensitivities=(sensitivities.residuals, sensitivities.columns)
+    )
 
 
 def _analyse_without_sensitivities(
-    problem: Problem, theta: FloatArray, spent: BudgetSpentError, white: Whitening | None
+    problem: Problem, theta: FloatArray, spent: BudgetSpentError, whitening: Whitening | None
 ) -> Analysis:
     """What is known without a look at the neighbours of the estimate.
 
@@ -123,7 +130,9 @@ def _analyse_without_sensitivities(
         weight = problem.evaluator.weight
         errors = weight * (problem.predict(theta[None])[0] - problem.evaluator.measured)
         error = errors[weight > 0]
-    criteria = compute_criteria(error if white is None else white.whiten(error), theta.size, white)
+    criteria = compute_criteria(
+        error if whitening is None else whitening.whiten(error), theta.size, whitening
+    )
     reason = "the budget of simulations left too few for standard errors"
     return Analysis(
         _make_estimates_without_stderr(problem, theta, reason),
@@ -137,13 +146,13 @@ def _analyse_without_sensitivities(
 def _analyse_sensitivities(
     problem: Problem,
     theta: FloatArray,
-    sensitive: Sensitivities,
-    most: int | None,
-    white: Whitening | None = None,
+    sensitivities: Sensitivities,
+    max_simulations: int | None,
+    whitening: Whitening | None = None,
 ) -> Analysis:
-    error, columns, plateau, one_sided, aside, count = sensitive
+    error, columns, plateau, one_sided, aside, count = sensitivities
     n, d = columns.shape
-    criteria = compute_criteria(error, d, white)
+    criteria = compute_criteria(error, d, whitening)
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
         return Analysis(
@@ -154,59 +163,65 @@ def _analyse_sensitivities(
     sloping = np.where(plateau > 0, 0.0, columns)
     influence = compute_influence(error, problem.loss_scale)
     gain = _compute_possible_gain(influence, sloping, place)
-    pulled = is_active(influence, sloping, place)
+    is_pulled = is_active(influence, sloping, place)
     scale = compute_physical_scale(problem, theta)
     powers = find_scalings(problem.model, problem.all_parameters)
-    left = None if most is None else most - count
-    shifts, more = find_translations(problem, theta, columns, scale, left)
-    count += more
-    columns, known = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
-    _, singular, rows, kept = truncated_svd(columns)
-    kept[d - known :] = False
-    inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
+    left = None if max_simulations is None else max_simulations - count
+    shifts, spent = find_translations(problem, theta, columns, scale, left)
+    count += spent
+    columns, n_symmetries = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    _, singular, rows, retained = truncated_svd(columns)
+    retained[d - n_symmetries :] = False
+    inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
     colour = estimate_joint_covariance(problem, influence, columns)
     covariance, noise = _estimate_covariance(error, columns, inverse, problem.loss_scale, colour)
     # A factor that is 0 is not moved by what scales it: the others are, without any effect.
     moved = _find_moved_parameters(powers * theta) | _find_moved_parameters(shifts)
-    directions = classify_directions(singular, rows, ~kept, moved, covariance, noise)
+    directions = classify_directions(singular, rows, ~retained, moved, covariance, noise)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
-    found = find_unidentified(directions)
+    blocks = find_unidentified(directions)
     names = problem.free_names
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
         correlation=_to_correlation(physical),
         sensitivity_correlation=_to_correlation(inverse * np.outer(scale, scale)),
-        condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
+        condition=float(singular[0] / singular[-1]) if retained.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
-        noise_colour=_classify_noise_colour(colour, white),
+        noise_colour=_classify_noise_colour(colour, whitening),
         groups=tuple(
-            g for one in found for g in express_combinations(one, names, theta, scale, physical)
+            g
+            for block in blocks
+            for g in express_combinations(block, names, theta, scale, physical)
         ),
     )
     combined = {name for group in uncertainty.groups for name in group.members}
     statuses = _classify_parameters(
-        place, found, pulled, np.array([name in combined for name in names])
+        place, blocks, is_pulled, np.array([name in combined for name in names])
     )
-    told = LocalStatistics(
+    statistics = LocalStatistics(
         theta,
         statuses,
         physical,
-        stdtrit(_compute_degrees_of_freedom(n, inverse, colour, white), 0.975),
+        stdtrit(_compute_degrees_of_freedom(n, inverse, colour, whitening), 0.975),
         directions.is_null_member,
         uncertainty.groups,
-        rows[~kept],
+        rows[~retained],
         scale,
     )
-    estimates = _correct_for_jumps(problem, make_estimates(problem, told), one_sided, aside * scale)
+    estimates = _correct_for_jumps(
+        problem, make_estimates(problem, statistics), one_sided, aside * scale
+    )
     linear = None
     if problem.loss_scale == 0.0:
         stated = np.diag(covariance)
         root = singular[:, None] * rows
         linear = linearise_outputs(error, columns, plateau > 0, place, stated, scale, inverse, root)
-    held = _find_active_bounds(problem, influence, sloping, place) if pulled.any() else ()
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, held, linear)
+    active_bounds = (
+        _find_active_bounds(problem, influence, sloping, place) if is_pulled.any() else ()
+    )
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, active_bounds, linear)
 
 
 def _find_moved_parameters(directions: FloatArray) -> BoolArray:
@@ -219,24 +234,27 @@ def _find_active_bounds(
 ) -> tuple[ActiveBound, ...]:
     at_end = np.logical_or(*is_at_bounds(place))
     reaches = tuple(
-        find_widest_bounds(problem, one) if asked else (one.lower, one.upper)
-        for one, asked in zip(problem.free_parameters, at_end, strict=True)
+        find_widest_bounds(problem, parameter) if is_at_end else (parameter.lower, parameter.upper)
+        for parameter, is_at_end in zip(problem.free_parameters, at_end, strict=True)
     )
     return rank_active_bounds(problem.free_parameters, reaches, influence, columns, place)
 
 
 def compute_criteria(
-    error: FloatArray, parameters: int, white: Whitening | None = None
+    error: FloatArray, parameters: int, whitening: Whitening | None = None
 ) -> Criteria:
     """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae.
 
     Of whitened residuals the likelihood is still that of the outputs, so that criteria with and
     without a noise model compare; correlation times count as parameters.
     """
-    n, counted = error.size, parameters + 1 + (0 if white is None else white.n_correlation_times)
+    n, counted = (
+        error.size,
+        parameters + 1 + (0 if whitening is None else whitening.n_correlation_times),
+    )
     mean = float(error @ error) / n
     twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
-    twice -= 0.0 if white is None else white.log_determinant
+    twice -= 0.0 if whitening is None else whitening.log_determinant
     aic = 2.0 * counted - twice
     left = n - counted - 1
     aicc = aic + 2.0 * counted * (counted + 1) / left if left > 0 else None
@@ -298,11 +316,11 @@ def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: Fl
     total = float(influence @ influence)
     downhill = -(columns.T @ influence)
     at_lower, at_upper = is_at_bounds(place)
-    held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
-    if total == 0.0 or held.all():
+    is_held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
+    if total == 0.0 or is_held.all():
         return 0.0
-    left, _, _, kept = truncated_svd(columns[:, ~held])
-    return float(np.sum((left[:, kept].T @ influence) ** 2)) / total
+    left, _, _, retained = truncated_svd(columns[:, ~is_held])
+    return float(np.sum((left[:, retained].T @ influence) ** 2)) / total
 
 
 def _estimate_covariance(
@@ -330,7 +348,7 @@ def _estimate_covariance(
 
 
 def _compute_degrees_of_freedom(
-    n: int, inverse: FloatArray, colour: ColouredCovariance | None, white: Whitening | None
+    n: int, inverse: FloatArray, colour: ColouredCovariance | None, whitening: Whitening | None
 ) -> FloatArray:
     """Degrees of freedom of the intervals (D,): of whitened samples too, what a mean would have.
 
@@ -340,19 +358,26 @@ def _compute_degrees_of_freedom(
     degrees = np.full(d, float(n - d))
     if colour is not None:
         degrees = np.array([colour.compute_degrees(row) for row in inverse])
-    return degrees if white is None else np.minimum(degrees, max(white.equivalent_samples - d, 1.0))
+    return (
+        degrees
+        if whitening is None
+        else np.minimum(degrees, max(whitening.equivalent_samples - d, 1.0))
+    )
 
 
 def _classify_noise_colour(
-    colour: ColouredCovariance | None, white: Whitening | None
+    colour: ColouredCovariance | None, whitening: Whitening | None
 ) -> NoiseColour:
     if colour is None or colour.is_white:
-        return "white" if white is None else "first-order"
+        return "white" if whitening is None else "first-order"
     return "drifting" if colour.is_drifting else "coloured"
 
 
 def _classify_parameters(
-    place: FloatArray, found: tuple[ParameterBlock, ...], pulled: BoolArray, combined: BoolArray
+    place: FloatArray,
+    blocks: tuple[ParameterBlock, ...],
+    is_pulled: BoolArray,
+    is_combined: BoolArray,
 ) -> tuple[EstimateStatus, ...]:
     """What the data say of each parameter: see `EstimateStatus`.
 
@@ -363,10 +388,10 @@ def _classify_parameters(
     statuses: list[EstimateStatus] = ["identified"] * place.size
     for d in np.flatnonzero(np.logical_or(*is_at_bounds(place))):
         statuses[d] = "at bound"
-    for block in found:
+    for block in blocks:
         for d in block.members:
-            if not pulled[d]:
-                statuses[d] = "group" if combined[d] else "unidentifiable"
+            if not is_pulled[d]:
+                statuses[d] = "group" if is_combined[d] else "unidentifiable"
     return tuple(statuses)
 
 
@@ -391,16 +416,16 @@ def _make_estimates_without_stderr(
     """Estimates of which nothing more is known than their values."""
     d = theta.size
     statuses: list[EstimateStatus] = ["unidentifiable"] * d
-    blind = np.ones(d, dtype=np.bool_)
-    known = LocalStatistics(
+    lacks_stderr = np.ones(d, dtype=np.bool_)
+    statistics = LocalStatistics(
         theta,
         tuple(statuses),
         np.zeros((d, d)),
         np.zeros(d),
-        blind,
+        lacks_stderr,
         (),
         np.eye(d),
         np.ones(d),
         reason,
     )
-    return make_estimates(problem, known)
+    return make_estimates(problem, statistics)

@@ -65,20 +65,26 @@ def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
         raise InvalidSettings(
             f"/weights/{odd[0]}", "the Cramér–Rao bound needs weight 1 for every output"
         )
-    found = compute_sensitivities(problem, theta)
+    sensitivities = compute_sensitivities(problem, theta)
     scale = compute_physical_scale(problem, theta)
     powers = find_scalings(problem.model, problem.all_parameters)
-    shifts, _ = find_translations(problem, theta, found.columns, scale)
-    columns, known = remove_symmetries(found.columns, np.vstack([powers * theta, shifts]) / scale)
+    shifts, _ = find_translations(problem, theta, sensitivities.columns, scale)
+    columns, n_symmetries = remove_symmetries(
+        sensitivities.columns, np.vstack([powers * theta, shifts]) / scale
+    )
     n, d = columns.shape
     # Rows of zeros make the directions complete where there are fewer samples than parameters.
     square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
-    _, singular, rows, kept = truncated_svd(square)
-    kept[d - known :] = False
-    variance = np.sum((rows[kept] / singular[kept, None]) ** 2, axis=0)
-    untold = np.any(rows[~kept] ** 2 > NULL_SHARE, axis=0) | found.one_sided
-    untold |= (
-        np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau_width > 0)
+    _, singular, rows, retained = truncated_svd(square)
+    retained[d - n_symmetries :] = False
+    variance = np.sum((rows[retained] / singular[retained, None]) ** 2, axis=0)
+    is_undetermined = np.any(rows[~retained] ** 2 > NULL_SHARE, axis=0) | sensitivities.one_sided
+    is_undetermined |= (
+        np.any(powers != 0.0, axis=0)
+        | np.any(shifts != 0.0, axis=0)
+        | (sensitivities.plateau_width > 0)
     )
-    stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
-    return CramerRaoBound(problem.free_names, stderr, float(np.sqrt(np.count_nonzero(kept) / n)), n)
+    stderr = np.where(is_undetermined, np.inf, np.sqrt(variance) * np.abs(scale))
+    return CramerRaoBound(
+        problem.free_names, stderr, float(np.sqrt(np.count_nonzero(retained) / n)), n
+    )

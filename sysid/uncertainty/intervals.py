@@ -52,37 +52,41 @@ class LocalStatistics:
     reason: str = ""
 
 
-def make_estimates(problem: Problem, known: LocalStatistics) -> tuple[Estimate, ...]:
+def make_estimates(problem: Problem, statistics: LocalStatistics) -> tuple[Estimate, ...]:
     """All parameters in the problem's order."""
-    free = {p.name: _make_free_estimate(p, known, d) for d, p in enumerate(problem.free_parameters)}
+    free = {
+        p.name: _make_free_estimate(p, statistics, d) for d, p in enumerate(problem.free_parameters)
+    }
     return tuple(
-        free.get(p.name) or _make_fixed_or_tied_estimate(problem, known, p)
+        free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
         for p in problem.all_parameters
     )
 
 
-def _make_free_estimate(parameter: Parameter, known: LocalStatistics, d: int) -> Estimate:
-    value, status = float(known.theta[d]), known.statuses[d]
-    blind = bool(known.lacks_stderr[d])
-    reason = known.reason or _explain_status(parameter.name, status, blind, known.groups)
-    error = None if blind else sqrt(max(float(known.covariance[d, d]), 0.0))
-    return _make_estimate(parameter, value, error, float(known.t_quantile[d]), status, reason)
+def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: int) -> Estimate:
+    value, status = float(statistics.theta[d]), statistics.statuses[d]
+    lacks_stderr = bool(statistics.lacks_stderr[d])
+    reason = statistics.reason or _explain_status(
+        parameter.name, status, lacks_stderr, statistics.groups
+    )
+    error = None if lacks_stderr else sqrt(max(float(statistics.covariance[d, d]), 0.0))
+    return _make_estimate(parameter, value, error, float(statistics.t_quantile[d]), status, reason)
 
 
 def _make_fixed_or_tied_estimate(
-    problem: Problem, known: LocalStatistics, parameter: Parameter
+    problem: Problem, statistics: LocalStatistics, parameter: Parameter
 ) -> Estimate:
     if parameter.name not in problem.ties:
         value = parameter.fixed or 0.0
         return _make_estimate(parameter, value, None, 0.0, "fixed", "its value was given")
     tree, reason = problem.ties[parameter.name], f"tied to {parameter.tied}"
-    value, slope = _linearise_tie(problem, tree, known.theta, known.scale)
-    blind = known.null_directions @ (slope * known.scale)
-    if np.linalg.norm(blind) > _NULL_SHARE * np.linalg.norm(slope * known.scale):
-        why = known.reason or "the data do not determine what it is tied to"
+    value, slope = _linearise_tie(problem, tree, statistics.theta, statistics.scale)
+    null_part = statistics.null_directions @ (slope * statistics.scale)
+    if np.linalg.norm(null_part) > _NULL_SHARE * np.linalg.norm(slope * statistics.scale):
+        why = statistics.reason or "the data do not determine what it is tied to"
         return _make_estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
-    error = sqrt(max(float(slope @ known.covariance @ slope), 0.0))
-    quantile = float(np.max(known.t_quantile[slope != 0.0], initial=0.0))
+    error = sqrt(max(float(slope @ statistics.covariance @ slope), 0.0))
+    quantile = float(np.max(statistics.t_quantile[slope != 0.0], initial=0.0))
     return _make_estimate(parameter, value, error, quantile, "tied", reason)
 
 
@@ -90,33 +94,41 @@ def _linearise_tie(
     problem: Problem, tree: Expression, theta: FloatArray, scale: FloatArray
 ) -> tuple[float, FloatArray]:
     """Value of a tied parameter, and its slopes in the free ones by central differences."""
-    given = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
+    fixed_values = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
 
-    def at(place: FloatArray) -> float:
-        return worth(tree, {**given, **dict(zip(problem.free_names, place.tolist(), strict=True))})
+    def evaluate_at(values: FloatArray) -> float:
+        return worth(
+            tree, {**fixed_values, **dict(zip(problem.free_names, values.tolist(), strict=True))}
+        )
 
     steps = np.diag(_TIE_STEP * scale)
-    slope = [(at(theta + one) - at(theta - one)) / (2.0 * one.sum()) for one in steps]
-    return at(theta), np.array(slope)
+    slope = [
+        (evaluate_at(theta + step) - evaluate_at(theta - step)) / (2.0 * step.sum())
+        for step in steps
+    ]
+    return evaluate_at(theta), np.array(slope)
 
 
 def _explain_status(
-    name: str, status: EstimateStatus, blind: bool, groups: tuple[IdentifiableCombination, ...]
+    name: str,
+    status: EstimateStatus,
+    lacks_stderr: bool,
+    groups: tuple[IdentifiableCombination, ...],
 ) -> str:
     """Why there is no standard error, or what to think of it."""
     if status == "group":
-        told = [group.expression for group in groups if name in group.members]
+        expressions = [group.expression for group in groups if name in group.members]
         others = (
-            f": {', '.join(told[:_MAX_NAMED_GROUPS])}{', …' if len(told) > _MAX_NAMED_GROUPS else ''}"
-            if told
+            f": {', '.join(expressions[:_MAX_NAMED_GROUPS])}{', …' if len(expressions) > _MAX_NAMED_GROUPS else ''}"
+            if expressions
             else ""
         )
-        if blind:
+        if lacks_stderr:
             return f"only a combination with other parameters has an effect on the output{others}"
         return (
             f"the data say little about it apart from a combination with other parameters{others}"
         )
-    if blind:
+    if lacks_stderr:
         return "the output does not change with it"
     return {
         "unidentifiable": "the data say little about it: its standard error is as large as its range",

@@ -68,7 +68,7 @@ def make_move_generator(seed: int) -> np.random.Generator:
 def linearise_outputs(
     error: FloatArray,
     columns: FloatArray,
-    held: BoolArray,
+    on_plateau: BoolArray,
     place: FloatArray,
     stated: FloatArray,
     scale: FloatArray,
@@ -98,11 +98,11 @@ def linearise_outputs(
     n, d = columns.shape
     total = float(error @ error)
     variance = total / (n - d)
-    told = (stated > 0) & ~held
+    is_stated = (stated > 0) & ~on_plateau
     white = variance * np.diag(inverse)
-    slope = np.where(held, 0.0, columns.T @ error)
-    if held.any():
-        inverse, root = _remove_parameters(root, held)
+    slope = np.where(on_plateau, 0.0, columns.T @ error)
+    if on_plateau.any():
+        inverse, root = _remove_parameters(root, on_plateau)
     at_lower, at_upper = is_at_bounds(place)
     leads_out = (at_lower & (slope > 0)) | (at_upper & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
@@ -111,12 +111,12 @@ def linearise_outputs(
         information_root=root / unit,
         outward_slope=np.where(leads_out, slope, 0.0) / unit,
         sum_of_squares=total,
-        variance_ratio=np.where(told, white, np.nan) / np.where(told, stated, 1.0),
+        variance_ratio=np.where(is_stated, white, np.nan) / np.where(is_stated, stated, 1.0),
     )
 
 
 def _remove_parameters(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
     """The same without the parameters held."""
     root = np.where(held, 0.0, root)
-    _, singular, rows, kept = truncated_svd(root)
-    return (rows[kept].T / singular[kept] ** 2) @ rows[kept], root
+    _, singular, rows, retained = truncated_svd(root)
+    return (rows[retained].T / singular[retained] ** 2) @ rows[retained], root

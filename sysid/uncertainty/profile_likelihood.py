@@ -120,14 +120,14 @@ def compute_profile(
         raise InvalidSettings("/points", f"found {points}; need {_MIN_POINTS} or more")
     best = _refine_estimate(problem, np.array(theta, dtype=np.float64))
     groups, spent = find_exchanges(problem, best.theta)
-    here = order_exchangeable(problem, best.theta, groups)
-    walk = _ProfileSearch(problem, here, names.index(name), groups, should_stop)
-    walk.evaluations += best.evaluations + spent
-    step = _SPAN_FACTOR * walk.half_width / (points // 2)
-    walk.extend_side(-step, points // 2)
-    walk.extend_side(step, points // 2)
-    low, high = walk.find_interval_end(-1.0), walk.find_interval_end(1.0)
-    return walk.to_profile(low, high)
+    start = order_exchangeable(problem, best.theta, groups)
+    search = _ProfileSearch(problem, start, names.index(name), groups, should_stop)
+    search.evaluations += best.evaluations + spent
+    step = _SPAN_FACTOR * search.half_width / (points // 2)
+    search.extend_side(-step, points // 2)
+    search.extend_side(step, points // 2)
+    low, high = search.find_interval_end(-1.0), search.find_interval_end(1.0)
+    return search.to_profile(low, high)
 
 
 def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
@@ -135,14 +135,14 @@ def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
     samples, free = problem.n_scored, len(problem.free_parameters)
     if samples <= free:
         raise InvalidRecord(f"{samples} samples are not more than {free} parameters; need more")
-    found = refine_candidates(problem, [theta])[0]
-    if found is None:
+    refined = refine_candidates(problem, [theta])[0]
+    if refined is None:
         raise InvalidRecord("the simulation diverges at the estimate, so it has no profile")
-    if found.rms <= _ROUNDING_RMS * problem.output_scale:
+    if refined.rms <= _ROUNDING_RMS * problem.output_scale:
         raise InvalidRecord(
             "the simulation equals the records up to rounding; a profile needs residuals"
         )
-    return found
+    return refined
 
 
 class _ProfileSearch:
@@ -157,10 +157,10 @@ class _ProfileSearch:
         should_stop: Callable[[], bool] | None,
     ) -> None:
         self._problem, self._d, self._should_stop = problem, d, should_stop
-        columns = [one for group in groups for one in zip(*group, strict=True) if d in one]
-        beside = [(i, theta[i] - theta[d] or d - i) for one in columns for i in one if i != d]
-        self._larger = [i for i, above in beside if above > 0]
-        self._smaller = [i for i, above in beside if above < 0]
+        columns = [pair for group in groups for pair in zip(*group, strict=True) if d in pair]
+        partners = [(i, theta[i] - theta[d] or d - i) for pair in columns for i in pair if i != d]
+        self._larger = [i for i, above in partners if above > 0]
+        self._smaller = [i for i, above in partners if above < 0]
         self.is_stopped, self.evaluations = False, 1
         self._place = float(to_unit(problem.evaluator, theta[None])[0, d])
         rms = float(problem.evaluate_fitness(theta[None])[0])
@@ -192,7 +192,7 @@ class _ProfileSearch:
         """What was found, in the parameter's unit."""
         parameter = self._problem.free_parameters[self._d]
         order = sorted(self._fits)
-        found = np.array([self._fits[place][0] for place in order])
+        thetas = np.array([self._fits[place][0] for place in order])
         best = min(self._fits, key=lambda place: self._fits[place][1])
         low_, high_ = (
             None if end is None else self._to_parameter_value(end) for end in (low, high)
@@ -200,10 +200,10 @@ class _ProfileSearch:
         return Profile(
             name=parameter.name,
             unit=parameter.unit,
-            values=found[:, self._d],
+            values=thetas[:, self._d],
             likelihood_ratio=np.array([self._compute_ratio(place) for place in order]),
             rms=np.array([self._fits[place][1] for place in order]),
-            others=np.delete(found, self._d, axis=1),
+            others=np.delete(thetas, self._d, axis=1),
             interval=(low_, high_),
             estimate=self._to_parameter_value(best),
             evaluations=self.evaluations,
@@ -223,9 +223,9 @@ class _ProfileSearch:
         if others.shape[1]:
             made_up = np.linalg.lstsq(others, columns[:, self._d], rcond=1e-7)[0]
             direction[np.arange(direction.size) != self._d] = -made_up
-        own = columns @ direction
+        own_slope = columns @ direction
         # What the others make up for but for rounding has no direction of its own.
-        norm = float(own @ own)
+        norm = float(own_slope @ own_slope)
         if norm <= _OWN_SLOPE_TOLERANCE * float(columns[:, self._d] @ columns[:, self._d]):
             norm = 0.0
         self._factor = self._compute_ratio_scale(error, columns, direction, norm)
@@ -238,12 +238,14 @@ class _ProfileSearch:
     ) -> float:
         """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
         scale = self._problem.loss_scale
-        seen = compute_influence(error, scale)
-        colour = estimate_joint_covariance(self._problem, seen, columns)
+        influence = compute_influence(error, scale)
+        colour = estimate_joint_covariance(self._problem, influence, columns)
         factor = _compute_robust_factor(error, scale)
         if colour is None or not norm > 0:
             return factor
-        return factor / colour.compute_widening(direction, float(np.mean(np.square(seen))), norm)
+        return factor / colour.compute_widening(
+            direction, float(np.mean(np.square(influence))), norm
+        )
 
     def _is_side_complete(self, place: float, taken: int, count: int) -> bool:
         self.is_stopped = self.is_stopped or bool(self._should_stop and self._should_stop())
@@ -253,16 +255,16 @@ class _ProfileSearch:
         """Estimate the others at a place, beginning with what they were at a nearer one."""
         d, start = self._d, self._fits[nearer][0].copy()
         start[d] = self._to_parameter_value(place)
-        held = _fix_parameter(self._restrict_exchanges(float(start[d])), d, float(start[d]))
-        rest = np.clip(np.delete(start, d), held.evaluator.lower, held.evaluator.upper)
-        rms = float(held.evaluate_fitness(rest[None])[0])
+        fixed = _fix_parameter(self._restrict_exchanges(float(start[d])), d, float(start[d]))
+        others = np.clip(np.delete(start, d), fixed.evaluator.lower, fixed.evaluator.upper)
+        rms = float(fixed.evaluate_fitness(others[None])[0])
         self.evaluations += 1
-        if rest.size:
-            end = refine_candidates(held, [rest])[0]
+        if others.size:
+            end = refine_candidates(fixed, [others])[0]
             if end is not None:
-                rest, rms = end.theta, end.rms
+                others, rms = end.theta, end.rms
                 self.evaluations += end.evaluations
-        self._fits[place] = (np.insert(rest, d, start[d]), rms)
+        self._fits[place] = (np.insert(others, d, start[d]), rms)
 
     def _restrict_exchanges(self, value: float) -> Problem:
         """The problem with what can be exchanged with the parameter on its side of a value.

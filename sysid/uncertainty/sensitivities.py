@@ -67,7 +67,7 @@ class BudgetSpentError(Exception):
 
 
 def compute_sensitivities(
-    problem: Problem, theta: FloatArray, most: int | None = None
+    problem: Problem, theta: FloatArray, max_simulations: int | None = None
 ) -> Sensitivities:
     """Central differences at an estimate (D,); beside a bound one-sided.
 
@@ -76,15 +76,15 @@ def compute_sensitivities(
     BudgetSpentError
         If they take more than `most` simulations.
     """
-    probe = _OutputProbe(problem, theta, most)
+    probe = _OutputProbe(problem, theta, max_simulations)
     d = probe.place.size
     plateau, middle = np.zeros(d), np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
-    both = np.arange(2 * d)
-    steps, beside = probe.simulate_steps(
-        both % d, np.where(both < d, -_DIFFERENCE_STEP, _DIFFERENCE_STEP)
+    parameters = np.arange(2 * d)
+    steps, shifted = probe.simulate_steps(
+        parameters % d, np.where(parameters < d, -_DIFFERENCE_STEP, _DIFFERENCE_STEP)
     )
-    columns, moves, differ = _compute_central_differences(probe.predicted, steps, beside)
+    columns, moves, differ = _compute_central_differences(probe.predicted, steps, shifted)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for d in np.flatnonzero(moves & differ).tolist():
             columns[:, d] = _estimate_slope_near_jumps(probe, d)
@@ -92,12 +92,12 @@ def compute_sensitivities(
         if jumping.size:
             down, below = probe.find_jumps(jumping, -1.0)
             up, above = probe.find_jumps(jumping, 1.0)
-            both = np.isfinite(down) & np.isfinite(up)
-            width = np.where(both, up + down, 0.0)
+            parameters = np.isfinite(down) & np.isfinite(up)
+            width = np.where(parameters, up + down, 0.0)
             plateau[jumping], one_sided[jumping] = width, np.isfinite(down) != np.isfinite(up)
-            middle[jumping] = np.where(both, 0.5 * (up - down), 0.0)
-            steps = np.where(both, 2.0 * width, np.inf)
-            columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
+            middle[jumping] = np.where(parameters, 0.5 * (up - down), 0.0)
+            steps = np.where(parameters, 2.0 * width, np.inf)
+            columns[:, jumping] = np.where(parameters, (above - below) / steps, 0.0)
         columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
         error = probe.residuals
     return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
@@ -105,7 +105,7 @@ def compute_sensitivities(
 
 @jit_compile
 def _compute_central_differences(
-    here: FloatArray, steps: FloatArray, beside: FloatArray
+    predicted: FloatArray, steps: FloatArray, shifted: FloatArray
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Central differences (n, D); whether the output moves on both sides at once, whether unlike.
 
@@ -115,24 +115,24 @@ def _compute_central_differences(
         Output at the estimate, and after `steps` (2D,) of each parameter down and then up.
     """
     d = steps.size // 2
-    slopes = np.zeros((here.size, d))
+    slopes = np.zeros((predicted.size, d))
     moves, differ = np.empty(d, dtype=np.bool_), np.empty(d, dtype=np.bool_)
     for j in range(d):
         low, high = steps[j], steps[d + j]
         falls, rises, apart, left, right = low == 0.0, high == 0.0, 0.0, 0.0, 0.0
-        for i in range(here.size):
-            below, above = beside[i, j], beside[i, d + j]
-            falls |= below != here[i]
-            rises |= above != here[i]
-            down, up = (here[i] - below) / -low, (above - here[i]) / high
+        for i in range(predicted.size):
+            below, above = shifted[i, j], shifted[i, d + j]
+            falls |= below != predicted[i]
+            rises |= above != predicted[i]
+            down, up = (predicted[i] - below) / -low, (above - predicted[i]) / high
             left, right, apart = left + down**2, right + up**2, apart + (up - down) ** 2
         moves[j] = falls and rises
         differ[j] = not apart <= _SLOPE_AGREEMENT**2 * min(
             left, right
         )  # also where there is one side only
         if moves[j]:
-            for i in range(here.size):
-                slopes[i, j] = (beside[i, d + j] - beside[i, j]) / (high - low)
+            for i in range(predicted.size):
+                slopes[i, j] = (shifted[i, d + j] - shifted[i, j]) / (high - low)
     return slopes, moves, differ
 
 
@@ -140,8 +140,8 @@ def _estimate_slope_near_jumps(probe: "_OutputProbe", d: int) -> FloatArray:
     """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
     sides = [_estimate_side_slope(probe, d, side) for side in (-1.0, 1.0)]
     best = min(doubt for doubt, _ in sides)
-    kept = [slope for doubt, slope in sides if doubt <= max(best, _SLOPE_AGREEMENT)]
-    return np.asarray(np.mean(kept, axis=0))
+    slopes = [slope for doubt, slope in sides if doubt <= max(best, _SLOPE_AGREEMENT)]
+    return np.asarray(np.mean(slopes, axis=0))
 
 
 def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[float, FloatArray]:
@@ -163,10 +163,10 @@ def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[fl
 class _OutputProbe:
     """The scored output beside an estimate, one parameter moved at a time."""
 
-    def __init__(self, problem: Problem, theta: FloatArray, most: int | None) -> None:
-        if most is not None and most < 1:
+    def __init__(self, problem: Problem, theta: FloatArray, max_simulations: int | None) -> None:
+        if max_simulations is not None and max_simulations < 1:
             raise BudgetSpentError(0, None)
-        self._problem, self._most = problem, most
+        self._problem, self._most = problem, max_simulations
         self.weight = problem.evaluator.weight[problem.scored_rows]
         self.measured = problem.evaluator.measured[problem.scored_rows]
         self.place = to_unit(problem.evaluator, theta[None])[0]
