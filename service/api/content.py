@@ -111,10 +111,10 @@ def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
     text = request.headers.get("range")
     if text is None or request.headers.get("if-range", etag) != etag:
         return None
-    found = _RANGE_PATTERN.fullmatch(text.strip())
-    if found is None or found[0] == "bytes=-":
+    match = _RANGE_PATTERN.fullmatch(text.strip())
+    if match is None or match[0] == "bytes=-":
         return None  # several ranges, or another unit: RFC 9110 lets a server send the whole
-    first, last = found.groups()
+    first, last = match.groups()
     if not first:
         start, stop = max(size - int(last), 0), size
     else:
@@ -125,8 +125,8 @@ def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
 
 
 def _matches_etag(header: str, etag: str) -> bool:
-    given = [one.strip().removeprefix("W/") for one in header.split(",")]
-    return etag in given or given == ["*"]
+    etags = [text.strip().removeprefix("W/") for text in header.split(",")]
+    return etag in etags or etags == ["*"]
 
 
 CSV_TYPES = ("text/csv", "application/csv", "text/plain")
@@ -175,14 +175,14 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
 
 async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:
     async with request.form(max_files=1, max_fields=20) as form:
-        file = next((one for one in form.values() if isinstance(one, UploadFile)), None)
+        file = next((value for value in form.values() if isinstance(value, UploadFile)), None)
         if file is None or not file.filename:
             raise InvalidRequest.from_fault(
                 "/file", "the form has no file; need one CSV or MCAP file"
             )
         digest = await _save_body(_read_pieces(file), path, settings)
-        found = _detect_format((file.content_type or "").partition(";")[0], file.filename)
-        return Upload(path, found, digest, Path(file.filename).stem)
+        file_format = _detect_format((file.content_type or "").partition(";")[0], file.filename)
+        return Upload(path, file_format, digest, Path(file.filename).stem)
 
 
 async def _read_pieces(file: UploadFile) -> AsyncIterator[bytes]:
@@ -208,5 +208,5 @@ def _detect_format(kind: str, file_name: str | None) -> FileFormat:
         return "mcap"
     if suffix in (".csv", ".txt", ".tsv") or kind in CSV_TYPES:
         return "csv"
-    found = f"{kind!r}" + (f" ({file_name})" if file_name else "")
-    raise UnsupportedMediaType(f"found {found}; need text/csv or application/x-mcap")
+    kind_text = f"{kind!r}" + (f" ({file_name})" if file_name else "")
+    raise UnsupportedMediaType(f"found {kind_text}; need text/csv or application/x-mcap")

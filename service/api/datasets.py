@@ -65,7 +65,7 @@ async def add_dataset(
             upload.file_format,
             sha256=upload.sha256,
             name=name or upload.name,
-            segments=[one.strip() for one in (segments or "").split(",") if one.strip()],
+            segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
             sample_time=sample_time,
         )
     return _dataset_response(stored, response, name)

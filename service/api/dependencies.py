@@ -28,21 +28,21 @@ class Parts:
 
 def get_parts(request: Request) -> Parts:
     """Return the parts of this process."""
-    found: Parts = request.app.state.parts
-    return found
+    parts: Parts = request.app.state.parts
+    return parts
 
 
 PartsDep = Annotated[Parts, Depends(get_parts)]
 
 
-def _open_read_session(found: PartsDep) -> Iterator[Session]:
-    with found.database.read_session() as session:
+def _open_read_session(parts: PartsDep) -> Iterator[Session]:
+    with parts.database.read_session() as session:
         yield session
 
 
-def _open_write_session(found: PartsDep) -> Iterator[Session]:
+def _open_write_session(parts: PartsDep) -> Iterator[Session]:
     """Open a session with one transaction: commit if the route returns, else roll back."""
-    with found.database.write_session() as session:
+    with parts.database.write_session() as session:
         yield session
 
 

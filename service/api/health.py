@@ -43,7 +43,7 @@ def check_ready(parts: PartsDep) -> dict[str, str]:
     checks = {"database": _check_database, "store": _check_store, "dispatcher": _check_dispatcher}
     failures = list(_collect_failures(parts, checks))
     if failures:
-        detail = "; ".join(one.detail for one in failures)
+        detail = "; ".join(failure.detail for failure in failures)
         raise Unavailable(detail, failures)
     return dict.fromkeys(checks, "ok")
 

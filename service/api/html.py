@@ -44,7 +44,7 @@ def error_page(
     status: int, title: str, detail: str, errors: Sequence[FieldError], headers: Mapping[str, str]
 ) -> HtmlPage:
     """Render an error as a page, in the words of the problem document."""
-    lines = [str(one).removeprefix("?") for one in errors] or [detail]
+    lines = [str(error).removeprefix("?") for error in errors] or [detail]
     return HtmlPage(
         render_template("error.html", status=status, title=title, lines=lines), status, headers
     )

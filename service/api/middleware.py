@@ -43,9 +43,9 @@ class BodyLimit:
 
         return watched
 
-    def _check_size(self, size: int, more: str) -> None:
+    def _check_size(self, size: int, suffix: str) -> None:
         if size > self._limit:
             raise TooLarge(
-                f"the body has {size} bytes{more}; at most {self._limit} are allowed "
+                f"the body has {size} bytes{suffix}; at most {self._limit} are allowed "
                 "(LAGID_MAX_BODY_BYTES)"
             )

@@ -60,7 +60,7 @@ async def check_model(request: Request) -> CheckOut:
         document = await _read_document(request)
     except InvalidRequest as error:
         return CheckOut.model_validate(
-            {"valid": False, "errors": [one.to_dict() for one in error.errors]}
+            {"valid": False, "errors": [fault.to_dict() for fault in error.errors]}
         )
     return await run_in_threadpool(models.check_model, document)
 

@@ -76,10 +76,10 @@ def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
 def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
     """Show the form to simulate the model of a run; with a full query, the simulation."""
     query = dict(request.query_params)
-    found = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
-    if found.is_csv:
-        return _csv_response(found.text, "simulation")
-    return HtmlPage(found.text, found.status)
+    answer = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
+    if answer.is_csv:
+        return _csv_response(answer.text, "simulation")
+    return HtmlPage(answer.text, answer.status)
 
 
 @router.get("/compare", **HIDDEN)
@@ -117,13 +117,13 @@ def static_file(name: str, request: Request) -> Response:
     """Serve the package's static files, and Plotly from its installed wheel."""
     if name == assets.plotly_file_name():
         return _plotly_response(request)
-    found = assets.load_asset(name)
-    if found is None:
+    asset = assets.load_asset(name)
+    if asset is None:
         raise NotFound("file", name)
-    headers = {"ETag": found.etag, "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
-    if found.etag in request.headers.get("if-none-match", ""):
+    headers = {"ETag": asset.etag, "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+    if asset.etag in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    return Response(found.content, media_type=found.media_type, headers=headers)
+    return Response(asset.content, media_type=asset.media_type, headers=headers)
 
 
 @router.get("/v1/runs/{run_id}/figures/{name}", tags=["runs"], response_class=JSONResponse)
@@ -155,19 +155,19 @@ def dataset_figure(
     dataset_id: str, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
     """Draw the signals of a dataset as Plotly JSON, or export the numbers as CSV."""
-    found = results.load_dataset_figure(session, parts.store, dataset_id, choice)
-    return _figure_response(found, "signals", choice)
+    figure = results.load_dataset_figure(session, parts.store, dataset_id, choice)
+    return _figure_response(figure, "signals", choice)
 
 
 @router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
 def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSession) -> Response:
     """Export the job as one HTML file that needs no server: tables, figures, the exact request."""
-    made = report.render_job_report(session, parts.store, job_id, str(request.base_url))
+    text = report.render_job_report(session, parts.store, job_id, str(request.base_url))
     policy = {
         "Content-Security-Policy": report.security_policy(),
         "X-Content-Type-Options": "nosniff",
     }
-    return HTMLResponse(made, headers=policy)
+    return HTMLResponse(text, headers=policy)
 
 
 def _figure_response(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:

@@ -47,8 +47,8 @@ STATUS_KINDS = {
 }
 
 STORAGE_KINDS = {
-    known.status: (known.kind, known.title)
-    for known in (NotFound, Conflict, InvalidRequest, Unavailable)
+    error_type.status: (error_type.kind, error_type.title)
+    for error_type in (NotFound, Conflict, InvalidRequest, Unavailable)
 }
 
 
@@ -75,14 +75,15 @@ def problem_response(
         "instance": request.url.path,
     }
     if errors:
-        told = [error.to_dict() for error in errors[: MAX_FAULTS + 1]]
-        if len(errors) > len(told):
-            told.append(FieldError("", "more faults follow; they are not listed").to_dict())
+        entries = [error.to_dict() for error in errors[: MAX_FAULTS + 1]]
+        if len(errors) > len(entries):
+            entries.append(FieldError("", "more faults follow; they are not listed").to_dict())
         content["errors"] = [
-            {**one, "detail": _shorten(one["detail"], MAX_DETAIL_CHARACTERS)} for one in told
+            {**entry, "detail": _shorten(entry["detail"], MAX_DETAIL_CHARACTERS)}
+            for entry in entries
         ]
-    given = {"Vary": "Accept", **(headers or {})}  # caches keep JSON and page apart
-    return _ProblemResponse(content, status, given, media_type=PROBLEM_TYPE)
+    all_headers = {"Vary": "Accept", **(headers or {})}  # caches keep JSON and page apart
+    return _ProblemResponse(content, status, all_headers, media_type=PROBLEM_TYPE)
 
 
 class _ProblemResponse(JSONResponse):
@@ -214,15 +215,15 @@ def _unreadable_reason(cause: BaseException | None) -> str | None:
 def _to_field_errors(request: Request, error: RequestValidationError) -> Iterator[FieldError]:
     entries = []
     for entry in error.errors():
-        place, loc = entry["loc"][0], entry["loc"][1:]
+        source, loc = entry["loc"][0], entry["loc"][1:]
         if entry["type"] == "json_invalid":
             yield FieldError("", f"the body is not JSON: {entry['ctx']['error']} at {loc[0]}")
-        elif place == "body":
+        elif source == "body":
             entries.append({**entry, "loc": loc})
         else:
             # The rest of `loc` is an index into repeated values.
             name = loc[0] if loc else ""
-            pointer = f"{{{name}}}" if place == "path" else f"?{name}"
+            pointer = f"{{{name}}}" if source == "path" else f"?{name}"
             yield FieldError(pointer, describe_error(entry, ()))
     kind = find_body_type(request.scope.get("endpoint"))
     yield from explain_errors(entries[:MAX_FAULTS], error.body, kind)

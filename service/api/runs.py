@@ -74,9 +74,9 @@ def export_model(
     pade_order: Annotated[int, Query(ge=1, le=MAX_PADE_ORDER)] = 3,
 ) -> Response:
     """Export the identified model as text: json, python, c (C99), or control (python-control)."""
-    found = exports.export_run(session, run_id, format, pade_order)
-    headers = {"Content-Disposition": f'attachment; filename="{found.name}"'}
-    return Response(found.text, media_type=found.media_type, headers=headers)
+    model = exports.export_run(session, run_id, format, pade_order)
+    headers = {"Content-Disposition": f'attachment; filename="{model.name}"'}
+    return Response(model.text, media_type=model.media_type, headers=headers)
 
 
 @router.post("/{run_id}:simulate")
@@ -100,9 +100,9 @@ def profile_run(
     run_id: str, body: ProfileIn, parts: PartsDep, theme: Theme = "light"
 ) -> ProfilesOut:
     """Compute profile likelihoods of free parameters; the others are re-estimated at each value."""
-    found = profiles.compute_profiles(parts.database, parts.store, run_id, body)
-    figure = apply_theme(profile_figure(found.profiles, found.threshold), theme)
-    return ProfilesOut(**dict(found), figure=figure)
+    answer = profiles.compute_profiles(parts.database, parts.store, run_id, body)
+    figure = apply_theme(profile_figure(answer.profiles, answer.threshold), theme)
+    return ProfilesOut(**dict(answer), figure=figure)
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)

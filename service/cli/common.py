@@ -102,12 +102,12 @@ def split_setting_path(change: str) -> list[str]:
 
 def apply_setting(body: dict[str, Any], change: str) -> None:
     """Set the value of a ``--set path=value`` in a body; the value is read as YAML."""
-    parts, here = split_setting_path(change), body
+    parts, target = split_setting_path(change), body
     for part in parts[:-1]:
-        here = here.setdefault(part, {})
-        if not isinstance(here, dict):
+        target = target.setdefault(part, {})
+        if not isinstance(target, dict):
             fail_usage(f"--set {change}: {part} has no fields")
-    here[parts[-1] if parts else ""] = parse_yaml(change.partition("=")[2].encode())
+    target[parts[-1] if parts else ""] = parse_yaml(change.partition("=")[2].encode())
 
 
 def print_json(value: Any) -> None:
@@ -148,7 +148,7 @@ def print_table(
 
 
 def print_listing(
-    found: list[dict[str, Any]],
+    entries: list[dict[str, Any]],
     as_json: bool,
     headings: Sequence[str],
     row: Callable[[dict[str, Any]], Sequence[object]],
@@ -157,9 +157,9 @@ def print_listing(
 ) -> None:
     """Print a server's listing as JSON, or as a table with one `row` per entry."""
     if as_json:
-        print_json(found)
+        print_json(entries)
     else:
-        print_table(headings, map(row, found), empty=empty)
+        print_table(headings, map(row, entries), empty=empty)
 
 
 def format_cell(value: object) -> str:
@@ -169,14 +169,18 @@ def format_cell(value: object) -> str:
     return format_value(value).replace("[", "\\[")
 
 
-def format_estimate(one: dict[str, Any]) -> str:
+def format_estimate(estimate: dict[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
-    return plain_estimate(one["value"], one["stderr"])
+    return plain_estimate(estimate["value"], estimate["stderr"])
 
 
-def describe_status(one: dict[str, Any]) -> str:
+def describe_status(estimate: dict[str, Any]) -> str:
     """Describe the status of an estimate, with its reason if there is one."""
-    return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
+    return (
+        f"{estimate['status']} ({estimate['reason']})"
+        if estimate["reason"]
+        else str(estimate["status"])
+    )
 
 
 def read_file(path: Path) -> bytes:
@@ -237,14 +241,14 @@ def parse_channels(text: str | None) -> dict[str, str]:
     return parse_pairs("--channels", split_names(text), "signal=channel, such as u=P1")
 
 
-def parse_number(place: str, text: str) -> float:
+def parse_number(argument: str, text: str) -> float:
     """Parse a finite number; end the command if the text at this place is none."""
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
     if not isfinite(value):
-        fail_usage(f"{place}: found {text!r}; need a number")
+        fail_usage(f"{argument}: found {text!r}; need a number")
     return value
 
 
@@ -301,18 +305,18 @@ class FieldOrigins:
         """Rewrite a note so that it names options instead of job fields."""
         return SETTING_PATTERN.sub(self._format_setting, note)
 
-    def _format_setting(self, found: re.Match[str]) -> str:
-        part, name, value = found.groups()
-        place = self.locate(join_pointer(part, name))
-        return f"{place}{'=' if place.startswith('--set ') else ' '}{value}"
+    def _format_setting(self, match: re.Match[str]) -> str:
+        part, name, value = match.groups()
+        origin = self.locate(join_pointer(part, name))
+        return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
 
     def _describe_fault(self, fault: FieldError) -> str:
-        place = self.locate(fault.pointer) if fault.pointer else ""
+        origin = self.locate(fault.pointer) if fault.pointer else ""
         column = "" if fault.column is None else f", column {fault.column}"
         detail = fault.detail
         if not self.rest.endswith("…"):
-            detail = POINTER_PATTERN.sub(lambda found: self.locate(found[0]), detail)
-        return f"{place}{column}: {detail}" if place else detail
+            detail = POINTER_PATTERN.sub(lambda match: self.locate(match[0]), detail)
+        return f"{origin}{column}: {detail}" if origin else detail
 
 
 def file_origins(name: object) -> FieldOrigins:
@@ -333,8 +337,10 @@ def report_faults(places: FieldOrigins) -> Iterator[None]:
             raise
         fail(
             places.describe_faults(
-                FieldError(str(one.get("pointer") or ""), str(one.get("detail")), one.get("column"))
-                for one in entries
+                FieldError(
+                    str(entry.get("pointer") or ""), str(entry.get("detail")), entry.get("column")
+                )
+                for entry in entries
             )
         )
 

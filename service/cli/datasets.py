@@ -35,18 +35,18 @@ DOCUMENT_HELP = "YAML or JSON file with the body of the request."
 def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
     """List the recordings of the server."""
     with connect_client(url, key) as client:
-        found = client.datasets()
+        datasets = client.datasets()
     print_listing(
-        found,
+        datasets,
         as_json,
         ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
-        lambda one: (
-            one["id"],
-            one["name"],
-            one["kind"],
-            one["samples"],
-            one["duration"],
-            _format_channels(one),
+        lambda dataset: (
+            dataset["id"],
+            dataset["name"],
+            dataset["kind"],
+            dataset["samples"],
+            dataset["duration"],
+            _format_channels(dataset),
         ),
         empty="no datasets; add one: lagid dataset add recording.csv",
     )
@@ -101,11 +101,11 @@ def simulate_dataset(
     if name is not None:
         body["name"] = name
     if sets:
-        given = {
+        values = {
             name: parse_number(f"--set {name}={value}", value)
             for name, value in parse_pairs("--set", sets).items()
         }
-        body["parameters"] = {**(body.get("parameters") or {}), **given}
+        body["parameters"] = {**(body.get("parameters") or {}), **values}
     with connect_client(url, key) as client, report_faults(_field_origins(file, sets)):
         stored = client.simulate_dataset(body)
     _print_dataset(stored, as_json)
@@ -136,8 +136,12 @@ def derive_dataset(
 
 def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
     """Map the fields of a simulation to options; all other fields are in the file."""
-    given = {f"/parameters/{one.partition('=')[0].strip()}": "--set {}" for one in sets or ()}
-    named = {place: option.format(place.rpartition("/")[2]) for place, option in given.items()}
+    pointers = {
+        f"/parameters/{change.partition('=')[0].strip()}": "--set {}" for change in sets or ()
+    }
+    named = {
+        pointer: option.format(pointer.rpartition("/")[2]) for pointer, option in pointers.items()
+    }
     options = {"/plant": "--plant", "/name": "--name", **named}
     return FieldOrigins(options, rest="--set {}" if file is None else f"{file} …")
 
@@ -149,9 +153,9 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
     period = stored["sample_time"]
     sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
     before = stored["details"].get("known_before")
-    known = f"known for {before:.6g} s before, " if before else ""
+    history = f"known for {before:.6g} s before, " if before else ""
     print_line(
-        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {known}"
+        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {history}"
         f"channels {_format_channels(stored)}"
     )
     for warning in stored["warnings"]:
@@ -159,4 +163,6 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
 
 
 def _format_channels(dataset: dict[str, Any]) -> str:
-    return ", ".join(append_unit(one["name"], one["unit"]) for one in dataset["channels"])
+    return ", ".join(
+        append_unit(channel["name"], channel["unit"]) for channel in dataset["channels"]
+    )

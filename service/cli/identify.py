@@ -104,19 +104,23 @@ def identify(
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
-    given = _build_body(data, model, changes, parse_channels(channels))
+    unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = CsvOptions(sample_time, tuple(split_names(segments)))
     recording = read_recording(data, reading)
-    body, loaded = check_body(given, max(1, len(recording.segments)))
+    body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     records = _extract_records(recording, data, loaded, body)
-    kept = []
+    validation_records = []
     if validation is not None:
-        kept = _extract_records(read_recording(validation, reading), validation, loaded, body)
+        validation_records = _extract_records(
+            read_recording(validation, reading), validation, loaded, body
+        )
     begun = time.perf_counter()
     with _report_core_faults():
-        found = _run_identification(loaded, records, kept, body, quiet=json_file == "-")
-    print_result(loaded, found, time.perf_counter() - begun, json_file)
+        result = _run_identification(
+            loaded, records, validation_records, body, quiet=json_file == "-"
+        )
+    print_result(loaded, result, time.perf_counter() - begun, json_file)
 
 
 def _build_body(
@@ -158,8 +162,10 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     except SysidError as error:
         fail(
             FIELD_ORIGINS.describe_faults(
-                FieldError("/model" + one.pointer.removeprefix("/model"), one.detail, one.column)
-                for one in to_field_errors(error)
+                FieldError(
+                    "/model" + fault.pointer.removeprefix("/model"), fault.detail, fault.column
+                )
+                for fault in to_field_errors(error)
             )
         )
     from service.jobs.record_checks import find_setting_faults
@@ -185,8 +191,8 @@ def _report_core_faults() -> Iterator[None]:
 
 
 def _refuse_server_settings(change: str, parts: list[str]) -> None:
-    for place, instead in SERVER_SETTINGS.items():
-        if ".".join([*parts, ""]).startswith(f"{place}."):
+    for setting, instead in SERVER_SETTINGS.items():
+        if ".".join([*parts, ""]).startswith(f"{setting}."):
             fail_usage(f"--set {change}: {instead}")
 
 
@@ -222,12 +228,12 @@ def read_recording(path: Path, reading: CsvOptions) -> "Recording":
 
 
 def print_result(
-    model: "Model", found: "Identification", seconds: float, json_file: str | None
+    model: "Model", result: "Identification", seconds: float, json_file: str | None
 ) -> None:
     """Print the estimates, or write the result as JSON, or both."""
     from service.runs.result import to_result_document
 
-    document = to_result_document(found, seconds)
+    document = to_result_document(result, seconds)
     if json_file == "-":
         print_json(document)
         return
@@ -238,28 +244,35 @@ def print_result(
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
         (
-            (one["name"], format_estimate(one), one["unit"], describe_status(one))
-            for one in document["parameters"]
+            (
+                parameter["name"],
+                format_estimate(parameter),
+                parameter["unit"],
+                describe_status(parameter),
+            )
+            for parameter in document["parameters"]
         ),
         empty="no parameters",
     )
     unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
     out.print(
-        f"RMS {found.rms:.6g}{plain_unit(unit)}, fit {_format_fit(found.fit_percent)}",
+        f"RMS {result.rms:.6g}{plain_unit(unit)}, fit {_format_fit(result.fit_percent)}",
         markup=False,
         end="",
     )
-    if found.fit_percent_validation is not None:
-        out.print(f", validation {_format_fit(found.fit_percent_validation)}", markup=False, end="")
-    out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
-    if any(found.known_before):
+    if result.fit_percent_validation is not None:
         out.print(
-            f"inputs known before the record: {_format_history_span(found.known_before)}",
+            f", validation {_format_fit(result.fit_percent_validation)}", markup=False, end=""
+        )
+    out.print(f"; {result.evaluations} simulations in {seconds:.2f} s", markup=False)
+    if any(result.known_before):
+        out.print(
+            f"inputs known before the record: {_format_history_span(result.known_before)}",
             markup=False,
         )
-    if found.residual_tests is not None and found.residual_tests.passed is not None:
-        out.print(_residual_verdict(found.residual_tests), markup=False, soft_wrap=True)
-    for warning in found.warnings:
+    if result.residual_tests is not None and result.residual_tests.passed is not None:
+        out.print(_residual_verdict(result.residual_tests), markup=False, soft_wrap=True)
+    for warning in result.warnings:
         err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
 
 
@@ -269,17 +282,17 @@ def _residual_verdict(tests: "ResidualTests") -> str:
     Warnings cover only p < 0.001, so most failed tests are reported only here.
     """
     failed = [
-        f"{one.output} {'is not white' if one.input is None else f'depends on {one.input}'}"
-        + ("" if one.p is None else f" (p = {one.p:.2g})" if one.p >= 1e-3 else " (p < 0.001)")
-        for one in tests.tests
-        if one.outcome == "failed"
+        f"{test.output} {'is not white' if test.input is None else f'depends on {test.input}'}"
+        + ("" if test.p is None else f" (p = {test.p:.2g})" if test.p >= 1e-3 else " (p < 0.001)")
+        for test in tests.tests
+        if test.outcome == "failed"
     ]
-    told = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
-    return f"residuals on {tests.data} data: {told}"
+    verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
+    return f"residuals on {tests.data} data: {verdict}"
 
 
-def _format_history_span(known: Sequence[float]) -> str:
-    least, most = min(known), max(known)
+def _format_history_span(durations: Sequence[float]) -> str:
+    least, most = min(durations), max(durations)
     return f"{least:.4g} s" if least == most else f"{least:.4g} to {most:.4g} s"
 
 
@@ -288,7 +301,12 @@ def _format_fit(fit: float) -> str:
 
 
 def _run_identification(
-    model: "Model", records: "list[Record]", kept: "list[Record]", body: "JobIn", *, quiet: bool
+    model: "Model",
+    records: "list[Record]",
+    validation_records: "list[Record]",
+    body: "JobIn",
+    *,
+    quiet: bool,
 ) -> "Identification":
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -323,7 +341,7 @@ def _run_identification(
             loss=to_loss(document["loss"]),
             weights=body.weights,
             skip=body.skip,
-            validation=kept or None,
+            validation=validation_records or None,
             validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
             progress=show,
@@ -344,9 +362,9 @@ def _extract_records(
     channels = map_channels(model, body.channels, body.hold)
     for signal, channel in channels.by_signal.items():
         if channel not in recording.names:
-            given = f"--channels {signal}" if signal in body.channels else "--channels"
+            option = f"--channels {signal}" if signal in body.channels else "--channels"
             fail(
-                f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
+                f"{option}: {path} has no channel {channel!r} for signal {signal!r} of the model"
                 f"{suggest_name(channel, recording.names)}"
             )
     return list(channels.cut_records(recording, path.stem))

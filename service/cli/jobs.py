@@ -90,19 +90,19 @@ def list_jobs(
 ) -> None:
     """List the jobs of the server, latest first."""
     with connect_client(url, key) as client:
-        found = client.jobs(state=state or None)
+        jobs = client.jobs(state=state or None)
     print_listing(
-        found,
+        jobs,
         as_json,
         ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
-        lambda one: (
-            one["id"],
-            one["name"],
-            one["state"],
-            one["model"],
-            _format_progress(one),
-            *_single_run_rms(one),
-            format_moment(one["created_at"]),
+        lambda job: (
+            job["id"],
+            job["name"],
+            job["state"],
+            job["model"],
+            _format_progress(job),
+            *_single_run_rms(job),
+            format_moment(job["created_at"]),
         ),
         empty=f"no jobs are {' or '.join(state)}"
         if state
@@ -125,26 +125,26 @@ def list_runs(
             print_run(client.run(job), as_json)
             return
         about = client.job(job or _find_latest_job(client))
-        found = client.runs(about["id"])
+        runs = client.runs(about["id"])
     if as_json:
-        print_json(found)
+        print_json(runs)
     else:
-        print_runs(found, about["rms_unit"])
+        print_runs(runs, about["rms_unit"])
 
 
 def cancel_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
     """Cancel a job; results so far are kept."""
     with connect_client(url, key) as client:
-        found = client.cancel(job)
-    asked = "will be cancelled" if found["state"] == "running" else f"is {found['state']}"
-    out.print(f"{found['id']} {asked}", markup=False)
+        answer = client.cancel(job)
+    asked = "will be cancelled" if answer["state"] == "running" else f"is {answer['state']}"
+    out.print(f"{answer['id']} {asked}", markup=False)
 
 
 def resume_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
     """Queue a failed or cancelled job again; it continues where it stopped."""
     with connect_client(url, key) as client:
-        found = client.resume(job)
-    out.print(f"{found['id']} is {found['state']}", markup=False)
+        answer = client.resume(job)
+    out.print(f"{answer['id']} is {answer['state']}", markup=False)
 
 
 def write_report(
@@ -168,11 +168,11 @@ def read_job(file: Path) -> dict[str, Any]:
     model = body.get("model")
     if isinstance(model, str) and model.endswith(MODEL_SUFFIXES):
         body["model"] = read_document(file.parent / model)
-    for one in body.get("datasets") or []:
-        if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
+    for dataset in body.get("datasets") or []:
+        if isinstance(dataset, str) and dataset.endswith(DATA_SUFFIXES):
             fail(
-                f"{file}: datasets must be ids or names on the server, but {one!r} is a file. "
-                f"Add it first: lagid dataset add {one}"
+                f"{file}: datasets must be ids or names on the server, but {dataset!r} is a file. "
+                f"Add it first: lagid dataset add {dataset}"
             )
     return body
 
@@ -180,21 +180,25 @@ def read_job(file: Path) -> dict[str, Any]:
 def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
     """Print runs with their cells, fits and estimates; labels replace the ids of their data."""
     places = [run_coordinates(run) for run in runs]
-    paths = list(dict.fromkeys(path for place in places for path in place))
-    units = {one["name"]: one["unit"] for run in runs for one in run["parameters"]}
+    paths = list(dict.fromkeys(path for coordinates in places for path in coordinates))
+    units = {
+        parameter["name"]: parameter["unit"] for run in runs for parameter in run["parameters"]
+    }
     rows = []
-    for run, place in zip(runs, places, strict=True):
-        found = {one["name"]: format_estimate(one) for one in run["parameters"]}
+    for run, coordinates in zip(runs, places, strict=True):
+        estimates = {
+            parameter["name"]: format_estimate(parameter) for parameter in run["parameters"]
+        }
         fit = run.get("fit_percent") or {}
         rows.append(
             [
                 run["id"],
                 run["state"],
-                *(place.get(path) for path in paths),
+                *(coordinates.get(path) for path in paths),
                 run["rms"],
                 format_decimals(fit.get("estimation")),
                 format_decimals(fit.get("validation")),
-                *(found.get(name) for name in units),
+                *(estimates.get(name) for name in units),
             ]
         )
     headings = (
@@ -204,41 +208,41 @@ def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
         f">{append_unit('RMS', rms_unit)}",
         ">fit %",
         ">validation %",
-        *(f">{append_unit(*one)}" for one in units.items()),
+        *(f">{append_unit(*name_and_unit)}" for name_and_unit in units.items()),
     )
     print_table(headings, rows, empty="no runs")
 
 
 def _print_end(client: "Client", job: dict[str, Any], as_json: bool) -> None:
-    found = client.runs(job["id"])
+    runs = client.runs(job["id"])
     if as_json:
-        print_json({**job, "runs": found})
-    elif len(found) > MAX_PRINTED:
-        print_run_summary(client, job, found)
+        print_json({**job, "runs": runs})
+    elif len(runs) > MAX_PRINTED:
+        print_run_summary(client, job, runs)
     else:
-        print_runs(found, job["rms_unit"])
-        for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
+        print_runs(runs, job["rms_unit"])
+        for warning in dict.fromkeys(w for run in runs for w in run.get("warnings", [])):
             print_line(f"note: {warning}")
     if not as_json:
-        print_reuse_note(job, found, "reuse: false in the job")
+        print_reuse_note(job, runs, "reuse: false in the job")
     check_succeeded(job)
 
 
 def _find_latest_job(client: "Client") -> str:
-    found = client.jobs(limit=1)
-    if not found:
+    jobs = client.jobs(limit=1)
+    if not jobs:
         fail("there are no jobs; submit one: lagid submit job.yaml")
-    return str(found[0]["id"])
+    return str(jobs[0]["id"])
 
 
 def _format_progress(job: dict[str, Any]) -> str:
     """Format the count of finished runs; for several runs also how they ended."""
     done = job["progress"]
-    told = f"{done['finished']}/{done['runs']}"
+    text = f"{done['finished']}/{done['runs']}"
     if done["runs"] == 1 or not done["finished"]:
-        return told
+        return text
     succeeded = done["finished"] - done["failed"]
-    return f"{told}: {succeeded} succeeded, {done['failed']} failed"
+    return f"{text}: {succeeded} succeeded, {done['failed']} failed"
 
 
 def _single_run_rms(job: dict[str, Any]) -> tuple[float | None, str | None]:

@@ -43,22 +43,22 @@ def list_models(
     as_json: AsJson = False,
 ) -> None:
     """List built-in models; with --url also those of a server."""
-    found = _list_builtin_models()
+    models = _list_builtin_models()
     if url is not None:
         with connect_client(url, key) as client:
-            found = client.models()
+            models = client.models()
     print_listing(
-        found,
+        models,
         as_json,
         ("name", ">version", "form", "inputs", "outputs", "parameters", "title"),
-        lambda one: (
-            one["name"],
-            one["version"] or "built in",
-            one["form"],
-            ", ".join(one["inputs"]),
-            ", ".join(one["outputs"]),
-            ", ".join(one["parameters"]),
-            one["title"],
+        lambda model: (
+            model["name"],
+            model["version"] or "built in",
+            model["form"],
+            ", ".join(model["inputs"]),
+            ", ".join(model["outputs"]),
+            ", ".join(model["parameters"]),
+            model["title"],
         ),
         empty="no models",
     )
@@ -102,16 +102,16 @@ def check_model(
     try:
         answer = checked(parse_yaml(read_file(file))).model_dump(mode="json")
     except InvalidRequest as error:
-        answer = {"valid": False, "errors": [one.to_dict() for one in error.errors]}
+        answer = {"valid": False, "errors": [fault.to_dict() for fault in error.errors]}
     if as_json:
         print_json(answer)
     elif answer["valid"]:
         out.print(f"{file}: the model is valid", markup=False)
     else:
-        for one in answer["errors"]:
-            column = f", column {one['column']}" if one.get("column") else ""
-            where = f"{one['pointer'] or 'document'}{column}"
-            err.print(f"{file}: {where}: {one['detail']}", markup=False)
+        for fault in answer["errors"]:
+            column = f", column {fault['column']}" if fault.get("column") else ""
+            where = f"{fault['pointer'] or 'document'}{column}"
+            err.print(f"{file}: {where}: {fault['detail']}", markup=False)
     if not answer["valid"]:
         raise typer.Exit(1)
 
@@ -132,4 +132,4 @@ def add_model(
 def _list_builtin_models() -> list[dict[str, Any]]:
     from service.models.models import list_catalogue
 
-    return [one.model_dump(mode="json") for one in list_catalogue()]
+    return [model.model_dump(mode="json") for model in list_catalogue()]

@@ -63,7 +63,7 @@ def _client(url: str | None, key: str | None) -> "Iterator[Client]":
         return
     with (
         TemporaryDirectory(prefix="lagid-paper-") as folder,
-        run_embedded_service(Path(folder), cpus=os.cpu_count()) as own,
-        Client(own) as client,
+        run_embedded_service(Path(folder), cpus=os.cpu_count()) as own_url,
+        Client(own_url) as client,
     ):
         yield client

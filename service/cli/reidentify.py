@@ -111,7 +111,7 @@ def reidentify(
         "model": read_model(model),
         "label": label,
         "look_at": split_names(parameters),
-        "predict": [parse_number("--predict", one) for one in split_names(predict)],
+        "predict": [parse_number("--predict", text) for text in split_names(predict)],
         "channels": parse_channels(channels),
         **_drop_missing(reference=reference, warm_start=warm_start, name=name),
     }
@@ -161,26 +161,26 @@ def _print_outcome(client: "Client", job: dict[str, Any], json_file: str | None)
 
 
 def _choose_label_value(
-    given: list[float], label: str, accept: str | None, accept_run: str | None
+    values: list[float], label: str, accept: str | None, accept_run: str | None
 ) -> float:
     """Choose the label value of the run to accept, before anything is computed."""
-    there = f"there are {', '.join(f'{x:g}' for x in sorted(set(given)))}"
+    choices = f"there are {', '.join(f'{x:g}' for x in sorted(set(values)))}"
     if accept is None:
         if accept_run is not None:
             fail_usage("--accept-run needs --accept NAME, the name of the reference")
-        return given[0]
-    if accept_run is None and len(set(given)) > 1:
-        fail_usage(f"--accept needs --accept-run, a value of {label}; {there}")
+        return values[0]
+    if accept_run is None and len(set(values)) > 1:
+        fail_usage(f"--accept needs --accept-run, a value of {label}; {choices}")
     if accept_run is not None and accept_run.startswith("run_"):
         fail_usage(
-            f"--accept-run {accept_run}: need a value of {label}; {there}. For a run of another "
+            f"--accept-run {accept_run}: need a value of {label}; {choices}. For a run of another "
             f"batch: lagid references accept {accept} {accept_run}"
         )
-    x = given[0] if accept_run is None else parse_number("--accept-run", accept_run)
-    if given.count(x) != 1:
-        found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
+    x = values[0] if accept_run is None else parse_number("--accept-run", accept_run)
+    if values.count(x) != 1:
+        count = f"{values.count(x)} experiments have {label} = {x:g}; {choices}"
         several = f". Accept one of their runs afterwards: lagid references accept {accept} RUN"
-        fail_usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
+        fail_usage(f"--accept-run {x:g}: {count}{several if x in values else ''}")
     return x
 
 
@@ -192,15 +192,15 @@ def _accept_run(client: "Client", job: dict[str, Any], name: str, label: str, x:
 
 def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
     """Replace the files of a batch by dataset ids; each file is uploaded once."""
-    known: dict[str, str] = {}
-    for source in (one for _, sources in batch for one in sources):
-        if source in known:
+    dataset_ids: dict[str, str] = {}
+    for source in (name for _, sources in batch for name in sources):
+        if source in dataset_ids:
             continue
         is_file = Path(source).is_file()
         if not is_file and source.endswith(DATA_SUFFIXES):
             fail(f"there is no file {source}")
-        known[source] = client.add_dataset(Path(source))["id"] if is_file else source
-    return [{"x": x, "datasets": [known[one] for one in sources]} for x, sources in batch]
+        dataset_ids[source] = client.add_dataset(Path(source))["id"] if is_file else source
+    return [{"x": x, "datasets": [dataset_ids[name] for name in sources]} for x, sources in batch]
 
 
 def _parse_experiments(text: str) -> tuple[float, list[str]]:
@@ -228,18 +228,18 @@ ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the 
 def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
     """List the current references."""
     with connect_client(url, key) as client:
-        found = client.references()
+        references = client.references()
     print_listing(
-        found,
+        references,
         as_json,
         ("name", "run", "accepted", "by", "labels", "estimates"),
-        lambda one: (
-            one["name"],
-            one["run"],
-            format_moment(one["at"]),
-            one["by"],
-            format_labels(one["labels"]),
-            _format_estimates(one["estimates"]),
+        lambda reference: (
+            reference["name"],
+            reference["run"],
+            format_moment(reference["at"]),
+            reference["by"],
+            format_labels(reference["labels"]),
+            _format_estimates(reference["estimates"]),
         ),
         empty="no references; accept one: lagid references accept NAME RUN",
     )
@@ -251,16 +251,16 @@ def show_reference(
 ) -> None:
     """Show a reference and the runs accepted before it."""
     with connect_client(url, key) as client:
-        found = client.reference(name)
+        reference = client.reference(name)
     if as_json:
-        print_json(found)
+        print_json(reference)
         return
-    out.print(f"{found['name']}: {_format_estimates(found['estimates'])}", markup=False)
-    if found["labels"]:
-        out.print(format_labels(found["labels"]), markup=False)
+    out.print(f"{reference['name']}: {_format_estimates(reference['estimates'])}", markup=False)
+    if reference["labels"]:
+        out.print(format_labels(reference["labels"]), markup=False)
     rows = [
-        (one["run"], format_moment(one["at"]), one["by"], one["note"])
-        for one in (found, *found["history"])
+        (version["run"], format_moment(version["at"]), version["by"], version["note"])
+        for version in (reference, *reference["history"])
     ]
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
@@ -277,11 +277,11 @@ def accept_reference(
 ) -> None:
     """Accept a run as the reference of a name; the previous run stays in the history."""
     with connect_client(url, key) as client, report_faults(REFERENCE_ORIGINS):
-        found = client.accept_reference(name, run, by=by, note=note)
+        reference = client.accept_reference(name, run, by=by, note=note)
     if as_json:
-        print_json(found)
+        print_json(reference)
         return
-    _print_accepted(found)
+    _print_accepted(reference)
 
 
 def _print_accepted(reference: dict[str, Any]) -> None:
@@ -290,4 +290,6 @@ def _print_accepted(reference: dict[str, Any]) -> None:
 
 
 def _format_estimates(estimates: dict[str, Any]) -> str:
-    return ", ".join(f"{name} = {format_estimate(one)}" for name, one in estimates.items())
+    return ", ".join(
+        f"{name} = {format_estimate(estimate)}" for name, estimate in estimates.items()
+    )

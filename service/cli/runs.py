@@ -67,9 +67,9 @@ def show_residuals(
 ) -> None:
     """Test whether a run's residuals are white and independent of the inputs."""
     with connect_client(url, key) as client:
-        found = client.residuals(run)
+        residuals = client.residuals(run)
     if as_json:
-        print_json(found)
+        print_json(residuals)
         return
     headings = (
         "test",
@@ -82,11 +82,11 @@ def show_residuals(
         ">p",
         "verdict",
     )
-    print_table(headings, map(_test_row, found["tests"]), empty="no tests")
-    verdict = {True: "passed", False: "failed", None: "not tested"}[found["passed"]]
-    out.print(f"residuals on {found['data']} data: {verdict}", markup=False)
-    if found["note"]:
-        out.print(f"note: {found['note']}", markup=False, soft_wrap=True)
+    print_table(headings, map(_test_row, residuals["tests"]), empty="no tests")
+    verdict = {True: "passed", False: "failed", None: "not tested"}[residuals["passed"]]
+    out.print(f"residuals on {residuals['data']} data: {verdict}", markup=False)
+    if residuals["note"]:
+        out.print(f"note: {residuals['note']}", markup=False, soft_wrap=True)
 
 
 @app.command("simulate")
@@ -102,24 +102,24 @@ def simulate_run(
     body = read_object(file)
     places = FieldOrigins({"?max_points": "--max-points"}, rest=f"{file} …")
     with connect_client(url, key) as client, report_faults(places):
-        found = client.simulate_run(run, body, max_points)
+        simulation = client.simulate_run(run, body, max_points)
     if as_json:
-        print_json(found)
+        print_json(simulation)
         return
-    for one in found["outputs"]:
-        values = [value for value in one["values"] if value is not None]
+    for output in simulation["outputs"]:
+        values = [value for value in output["values"] if value is not None]
         out.print(
-            f"{one['name']} [{one['unit']}]: {one['samples']} samples, from {min(values):.6g}"
-            f" to {max(values):.6g}, at the end {values[-1]:.6g}",
+            f"{output['name']} [{output['unit']}]: {output['samples']} samples, "
+            f"from {min(values):.6g} to {max(values):.6g}, at the end {values[-1]:.6g}",
             markup=False,
             soft_wrap=True,
         )
-    _print_step(found["metrics"])
-    _print_controller(found["controller"], found["tuning"], found["margins"])
-    for note in found["notes"]:
+    _print_step(simulation["metrics"])
+    _print_controller(simulation["controller"], simulation["tuning"], simulation["margins"])
+    for note in simulation["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
-    if found["dataset"]:
-        out.print(f"stored as {found['dataset']['id']}", markup=False)
+    if simulation["dataset"]:
+        out.print(f"stored as {simulation['dataset']['id']}", markup=False)
 
 
 @app.command("profile")
@@ -136,18 +136,18 @@ def profile_run(
 ) -> None:
     """Compute profile likelihoods: 95 % intervals, all other parameters re-estimated."""
     with connect_client(url, key) as client, report_faults(PROFILE_ORIGINS):
-        found = client.profile(run, *(parameters or ()), points=points)
+        answer = client.profile(run, *(parameters or ()), points=points)
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
     rows = [
         [
-            one["name"],
-            one["unit"],
-            f"{one['estimate']:.6g}",
-            *("open" if end is None else f"{end:.6g}" for end in one["interval95"]),
+            profile["name"],
+            profile["unit"],
+            f"{profile['estimate']:.6g}",
+            *("open" if end is None else f"{end:.6g}" for end in profile["interval95"]),
         ]
-        for one in found["profiles"]
+        for profile in answer["profiles"]
     ]
     print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
 
@@ -161,29 +161,29 @@ def compare_runs(
 ) -> None:
     """Compare runs of several models on the same data."""
     with connect_client(url, key) as client, report_faults(FieldOrigins({"/runs": "RUN"})):
-        found = client.compare(*runs)
+        comparison = client.compare(*runs)
     if as_json:
-        print_json(found)
+        print_json(comparison)
         return
     headings = (
         "run",
         "model",
         ">parameters",
         ">samples",
-        f">RMS [{found['unit']}]",
+        f">RMS [{comparison['unit']}]",
         ">fit %",
         ">validation %",
         ">AIC",
         ">BIC",
         "residuals",
-        *(f">{one['name']}" for one in found["parameters"]),
+        *(f">{parameter['name']}" for parameter in comparison["parameters"]),
     )
     print_table(
         headings,
-        [_comparison_row(one, found["parameters"]) for one in found["runs"]],
+        [_comparison_row(run, comparison["parameters"]) for run in comparison["runs"]],
         empty="no runs",
     )
-    for note in found["notes"]:
+    for note in comparison["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
 
 
@@ -198,7 +198,7 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
             markup=False,
         )
         return
-    told = (
+    lines = (
         ("rise time (10 to 90 %)", metrics["rise_time"], "s"),
         ("overshoot of the reference", metrics["overshoot_percent"], "%"),
         ("overshoot of the final value", metrics["overshoot_of_final_percent"], "%"),
@@ -207,7 +207,7 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         ("IAE", metrics["iae"], multiply_units(metrics["unit"], "s")),
         ("ITAE", metrics["itae"], multiply_units(metrics["unit"], "s²")),
     )
-    for name, value, unit in told:
+    for name, value, unit in lines:
         missing = "not in this record: it has not settled" if "settling" in name else "never"
         shown = missing if value is None else f"{value:.4g} {unit}"
         out.print(f"{name}: {shown}", markup=False)
@@ -243,34 +243,34 @@ def _print_controller(
         out.print(f"without limits: stable, {', '.join(shown)}", markup=False)
 
 
-def _test_row(one: dict[str, Any]) -> tuple[object, ...]:
-    reason = f": {one['reason']}" if one["reason"] else ""
+def _test_row(test: dict[str, Any]) -> tuple[object, ...]:
+    reason = f": {test['reason']}" if test["reason"] else ""
     return (
-        one["test"],
-        one["experiment"] + 1,
-        one["output"],
-        one["input"],
-        one["samples"],
-        _format_percent(one["inside95"]),
-        _format_percent(one["inside99"]),
-        format_p_value(one["p"]),
-        f"{one['outcome']}{reason}",
+        test["test"],
+        test["experiment"] + 1,
+        test["output"],
+        test["input"],
+        test["samples"],
+        _format_percent(test["inside95"]),
+        _format_percent(test["inside99"]),
+        format_p_value(test["p"]),
+        f"{test['outcome']}{reason}",
     )
 
 
-def _comparison_row(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
+def _comparison_row(run: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
     values = [
         next(
-            (format_estimate(value) for value in parameter["values"] if value["run"] == one["run"]),
+            (format_estimate(value) for value in parameter["values"] if value["run"] == run["run"]),
             None,
         )
         for parameter in parameters
     ]
-    passed = {True: "passed", False: "failed", None: None}[one["residuals_passed"]]
+    passed = {True: "passed", False: "failed", None: None}[run["residuals_passed"]]
     return (
-        *(one[name] for name in ("run", "title", "parameters", "samples", "rms")),
+        *(run[name] for name in ("run", "title", "parameters", "samples", "rms")),
         *(
-            format_decimals(one[name])
+            format_decimals(run[name])
             for name in ("fit_estimation", "fit_validation", "aic", "bic")
         ),
         passed,

@@ -77,7 +77,7 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     raise typer.Exit(run_process(settings))
 
 
-def load_settings(**given: Any) -> "Settings":
+def load_settings(**options: Any) -> "Settings":
     """Read settings from the environment; options override them.
 
     Raises
@@ -91,7 +91,7 @@ def load_settings(**given: Any) -> "Settings":
     from service.core.validation import describe_error
 
     try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})
+        return Settings(**{name: value for name, value in options.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         name = "_".join(str(part) for part in first["loc"]).upper()
@@ -189,10 +189,10 @@ def upgrade_database(data_dir: DataDir = None) -> None:
 
     settings = load_settings(data_dir=data_dir)
     settings.prepare_data_folder()
-    with open_database(settings) as found:
-        migrate.upgrade_database(found)
+    with open_database(settings) as database:
+        migrate.upgrade_database(database)
         out.print(
-            f"the database is at revision {migrate.read_current_revision(found)}", markup=False
+            f"the database is at revision {migrate.read_current_revision(database)}", markup=False
         )
 
 
@@ -208,10 +208,10 @@ def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
             f"there is no database in {settings.data_dir.absolute()}. Create one with "
             "`lagid serve` or `lagid db upgrade`, or name another folder with --data-dir."
         )
-    with open_database(settings) as found:
-        migrate.check_revision(found)
+    with open_database(settings) as database:
+        migrate.check_revision(database)
         store = open_store(settings.resolved_store_url)
-        with found.read_session() as session:
+        with database.read_session() as session:
             lost = garbage.find_lost_hashes(session, store)
             orphans = list(garbage.find_orphans(session, store))
             if fix:
@@ -258,14 +258,14 @@ def open_database(settings: "Settings") -> Iterator["Database"]:
 
     from service.storage.sessions import Database
 
-    found = Database(settings.resolved_database_url)
+    database = Database(settings.resolved_database_url)
     try:
-        yield found
+        yield database
     except SQLAlchemyError as error:
         reason = str(error).splitlines()[0]
         raise Unavailable(f"the database cannot be used: {reason}") from error
     finally:
-        found.dispose()
+        database.dispose()
 
 
 def _check_python() -> str:

@@ -137,7 +137,7 @@ def sweep_noise(
     truth = _build_truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
         "model": read_model(model),
-        "sigma": [one for text in sigma for one in parse_sigma_grid(text)],
+        "sigma": [sigma_value for text in sigma for sigma_value in parse_sigma_grid(text)],
         "relative": relative,
         "replicates": replicates,
         "methods": split_names(methods),
@@ -161,11 +161,11 @@ def parse_sigma_grid(text: str) -> list[float]:
 
     The steps are computed in decimals, so that the fourth value of 0:1:0.05 is exactly 0.15.
     """
-    found: list[float] = []
+    sigmas: list[float] = []
     for part in split_names(text):
-        ends = [_parse_decimal(text, one) for one in part.split(":")]
+        ends = [_parse_decimal(text, number_text) for number_text in part.split(":")]
         if len(ends) == 1:
-            found.append(float(ends[0]))
+            sigmas.append(float(ends[0]))
         elif len(ends) == 3 and ends[2] > 0 and ends[1] >= ends[0]:
             start, stop, step = ends
             count = int((stop - start) / step) + 1
@@ -173,15 +173,15 @@ def parse_sigma_grid(text: str) -> list[float]:
                 fail_usage(
                     f"--sigma {text}: {count} values; at most {MAX_SIGMA_VALUES} are allowed"
                 )
-            found += [float(start + step * number) for number in range(count)]
+            sigmas += [float(start + step * number) for number in range(count)]
         else:
             fail_usage(
                 f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
                 "positive step, such as 0:1:0.05"
             )
-    if not found:
+    if not sigmas:
         fail_usage(f"--sigma {text!r}: need numbers, such as 0:1:0.05 or 0,0.1,0.3")
-    return found
+    return sigmas
 
 
 def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
@@ -191,16 +191,20 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
     parameters.
     """
     groups = summary["groups"]
-    units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
+    units = {
+        parameter["name"]: parameter["unit"]
+        for group in groups
+        for parameter in group["parameters"]
+    }
     others = [key for key in summary["by"] if key not in (SIGMA_PATH, RELATIVE_KEY)]
     relative = [f">{RELATIVE_KEY} σ"] if RELATIVE_KEY in summary["by"] else []
     cells = [
         [
-            *(_format_short(one["key"][RELATIVE_KEY], 4) for _ in relative),
-            _format_short(one["sigma"], 4),
-            *(str(one["key"][key]) for key in others),
+            *(_format_short(group["key"][RELATIVE_KEY], 4) for _ in relative),
+            _format_short(group["sigma"], 4),
+            *(str(group["key"][key]) for key in others),
         ]
-        for one in groups
+        for group in groups
     ]
     unit = summary["rms_unit"]
     one_output = None if unit == "σ" else unit
@@ -209,7 +213,7 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
         f">{append_unit('σ', one_output)}",
         *(key.rsplit("/", 1)[-1] for key in others),
     ]
-    found = [
+    tables = [
         (
             [
                 *keys,
@@ -219,7 +223,7 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
                 f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]",
                 ">floor",
             ],
-            [[*cell, *_group_cells(one)] for cell, one in zip(cells, groups, strict=True)],
+            [[*cell, *_group_cells(group)] for cell, group in zip(cells, groups, strict=True)],
         )
     ]
     names = list(units)
@@ -230,9 +234,11 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
                 f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error [5 %, 95 %]",
                 ">floor",
             ]
-        rows = [[*cell, *_error_cells(one, some)] for cell, one in zip(cells, groups, strict=True)]
-        found.append((headings, rows))
-    return found
+        rows = [
+            [*cell, *_error_cells(group, some)] for cell, group in zip(cells, groups, strict=True)
+        ]
+        tables.append((headings, rows))
+    return tables
 
 
 def _group_cells(group: dict[str, Any]) -> list[str]:
@@ -247,12 +253,15 @@ def _group_cells(group: dict[str, Any]) -> list[str]:
 
 
 def _error_cells(group: dict[str, Any], names: list[str]) -> list[str]:
-    known = {one["name"]: one for one in group["parameters"]}
-    found = [known.get(name, {"error": None, "floor": None}) for name in names]
+    by_name = {parameter["name"]: parameter for parameter in group["parameters"]}
+    parameters = [by_name.get(name, {"error": None, "floor": None}) for name in names]
     return [
         text
-        for one in found
-        for text in (_format_band(one["error"], signed=True), _format_short(one["floor"]))
+        for parameter in parameters
+        for text in (
+            _format_band(parameter["error"], signed=True),
+            _format_short(parameter["floor"]),
+        )
     ]
 
 
@@ -285,12 +294,12 @@ def _build_truth(
 ) -> dict[str, Any]:
     return {
         "parameters": {
-            one: parse_number(f"--true {one}={value}", value)
-            for one, value in parse_pairs("--true", true or ()).items()
+            name: parse_number(f"--true {name}={value}", value)
+            for name, value in parse_pairs("--true", true or ()).items()
         },
         "inputs": {
-            one: {"kind": "expression", "expression": text}
-            for one, text in parse_pairs("--input", inputs or ()).items()
+            name: {"kind": "expression", "expression": text}
+            for name, text in parse_pairs("--input", inputs or ()).items()
         },
         "samples": samples,
         "sample_time": sample_time,
@@ -298,22 +307,22 @@ def _build_truth(
 
 
 def _choose_source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
-    given = {name: value for name, value in truth.items() if value}
-    if (data is None) == (not given):
+    present = {name: value for name, value in truth.items() if value}
+    if (data is None) == (not present):
         fail_usage(
             "need either --data, or --true, --input, --samples and --sample-time to simulate"
         )
-    return {"truth": given} if data is None else {"datasets": split_names(data)}
+    return {"truth": present} if data is None else {"datasets": split_names(data)}
 
 
 def _parse_decimal(text: str, part: str) -> Decimal:
     try:
-        found = Decimal(part)
+        value = Decimal(part)
     except InvalidOperation:
-        found = Decimal("NaN")
-    if not found.is_finite():
+        value = Decimal("NaN")
+    if not value.is_finite():
         fail_usage(f"--sigma {text}: found {part!r}; need a number, or start:stop:step")
-    return found
+    return value
 
 
 def _format_short(value: float | None, digits: int = 2) -> str:
@@ -324,7 +333,7 @@ def _format_band(quantiles: list[float] | None, *, signed: bool = False) -> str:
     if quantiles is None:
         return "–"
     low, middle, high = (
-        f"{quantiles[place]:{'+' if signed else ''}.2g}"
-        for place in (LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX)
+        f"{quantiles[index]:{'+' if signed else ''}.2g}"
+        for index in (LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX)
     )
     return f"{middle} [{low}, {high}]"

@@ -47,19 +47,19 @@ def print_run(run: dict[str, Any], as_json: bool) -> None:
         print_json(run)
         return
     print_line(f"{run['id']}  run {run['number'] + 1} of {run['job']}: {run['state']}")
-    if place := run_coordinates(run):
-        print_line(format_labels(place))
+    if coordinates := run_coordinates(run):
+        print_line(format_labels(coordinates))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
         [
             [
-                one["name"],
-                format_estimate(one),
-                one["unit"],
-                _format_interval(one["interval95"]),
-                describe_status(one),
+                parameter["name"],
+                format_estimate(parameter),
+                parameter["unit"],
+                _format_interval(parameter["interval95"]),
+                describe_status(parameter),
             ]
-            for one in run["parameters"]
+            for parameter in run["parameters"]
         ],
         empty="no estimates" if run["finished_at"] else "no estimates yet",
     )
@@ -87,16 +87,16 @@ def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: 
 
 def _format_fit(run: dict[str, Any]) -> str:
     fit = run.get("fit_percent") or {}
-    told = [f"RMS {_format_rms(run, 'rms')}"]
-    told += [
+    parts = [f"RMS {_format_rms(run, 'rms')}"]
+    parts += [
         f"{name} {fit[part]:.2f} %"
         for name, part in (("fit", "estimation"), ("validation fit", "validation"))
         if fit.get(part) is not None
     ]
     if run.get("rms_validation") is not None:
-        told.append(f"validation RMS {_format_rms(run, 'rms_validation')}")
+        parts.append(f"validation RMS {_format_rms(run, 'rms_validation')}")
     seconds = "" if run["seconds"] is None else f" in {run['seconds']:.2f} s"
-    return f"{', '.join(told)}; {run['evaluations']} simulations{seconds}"
+    return f"{', '.join(parts)}; {run['evaluations']} simulations{seconds}"
 
 
 def _format_rms(run: dict[str, Any], name: str) -> str:
@@ -121,8 +121,8 @@ LOW_QUANTILE, MEDIAN, HIGH_QUANTILE = 0.05, 0.5, 0.95
 def print_run_summary(client: "Client", job: dict[str, Any], runs: list[dict[str, Any]]) -> None:
     """Print a summary of a job instead of its runs."""
     states = Counter(run["state"] for run in runs)
-    told = ", ".join(f"{count} {state}" for state, count in states.most_common())
-    print_line(f"{job['id']}: {len(runs)} runs, {told}")
+    counts = ", ".join(f"{count} {state}" for state, count in states.most_common())
+    print_line(f"{job['id']}: {len(runs)} runs, {counts}")
     _print_groups(client, job)
     print_line(f"single runs: lagid runs {job['id']}")
     _print_warning_kinds([warning for run in runs for warning in run.get("warnings", [])])
@@ -138,23 +138,29 @@ def _print_groups(client: "Client", job: dict[str, Any]) -> None:
         summary["groups"],
         [summary["quantiles"].index(q) for q in (LOW_QUANTILE, MEDIAN, HIGH_QUANTILE)],
     )
-    units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
+    units = {
+        parameter["name"]: parameter["unit"]
+        for group in groups
+        for parameter in group["parameters"]
+    }
     headings = [
         *(key.removeprefix("/").replace("/", ".") for key in summary["by"]),
         ">runs",
         ">success",
         f"{append_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
-        *(append_unit(*one) for one in units.items()),
+        *(append_unit(*name_and_unit) for name_and_unit in units.items()),
     ]
     print_table(
-        headings, [_group_row(one, units, places) for one in groups[:MAX_PRINTED]], empty="no runs"
+        headings,
+        [_group_row(group, units, places) for group in groups[:MAX_PRINTED]],
+        empty="no runs",
     )
     if len(groups) > MAX_PRINTED:
         print_line(f"… and {len(groups) - MAX_PRINTED} more groups")
 
 
 def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
-    values = {one["name"]: one["value"] for one in group["parameters"]}
+    values = {parameter["name"]: parameter["value"] for parameter in group["parameters"]}
     return [
         *group["key"].values(),
         group["runs"],
@@ -167,14 +173,14 @@ def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[in
 def _format_band(quantiles: Sequence[float] | None, places: Sequence[int]) -> str | None:
     if quantiles is None:
         return None
-    low, middle, high = (f"{quantiles[place]:.4g}" for place in places)
+    low, middle, high = (f"{quantiles[index]:.4g}" for index in places)
     return f"{middle}, {low} to {high}"
 
 
 def _print_warning_kinds(warnings: list[str]) -> None:
     """Print the first warning of each kind; warnings of one kind differ only in numbers."""
-    kinds = Counter(NUMBER_PATTERN.sub("…", one) for one in warnings)
-    first = {NUMBER_PATTERN.sub("…", one): one for one in reversed(warnings)}
+    kinds = Counter(NUMBER_PATTERN.sub("…", warning) for warning in warnings)
+    first = {NUMBER_PATTERN.sub("…", warning): warning for warning in reversed(warnings)}
     for kind, count in kinds.most_common(MAX_WARNING_KINDS):
         print_line(f"note ({count} ×, for example): {first[kind]}")
     if len(kinds) > MAX_WARNING_KINDS:
@@ -186,7 +192,7 @@ def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
     tables = build_tables(trend, PLAIN)
     headings = [
         f">{trend['x']}",
-        *(f">{one}" for one in tables.headings),
+        *(f">{heading}" for heading in tables.headings),
         ">measured span",
         ">evaluations",
         "flags",

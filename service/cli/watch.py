@@ -108,8 +108,8 @@ class RunsProgress:
 
     def _describe_run(self, run: Document) -> str:
         cell = _describe_cell(run)
-        found = self.format_rms(run["rms"]) if run["state"] == "succeeded" else run["state"]
-        return f"run {run['number'] + 1}{f' ({cell})' if cell else ''}: {found}"
+        outcome = self.format_rms(run["rms"]) if run["state"] == "succeeded" else run["state"]
+        return f"run {run['number'] + 1}{f' ({cell})' if cell else ''}: {outcome}"
 
 
 class ProgressLog:
@@ -132,14 +132,14 @@ class ProgressLog:
 
     def _format_line(self, job: Document) -> str:
         done = job["progress"]
-        told = [f"{job['id']} {job['state']}", f"{done['finished']}/{done['runs']} runs"]
+        parts = [f"{job['id']} {job['state']}", f"{done['finished']}/{done['runs']} runs"]
         if done["runs"] > 1:
-            return ", ".join([*told, *self._many.describe_progress(job)])
+            return ", ".join([*parts, *self._many.describe_progress(job)])
         if done["generation"]:
-            told.append(f"generation {done['generation']}")
+            parts.append(f"generation {done['generation']}")
         if done["best_rms"] is not None:
-            told.append(self._many.format_rms(done["best_rms"]))
-        return ", ".join(told)
+            parts.append(self._many.format_rms(done["best_rms"]))
+        return ", ".join(parts)
 
 
 class _ProgressBars:
@@ -167,22 +167,22 @@ class _ProgressBars:
                 run["id"], label, run["progress"], self._many.format_rms(run["rms"]), run["state"]
             )
 
-    def _update_bar(self, key: str, label: str, part: float, told: str, state: str) -> None:
+    def _update_bar(self, key: str, label: str, part: float, text: str, state: str) -> None:
         if key not in self._bars:
-            self._bars[key] = self._progress.add_task(label, total=1.0, told=told, state=state)
+            self._bars[key] = self._progress.add_task(label, total=1.0, told=text, state=state)
         self._progress.update(
-            self._bars[key], description=label, completed=part, told=told, state=state
+            self._bars[key], description=label, completed=part, told=text, state=state
         )
 
 
 def _find_newest_run(client: "Client", job_id: str) -> Document | None:
     """Find the ended run with the highest number; runs start in the order of their numbers."""
     ended = ["succeeded", "failed"]
-    found = client.runs(job_id, at_most=1, state=ended, order="number", descending=True)
-    return found[0] if found else None
+    runs = client.runs(job_id, at_most=1, state=ended, order="number", descending=True)
+    return runs[0] if runs else None
 
 
 def _describe_cell(run: Document) -> str:
     """Describe a run by its labels and axis values, except datasets and models."""
     values = [*run["labels"].values(), *run["cell"].values()]
-    return ", ".join(format_value(one) for one in values if not isinstance(one, dict | list))
+    return ", ".join(format_value(value) for value in values if not isinstance(value, dict | list))
