@@ -10,7 +10,7 @@ from tests.stored import claim, submit
 
 
 def submit_for(database, project, **values):
-    with database.write() as session:
+    with database.write_session() as session:
         if session.get(Project, project) is None:
             session.add(Project(id=project, name=project))
             session.flush()
@@ -19,7 +19,7 @@ def submit_for(database, project, **values):
 
 
 def claim_within(database, admission):
-    with database.write() as session:
+    with database.write_session() as session:
         claimed = LeaseQueue(session).claim_job("d1", admission=admission)
         return None if claimed is None else claimed.job.id
 
@@ -39,12 +39,12 @@ def test_a_priority_comes_before_the_projects_turn(database):
 def test_a_full_dispatcher_sees_and_takes_only_short_or_urgent_jobs(database):
     full = Admission(max_runs=8, above_priority=3)
     sweep = submit(database, n_runs=9, priority=3)
-    with database.read() as session:
+    with database.read_session() as session:
         assert not read_queue_status(session, "d1", full).has_waiting_job
         assert read_queue_status(session, "d1").has_waiting_job
     assert claim_within(database, full) is None
     short, urgent = submit(database, n_runs=8), submit(database, n_runs=100_000, priority=4)
-    with database.read() as session:
+    with database.read_session() as session:
         assert read_queue_status(session, "d1", full).has_waiting_job
     assert [claim_within(database, full) for _ in range(3)] == [urgent, short, None]
     assert claim_within(database, None) == sweep
@@ -54,10 +54,10 @@ def test_unfinished_work_is_counted_by_project_and_only_while_it_is_open(databas
     first = submit_for(database, "a", n_runs=10)
     submit_for(database, "a", n_runs=5)
     submit_for(database, "b", n_runs=7)
-    with database.read() as session:
+    with database.read_session() as session:
         assert count_unfinished(session, "a") == UnfinishedWork(2, 15)
         assert count_unfinished(session, "nobody") == UnfinishedWork(0, 0)
-    with database.write() as session:
+    with database.write_session() as session:
         assert JobRepository(session, "a").cancel(first).state is JobState.CANCELLED
-    with database.read() as session:
+    with database.read_session() as session:
         assert count_unfinished(session, "a") == UnfinishedWork(1, 5)

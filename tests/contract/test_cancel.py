@@ -14,20 +14,20 @@ from tests.stored import claim, claimed, job_of, runs_of, state_of, submit
 
 
 def finish(database, lease, state):
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).finish_job(lease, state)
 
 
 def test_a_queued_job_is_cancelled_at_once(database):
     job_id = submit(database)
-    with database.write() as session:
+    with database.write_session() as session:
         assert JobRepository(session).cancel(job_id).state is JobState.CANCELLED
     assert claim(database) is None
 
 
 def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
     got, _ = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         job = JobRepository(session).cancel(got.job.id)
         assert (job.state, job.cancel_requested) == (JobState.RUNNING, True)
     finish(database, got.lease, JobState.CANCELLED)
@@ -37,17 +37,17 @@ def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
 def test_cancelling_twice_is_as_cancelling_once(database):
     job_id = submit(database)
     for _ in range(2):
-        with database.write() as session:
+        with database.write_session() as session:
             assert JobRepository(session).cancel(job_id).state is JobState.CANCELLED
 
 
 @pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED])
 def test_a_finished_job_cannot_be_cancelled(database, end):
     got, (run_id,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
         LeaseQueue(session).finish_job(got.lease, end)
-    with pytest.raises(RowConflict, match=end.value), database.write() as session:
+    with pytest.raises(RowConflict, match=end.value), database.write_session() as session:
         JobRepository(session).cancel(got.job.id)
 
 
@@ -57,7 +57,7 @@ def test_cancel_and_claim_at_once_never_lose_the_wish(database):
 
         def cancel(job_id=job_id, start=start):
             start.wait()
-            with database.write() as session:
+            with database.write_session() as session:
                 JobRepository(session).cancel(job_id)
 
         thread = threading.Thread(target=cancel)
@@ -78,7 +78,7 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
         def cancel(job_id=got.job.id, start=start):
             start.wait()
             try:
-                with database.write() as session:
+                with database.write_session() as session:
                     JobRepository(session).cancel(job_id)
             except RowConflict:
                 pass
@@ -86,14 +86,14 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
         thread = threading.Thread(target=cancel)
         thread.start()
         start.wait()
-        with database.write() as session:
+        with database.write_session() as session:
             RunWriter(session, got.lease).record_outcomes(
                 [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED)]
             )
             LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
         thread.join()
         assert state_of(database, got.job.id) is JobState.SUCCEEDED
-        with database.read() as session:
+        with database.read_session() as session:
             kinds = [event.kind for event in EventRepository(session).list_after(got.job.id)]
         assert kinds.count("end") == 1
         assert kinds[-1] == "end"
@@ -101,7 +101,7 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
 
 def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
     got, (done, bad, _) = claimed(database, n_runs=3)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes(
             [
                 RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
@@ -109,7 +109,7 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
             ]
         )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "1 run failed")
-    with database.write() as session:
+    with database.write_session() as session:
         job = JobRepository(session).resume(got.job.id)
         assert (job.state, job.n_done, job.n_failed, job.error) == (JobState.QUEUED, 1, 0, None)
     states = [run.state for run in runs_of(database, got.job.id)]
@@ -119,7 +119,7 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
 
 def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
     job_id = submit(database)
-    with pytest.raises(RowConflict, match="queued"), database.write() as session:
+    with pytest.raises(RowConflict, match="queued"), database.write_session() as session:
         JobRepository(session).resume(job_id)
-    with pytest.raises(RowNotFound), database.write() as session:
+    with pytest.raises(RowNotFound), database.write_session() as session:
         JobRepository(session).resume("job_none")

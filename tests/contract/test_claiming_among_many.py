@@ -45,7 +45,7 @@ def crowded(database):
         }
         for number, state in enumerate(states)
     ]
-    with database.write() as session:
+    with database.write_session() as session:
         session.execute(insert(Project), [{"id": one, "name": one} for one in PROJECTS])
         session.execute(insert(Job), rows)
     with database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
@@ -75,7 +75,7 @@ def plans_of(database, work) -> list[str]:
 
 
 def claim(database, admission=None):
-    with database.write() as session:
+    with database.write_session() as session:
         return LeaseQueue(session).claim_job("d2", admission=admission)
 
 
@@ -149,13 +149,13 @@ def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specifi
     got, _ = claimed(database)
 
     def work() -> None:
-        with database.write() as session:
+        with database.write_session() as session:
             queue = LeaseQueue(session)
             queue.lock_job(got.lease)
             queue.write_progress(got.lease, JobProgress(1))
             queue.append_event(got.lease, "log", {"message": "told"})
             queue.reap_expired(LeaseOwners(ended=frozenset({got.lease.owner})))
-        with database.read() as session:
+        with database.read_session() as session:
             assert JobRepository(session).get_state(got.job.id) is JobState.QUEUED
         _read_events(SimpleNamespace(database=database), got.job.id, 0)
 
@@ -165,5 +165,5 @@ def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specifi
 
 
 def job_of_project(database, got) -> str:
-    with database.read() as session:
+    with database.read_session() as session:
         return str(session.get_one(Job, got.job.id).project_id)

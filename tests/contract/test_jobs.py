@@ -18,7 +18,7 @@ NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_
 
 
 def events(database, job_id, after=0, limit=500):
-    with database.read() as session:
+    with database.read_session() as session:
         return EventRepository(session).list_after(job_id, after, limit)
 
 
@@ -27,7 +27,7 @@ def kinds(database, job_id):
 
 
 def test_a_submitted_job_is_queued_and_kept_whole(database):
-    with database.write() as session:
+    with database.write_session() as session:
         submission = JobRepository(session).submit(NEW)
     assert submission.is_new
     job = job_of(database, submission.job.id)
@@ -42,7 +42,7 @@ def test_a_submitted_job_is_queued_and_kept_whole(database):
 
 def test_a_specification_keeps_the_order_of_its_keys(database):
     parameters = {name: {"lower": 0, "upper": 1} for name in ("zeta", "T", "L", "gain")}
-    with database.write() as session:
+    with database.write_session() as session:
         job = JobRepository(session).submit(
             NewJob(name="order", spec={"model": {"parameters": parameters}}, n_runs=1)
         )
@@ -53,7 +53,7 @@ def test_a_specification_keeps_the_order_of_its_keys(database):
 def test_the_same_request_under_the_same_key_is_one_job(database):
     found = []
     for _ in range(2):
-        with database.write() as session:
+        with database.write_session() as session:
             found.append(JobRepository(session).submit(NEW, key="k1", request_hash="h"))
     assert [one.is_new for one in found] == [True, False]
     assert found[0].job.id == found[1].job.id
@@ -61,9 +61,9 @@ def test_the_same_request_under_the_same_key_is_one_job(database):
 
 
 def test_another_request_under_the_same_key_is_refused(database):
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).submit(NEW, key="k1", request_hash="h")
-    with pytest.raises(KeyReused, match="k1"), database.write() as session:
+    with pytest.raises(KeyReused, match="k1"), database.write_session() as session:
         JobRepository(session).submit(NEW, key="k1", request_hash="other")
 
 
@@ -72,7 +72,7 @@ def test_many_requests_under_one_key_at_once_make_one_job(database):
 
     def send():
         start.wait()
-        with database.write() as session:
+        with database.write_session() as session:
             found.append(JobRepository(session).submit(NEW, key="k1", request_hash="h"))
 
     threads = [threading.Thread(target=send) for _ in range(4)]
@@ -82,16 +82,16 @@ def test_many_requests_under_one_key_at_once_make_one_job(database):
         thread.join()
     assert len({one.job.id for one in found}) == 1
     assert sum(one.is_new for one in found) == 1
-    with database.read() as session:
+    with database.read_session() as session:
         assert JobRepository(session).count_states()[JobState.QUEUED] == 1
 
 
 def test_pages_of_jobs_stay_put_while_new_ones_arrive(database):
     old = [submit(database) for _ in range(5)]
-    with database.read() as session:
+    with database.read_session() as session:
         first = JobRepository(session).list_page(limit=2)
     submit(database)
-    with database.read() as session:
+    with database.read_session() as session:
         second = JobRepository(session).list_page(limit=2, cursor=first.next)
         third = JobRepository(session).list_page(limit=2, cursor=second.next)
     pages = [*first.items, *second.items, *third.items]
@@ -101,7 +101,7 @@ def test_pages_of_jobs_stay_put_while_new_ones_arrive(database):
 
 def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
     submit(database), submit(database)
-    with database.read() as session:
+    with database.read_session() as session:
         page = JobRepository(session).list_page(limit=2)
     assert len(page.items) == 2
     assert page.next is None
@@ -110,7 +110,7 @@ def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
 def test_jobs_are_listed_and_counted_by_state(database):
     first, second = submit(database), submit(database)
     claim(database)
-    with database.read() as session:
+    with database.read_session() as session:
         jobs = JobRepository(session)
         assert [job.id for job in jobs.list_page(states=[JobState.RUNNING]).items] == [first]
         assert [
@@ -127,12 +127,12 @@ def test_jobs_are_listed_and_counted_by_state(database):
 
 def test_a_deleted_job_is_no_longer_there(database):
     job_id = submit(database)
-    with pytest.raises(RowConflict, match="cancel it"), database.write() as session:
+    with pytest.raises(RowConflict, match="cancel it"), database.write_session() as session:
         JobRepository(session).delete(job_id)
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(job_id)
         JobRepository(session).delete(job_id)
-    with database.read() as session:
+    with database.read_session() as session:
         assert JobRepository(session).list_page().items == ()
         assert sum(JobRepository(session).count_states().values()) == 0
         with pytest.raises(RowNotFound, match=job_id):
@@ -140,29 +140,29 @@ def test_a_deleted_job_is_no_longer_there(database):
 
 
 def test_another_projects_jobs_are_neither_seen_nor_touched(database):
-    with database.write() as session:
+    with database.write_session() as session:
         session.add(Project(id="proj_other", name="other"))
     job_id = submit(database)
-    with database.write() as session:
+    with database.write_session() as session:
         foreign = JobRepository(session, "proj_other")
         assert foreign.list_page().items == ()
         for act in (foreign.get, foreign.cancel, foreign.resume, foreign.delete):
             with pytest.raises(RowNotFound):
                 act(job_id)
         assert foreign.submit(NEW, key="k", request_hash="h").is_new
-    with database.write() as session:
+    with database.write_session() as session:
         assert JobRepository(session).submit(NEW, key="k", request_hash="h").is_new
 
 
 @pytest.mark.parametrize("name", ["a\x00b", "\udcff"])
 def test_a_name_that_not_every_database_can_keep_is_refused(database, name):
-    with pytest.raises(UnstorableValue), database.write() as session:
+    with pytest.raises(UnstorableValue), database.write_session() as session:
         JobRepository(session).submit(NewJob(name=name, spec={}))
 
 
 def test_a_job_tells_its_whole_story(database):
     got, (run_id,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         queue = LeaseQueue(session)
         queue.append_event(got.lease, "log", {"line": "packing 1 run"})
         queue.write_progress(got.lease, JobProgress(50, best_rms=0.5))
@@ -182,7 +182,7 @@ def test_a_job_tells_its_whole_story(database):
 
 def test_a_resumed_job_tells_on_after_its_end(database):
     job_id = submit(database)
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(job_id)
         JobRepository(session).resume(job_id)
     assert kinds(database, job_id)[-2:] == [("end", "cancelled"), ("state", "queued")]
@@ -192,7 +192,7 @@ def test_a_reader_goes_on_after_the_last_event_it_saw(database):
     got, _ = claimed(database)
     other, _ = claimed(database)
     for i in range(5):
-        with database.write() as session:
+        with database.write_session() as session:
             LeaseQueue(session).append_event(got.lease, "log", {"line": i})
             LeaseQueue(session).append_event(other.lease, "log", {"line": -i})
     everything = events(database, got.job.id)
@@ -209,10 +209,10 @@ def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
     before = len(events(database, got.job.id))
 
     def write(line):
-        with database.write() as session:
+        with database.write_session() as session:
             EventRepository(session).append_event(got.job.id, "log", {"line": line})
 
-    with database.write() as slow:
+    with database.write_session() as slow:
         EventRepository(slow).append_event(got.job.id, "log", {"line": "first"})
         quick = threading.Thread(target=write, args=("second",))
         quick.start()
@@ -229,7 +229,7 @@ def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
 
     def write(who):
         for i in range(15):
-            with database.write() as session:
+            with database.write_session() as session:
                 EventRepository(session).append_event(got.job.id, "log", {"line": f"{who}{i}"})
 
     def read():

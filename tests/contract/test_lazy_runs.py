@@ -39,12 +39,12 @@ def place(tmp_path, database, monkeypatch):
 
 
 def claim(place, owner="d1"):
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         return LeaseQueue(session).claim_job(owner)
 
 
 def lose(place, claim):
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({claim.lease.owner})))
 
 
@@ -155,12 +155,12 @@ def test_two_sources_of_one_lease_make_each_run_once(place):
 def test_a_job_cannot_succeed_before_all_its_runs_are_made(place):
     place.submit(**SWEEP)
     got = claim(place)
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         for run in RunWriter(session, got.lease).list_pending():
             run.state = JobState.SUCCEEDED
     left = N_RUNS - AT_ONCE
     said = f"{left} of its runs did not finish"
-    with pytest.raises(RowConflict, match=said), place.database.write() as session:
+    with pytest.raises(RowConflict, match=said), place.database.write_session() as session:
         LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
 
 
@@ -169,10 +169,10 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
     place.cancel(whole)
     place.cancel(job)
     assert len(place.runs(job)) == AT_ONCE
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         (group,) = group_all_runs(session, place.job(job), [], [], 10)
     assert group.states[JobState.CANCELLED] == N_RUNS
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         submit.resume_job(session, job, place.settings)
     carry_out(place, job, InlineExecutor())
     assert place.job(job).state is JobState.SUCCEEDED
@@ -193,7 +193,7 @@ def test_a_clone_has_the_same_cells(place):
 def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, by):
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     keys = [GroupKey("label" if one == "x" else "axis", one) for one in by]
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         expected = read_groups(session, whole, keys, [], 100)
         found = group_all_runs(session, place.job(job), keys, [], 100)
         told = summarise_job(session, job, by)
@@ -205,7 +205,7 @@ def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, b
 
 def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(place):
     job = place.submit(**SWEEP)
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         listed = list_runs(session, job, None, 100, RunQuery())
         progress = submit.to_job_out(JobRepository(session).get(job)).progress
         assert RunRepository(session).count_created(job) == len(listed.items) == AT_ONCE
@@ -215,7 +215,7 @@ def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(place):
 def test_what_a_name_means_is_settled_at_submission(place):
     axes = [{"path": "/datasets", "values": [["steps"]] * 8}]
     job = place.submit(algorithm=SMALL, sweep={"axes": axes})
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         session.get(Dataset, place.dataset).name = "another name"
     carry_out(place, job, InlineExecutor())
     assert [run.cell for run in place.runs(job)] == [{"/datasets": [place.dataset]}] * 8
@@ -237,7 +237,7 @@ def test_names_inside_objects_and_lists_are_settled_too(place):
 
 def test_a_lease_that_has_expired_makes_nothing(place):
     job = place.submit(**SWEEP)
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         got = LeaseQueue(session).claim_job("late", timedelta(seconds=0))
     lose(place, got)
     assert list(source(place, got).runs()) == []

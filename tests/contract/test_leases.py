@@ -203,7 +203,7 @@ def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
     job = submit(database)
     leases = HeldLeases(database, 3.0)  # by the true clock
     lease = leases.claim_job().lease
-    with database.write() as other:
+    with database.write_session() as other:
         other.execute(update(Job).where(Job.id == job).values(name="held"))
         begun = time.monotonic()
         with pytest.raises(OperationalError):

@@ -24,12 +24,12 @@ def clock():
 
 
 def reap(database, clock):
-    with database.write() as session:
+    with database.write_session() as session:
         return LeaseQueue(session, clock).reap_expired()
 
 
 def finish(database, lease, state=JobState.SUCCEEDED, error=None):
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).finish_job(lease, state, error)
 
 
@@ -82,7 +82,7 @@ def test_no_two_claimers_ever_get_the_same_job(database):
 @pytest.mark.postgres
 def test_a_claimer_does_not_wait_for_a_rival_that_has_not_committed(postgres_database):
     first, second = submit(postgres_database), submit(postgres_database)
-    with postgres_database.write() as slow:
+    with postgres_database.write_session() as slow:
         assert LeaseQueue(slow).claim_job("slow").job.id == first
         assert claim(postgres_database, "quick").job.id == second
         assert claim(postgres_database, "quick") is None
@@ -92,7 +92,7 @@ def test_a_claim_that_is_rolled_back_leaves_the_job_queued(database):
     job_id = submit(database)
 
     def claim_and_crash():
-        with database.write() as session:
+        with database.write_session() as session:
             LeaseQueue(session).claim_job("d1")
             raise ZeroDivisionError
 
@@ -109,7 +109,7 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     claim(database, "d1", clock)  # of the same owner, who has dropped it
     claim(database, "d2", clock)
     clock.advance(7)
-    with database.write() as session:
+    with database.write_session() as session:
         held = LeaseQueue(session, clock).renew_leases(mine)
     assert {one.lease for one in held} == mine
     clock.advance(4)
@@ -124,7 +124,7 @@ def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(data
     asked: list[bool] = []  # for the time, and whether the other writer had come to its end
 
     def hold():
-        with database.write() as session:
+        with database.write_session() as session:
             session.execute(text("UPDATE jobs SET name = 'held'"))
             is_held.set()
             threading.Event().wait(0.2)  # so that the claim waits for it
@@ -145,9 +145,9 @@ def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(data
 
 def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
     got, _ = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(got.job.id)
-    with database.write() as session:
+    with database.write_session() as session:
         (held,) = LeaseQueue(session).renew_leases([got.lease])
     assert held.cancel_requested
 
@@ -156,7 +156,7 @@ def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
     submit(database)
     lost, _ = lose(database, clock)
     claim(database, "silent", clock)  # under a new attempt
-    with database.write() as session:
+    with database.write_session() as session:
         assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
 
 
@@ -164,7 +164,7 @@ def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
     job_id = submit(database)
     claim(database, "d1", clock)
     clock.advance(7)
-    with database.write() as session:
+    with database.write_session() as session:
         assert LeaseQueue(session, clock).renew_leases([]) == ()
     clock.advance(4)
     assert reap(database, clock).requeued == (job_id,)
@@ -181,7 +181,7 @@ def test_the_reaper_leaves_a_living_lease_alone(database, clock):
 def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock):
     submit(database, n_runs=2)
     got = claim(database, "d1", clock)
-    with database.write() as session:
+    with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(NewRun(number=i) for i in range(2))
         first, second = (run.id for run in ledger.list_pending())
@@ -195,7 +195,7 @@ def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock
     ]
     again = claim(database, "d2", clock)
     assert again.lease.attempt == 2
-    with database.write() as session:
+    with database.write_session() as session:
         assert [run.id for run in RunWriter(session, again.lease).list_pending()] == [second]
 
 
@@ -221,7 +221,7 @@ def test_a_job_that_loses_its_lease_too_often_fails_and_says_why(database, clock
 def test_a_job_that_was_to_be_cancelled_is_never_retried(database, clock):
     job_id = submit(database)
     claim(database, "d1", clock)
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(job_id)
     clock.advance(11)
     assert reap(database, clock).cancelled == (job_id,)
@@ -238,7 +238,7 @@ def test_two_reapers_bury_a_job_once(database, clock):
 
 def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
     got, _ = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease)
     job = job_of(database, got.job.id)
     assert (job.state, job.lost_leases, job.lease_owner) == (JobState.QUEUED, 0, None)
@@ -247,7 +247,7 @@ def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
 
 def test_a_job_released_after_a_wish_to_cancel_is_cancelled(database):
     got, _ = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(got.job.id)
         LeaseQueue(session).release_job(got.lease)
     assert state_of(database, got.job.id) is JobState.CANCELLED
@@ -280,30 +280,30 @@ LATE_WRITES = {
 @pytest.mark.parametrize("write", LATE_WRITES.values(), ids=LATE_WRITES)
 def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
     got, (run_id,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session, clock).renew_leases(
             [got.lease]
         )  # in the past of the true clock: it expires
     clock.advance(11)
     assert reap(database, clock).requeued == (got.job.id,)
-    with database.read() as session:
+    with database.read_session() as session:
         before = EventRepository(session).list_after(got.job.id)[-1].id
     for rival in (None, "d2"):  # while it is queued again, and while another has it
         if rival:
             claim(database, rival, clock)
             before += 1
-        with pytest.raises(LeaseLost, match="attempt 1"), database.write() as session:
+        with pytest.raises(LeaseLost, match="attempt 1"), database.write_session() as session:
             write(session, got.lease, run_id)
         (run,) = runs_of(database, got.job.id)
         assert (run.state, run.best_rms, run.attempt) == (JobState.QUEUED, None, 0)
-        with database.read() as session:
+        with database.read_session() as session:
             assert EventRepository(session).list_after(got.job.id)[-1].id == before
 
 
 @pytest.mark.parametrize("end", ENDS)
 def test_a_terminal_state_is_never_overwritten(database, clock, end):
     got, (run_id,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
         LeaseQueue(session).finish_job(got.lease, end, "as told")
     for other in ENDS:
@@ -334,11 +334,11 @@ def test_unfinished_runs_end_with_their_job(database, end):
 def test_progress_is_kept_and_told_and_the_best_never_rises(database):
     got, _ = claimed(database)
     for rms in (0.5, None, 0.2, 0.9):
-        with database.write() as session:
+        with database.write_session() as session:
             LeaseQueue(session).write_progress(got.lease, JobProgress(100, 7, rms, 3.5))
     job = job_of(database, got.job.id)
     assert (job.evaluations, job.generation, job.best_rms, job.seconds_left) == (100, 7, 0.2, 3.5)
-    with database.read() as session:
+    with database.read_session() as session:
         events = EventRepository(session).list_after(got.job.id)
     told = [event.data["best_rms"] for event in events if event.kind == "progress"]
     assert told == [0.5, 0.5, 0.2, 0.2]
@@ -346,7 +346,7 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
 
 def test_the_best_of_an_ended_job_is_that_of_its_results(database):
     got, runs = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).write_progress(
             got.lease, JobProgress(100, 7, 0.2, 3.5)
         )  # fitness, as of soft-l1

@@ -33,7 +33,7 @@ def clock() -> Clock:
 
 
 def announce(database, owner: str, details) -> None:
-    with database.write() as session:
+    with database.write_session() as session:
         told = {LEASE_SECONDS_KEY: LEASE.total_seconds(), **details}
         DispatcherRepository(session).add_dispatcher(owner, told)
 
@@ -56,7 +56,7 @@ def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(dat
     announce(database, "dead", of_a_process_that_has_ended())
     assert reap_jobs(database).requeued == (job,)
     assert state_of(database, job) is JobState.QUEUED
-    with database.read() as session:
+    with database.read_session() as session:
         assert DispatcherRepository(session).list_alive() == []
 
 
@@ -99,7 +99,7 @@ def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back
     reap_jobs(database, clock)
     for _ in range(5):
         clock.advance(3)
-        with database.write() as session:
+        with database.write_session() as session:
             assert [
                 one.lease for one in LeaseQueue(session, clock).renew_leases([held], LEASE)
             ] == [held]
@@ -110,7 +110,7 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
     job = submit(database, n_runs=3, max_attempts=2)
     for number in range(3):
         got = claim(database, "falls", clock)
-        with database.write() as session:
+        with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
             ledger.create_runs(NewRun(number=i) for i in range(3))
             run = ledger.list_pending()[0].id
@@ -122,11 +122,11 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
 
 def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) -> None:
     got, _ = claimed(database, max_attempts=2)
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease, lost=True)
     assert job_of(database, got.job.id).lost_leases == 1
     again = claim(database)
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).release_job(again.lease, lost=True)
     job = job_of(database, got.job.id)
     assert job.state is JobState.FAILED
@@ -135,9 +135,9 @@ def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) 
 
 def test_deaths_over_a_run_outlive_the_dispatcher_that_counted_them(database) -> None:
     got, (run,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).write_kills({run: 1})
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease)
     assert [one.kills for one in runs_of(database, got.job.id)] == [1]
 
@@ -161,7 +161,7 @@ def expired(database, owner: str, details, seconds: float = 0.1) -> str:
     """A job whose owner has told these details, and whose lease has ended since then."""
     job = submit(database)
     announce(database, owner, details)
-    with database.write() as session:
+    with database.write_session() as session:
         ago = timedelta(seconds=-seconds)
         assert LeaseQueue(session).claim_job(owner, ago).job.id == job
     return job
@@ -218,7 +218,7 @@ def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: 
     job = submit(database, max_attempts=2)
     for number in range(4):
         got = claim(database, "falls", clock)
-        with database.write() as session:
+        with database.write_session() as session:
             ledger = RunWriter(session, got.lease)
             ledger.create_runs([NewRun(number=0)])
             ledger.save_checkpoints([(ledger.list_pending()[0].id, 100 * (number + 1), b"state")])
@@ -235,7 +235,7 @@ def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
 ) -> None:
     job = submit(database)
     announce(database, "slow", {LEASE_SECONDS_KEY: 60.0})
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session, clock).claim_job("slow", timedelta(seconds=60))
     assert reap_jobs(database, clock).requeued == ()
     assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
@@ -249,7 +249,7 @@ def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
 
 
 def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: Clock) -> None:
-    with database.write() as session:
+    with database.write_session() as session:
         repository = DispatcherRepository(session, clock)
         repository.add_dispatcher("slow", {LEASE_SECONDS_KEY: 60.0})
         repository.add_dispatcher("quick", {LEASE_SECONDS_KEY: 10.0})
@@ -264,7 +264,7 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
     wrong = utc_now() - timedelta(seconds=1000)
     monkeypatch.setattr("service.storage.columns.utc_now", lambda: wrong)
     job = submit(postgres_database)
-    with postgres_database.write() as session:
+    with postgres_database.write_session() as session:
         assert choose_database_clock(session)() > wrong + timedelta(seconds=500)
         LeaseQueue(session).claim_job("behind")
     monkeypatch.undo()
@@ -274,7 +274,7 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
 
 def save_one(database, got) -> None:
     """Write a checkpoint of a run of the job."""
-    with database.write() as session:
+    with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         ledger.create_runs([NewRun(number=0)])
         ledger.save_checkpoints([(ledger.list_pending()[0].id, 100, b"state")])

@@ -34,12 +34,12 @@ def place(tmp_path):
 
 
 def claim(place):
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         return LeaseQueue(session).claim_job("d1")
 
 
 def claim_again(place, lease):
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         LeaseQueue(session).release_job(lease)
     return claim(place)
 
@@ -55,7 +55,7 @@ def point(run, number):
 def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> None:
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         ledger = RunWriter(session, first.lease)
         ledger.record_outcomes(
             [
@@ -77,7 +77,7 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
     again.finish()
     assert place.job(job).error == "3 of 4 runs failed: as told; otherwise"
     assert place.job(job).evaluations == 730 + state.evaluations
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         told = [one.data for one in EventRepository(session).list_after(job) if one.kind == "log"]
     assert told == [{"message": f"{runs[3]} failed: otherwise"}]
 
@@ -87,7 +87,7 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
 ) -> None:
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         ledger = RunWriter(session, first.lease)
         ledger.append_history([point(run, number) for run in runs for number in range(2)])
         ledger.record_outcomes([RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED)])
@@ -101,7 +101,7 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
         (runs[2], True),
         (runs[3], True),
     ]
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         lengths = [len(RunRepository(session).read_history(run)) for run in runs]
         kept = [(one.run_id, unpack_state(one.state) is None) for one in session.query(Checkpoint)]
     assert lengths == [2, 2, 0, 0]

@@ -22,7 +22,7 @@ RESULT = {
 
 
 def accepted(database, name, run, **more):
-    with database.write() as session:
+    with database.write_session() as session:
         return ReferenceRepository(session).accept_run(name, run, **more).number
 
 
@@ -32,7 +32,7 @@ def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
     assert accepted(database, "tube", runs[1]) == 2  # the one in use
     assert accepted(database, "tube", runs[0]) == 3  # an earlier one again
     accepted(database, "other", runs[2], note="narrow")
-    with database.read() as session:
+    with database.read_session() as session:
         repository = ReferenceRepository(session)
         history = repository.list_history("tube")
         assert [one.run_id for one in history] == [runs[0], runs[1], runs[0]]
@@ -53,7 +53,7 @@ def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database)
     assert accepted(database, "tube", run) == 1  # nothing new is said
     assert accepted(database, "tube", run, note="second") == 2
     assert accepted(database, "tube", run, accepted_by="me", note="second") == 3
-    with database.read() as session:
+    with database.read_session() as session:
         repository = ReferenceRepository(session)
         assert repository.get_latest("tube").number == 3
         assert [one.note for one in repository.list_history("tube")] == [
@@ -69,7 +69,7 @@ def test_references_are_listed_page_by_page_without_the_results_of_their_runs(da
         accepted(database, f"n{number}", runs[0])
         accepted(database, f"n{number}", run)
     found, cursor = [], None
-    with database.read() as session:
+    with database.read_session() as session:
         repository = ReferenceRepository(session)
         for _ in range(3):
             page = repository.list_page(cursor=cursor, limit=2)
@@ -90,7 +90,7 @@ def test_acceptances_at_once_have_numbers_of_their_own(database):
         one.start()
     for one in threads:
         one.join()
-    with database.read() as session:
+    with database.read_session() as session:
         history = ReferenceRepository(session).list_history("tube")
     assert [one.number for one in history] == [6, 5, 4, 3, 2, 1]
     assert {one.run_id for one in history} == set(runs)
@@ -98,7 +98,7 @@ def test_acceptances_at_once_have_numbers_of_their_own(database):
 
 def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_results(database):
     submit(database, n_runs=3)
-    with database.write() as session:
+    with database.write_session() as session:
         lease = LeaseQueue(session).claim_job("d1").lease
         RunWriter(session, lease).create_runs(
             NewRun(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
@@ -109,11 +109,11 @@ def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_resu
         {"state": JobState.FAILED, "error": "diverged"},
         {"state": JobState.SUCCEEDED, "result": {**RESULT, "warnings": []}},
     ]
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, lease).record_outcomes(
             [RunOutcome(run_id=run, **end) for run, end in zip(runs, ends, strict=True)]
         )
-    with database.read() as session:
+    with database.read_session() as session:
         first, last = read_trend_rows(session, lease.job_id, 10)
         assert count_succeeded(session, lease.job_id) == 2
         assert [one.id for one in read_trend_rows(session, lease.job_id, 1)] == runs[:1]

@@ -61,7 +61,7 @@ def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
             old.evaluations,
             old.signals_sha256,
         )
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         told = [one.data.get("message") for one in EventRepository(session).list_latest(job, 20)]
     assert "3 of 5 runs were taken over from earlier runs" in told
     assert place.job(job).evaluations == sum(run.evaluations for run in after)
@@ -87,9 +87,9 @@ def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
 
 def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(place):
     first, before, _ = carried_out(place, **sweep(2))
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         JobRepository(session).delete(first)
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         delete_orphans(session, place.store, older_than=timedelta(0))
     _, after, computed = carried_out(place, **sweep(2))
     assert computed == [run.id for run in after]

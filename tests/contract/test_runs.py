@@ -21,7 +21,7 @@ RESULT = {
 
 
 def record(database, lease, *outcomes, **evidence):
-    with database.write() as session:
+    with database.write_session() as session:
         return RunWriter(session, lease).record_outcomes(outcomes, **evidence)
 
 
@@ -43,7 +43,7 @@ def good(run_id, rms=0.01):
 def sweep(database, cells):
     """A claimed job with these cells; its identifier."""
     submit(database, n_runs=len(cells))
-    with database.write() as session:
+    with database.write_session() as session:
         got = LeaseQueue(session).claim_job("d1")
         RunWriter(session, got.lease).create_runs(
             NewRun(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
@@ -52,13 +52,13 @@ def sweep(database, cells):
 
 
 def numbers(database, job_id, **filters):
-    with database.read() as session:
+    with database.read_session() as session:
         return [run.number for run in RunRepository(session).list_page(job_id, **filters).items]
 
 
 def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
     got, before = claimed(database, n_runs=1500)
-    with database.write() as session:
+    with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(NewRun(number=i) for i in range(1500))
         assert [run.id for run in ledger.list_pending(limit=2000)] == before
@@ -68,7 +68,7 @@ def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
 
 def test_runs_can_be_made_with_their_job(database):
     job_id = submit(database)
-    with database.write() as session:
+    with database.write_session() as session:
         job = JobRepository(session).get(job_id)
         insert_runs(session, job, [NewRun(number=0, cell={"/seed": 3}, seed=3, method="simple")])
     (run,) = runs_of(database, job_id)
@@ -83,7 +83,7 @@ def test_runs_can_be_made_with_their_job(database):
 
 def test_pending_runs_come_in_order_and_in_parts(database):
     got, ids = claimed(database, n_runs=5)
-    with database.write() as session:
+    with database.write_session() as session:
         ledger = RunWriter(session, got.lease)
         first = ledger.list_pending(limit=2)
         rest = ledger.list_pending(limit=9, after=first[-1].number)
@@ -92,7 +92,7 @@ def test_pending_runs_come_in_order_and_in_parts(database):
 
 def test_started_runs_carry_the_attempt_that_started_them(database):
     got, ids = claimed(database, n_runs=2)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).start_runs(ids[:1])
     first, second = runs_of(database, got.job.id)
     assert (first.state, first.attempt) == (JobState.RUNNING, 1)
@@ -103,7 +103,7 @@ def test_started_runs_carry_the_attempt_that_started_them(database):
 def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
     got, (run_id,) = claimed(database)
     assert record(database, got.lease, good(run_id)) == (run_id,)
-    with database.read() as session:
+    with database.read_session() as session:
         run = RunRepository(session).get(run_id)
         (row,) = RunRepository(session).read_table(got.job.id)
     assert run.result == RESULT
@@ -132,7 +132,7 @@ def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(datab
     record(database, got.lease, RunOutcome(run_id=ids[2], state=JobState.FAILED, error="diverged"))
     job = job_of(database, got.job.id)
     assert (job.n_done, job.n_failed, job.best_rms) == (3, 1, 0.2)
-    with database.read() as session:
+    with database.read_session() as session:
         counts = RunRepository(session).count_states(got.job.id)
     assert counts == {
         JobState.QUEUED: 1,
@@ -166,10 +166,10 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
         for number in range(3)
     ]
     migrants = [MigrantPoint(run_id, 0, 1, 0, 1, 0.5)]
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).append_history(points[:4], migrants)
     record(database, got.lease, good(run_id), history=points, migrants=migrants)
-    with database.read() as session:
+    with database.read_session() as session:
         history = RunRepository(session).read_history(run_id)
         log = RunRepository(session).read_migrations(run_id)
     assert [(one.island, one.number) for one in history] == [
@@ -182,21 +182,21 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
 
 def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
     got, (a, b) = claimed(database, n_runs=2)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).save_checkpoints([(a, 10, b"\x00old"), (b, 10, b"b")])
         RunWriter(session, got.lease).save_checkpoints([(a, 20, b"\x00new")])
         assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new", b: b"b"}
     record(database, got.lease, good(b))
-    with database.write() as session:
+    with database.write_session() as session:
         assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new"}
 
 
 def test_the_next_holder_goes_on_from_the_checkpoint(database):
     got, (run_id,) = claimed(database)
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).save_checkpoints([(run_id, 10, b"half way")])
         LeaseQueue(session).release_job(got.lease)
-    with database.write() as session:
+    with database.write_session() as session:
         again = LeaseQueue(session).claim_job("d2")
         assert RunWriter(session, again.lease).read_checkpoints() == {run_id: b"half way"}
 
@@ -205,7 +205,7 @@ def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
     got, _ = claimed(database, n_runs=7)
     seen, cursor = [], None
     while True:
-        with database.read() as session:
+        with database.read_session() as session:
             page = RunRepository(session).list_page(got.job.id, limit=3, cursor=cursor)
         seen += [run.number for run in page.items]
         if (cursor := page.next) is None:
@@ -222,7 +222,7 @@ def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_
     record(database, got.lease, *(good(i, rms) for i, rms in zip(ids, values, strict=True)))
     seen, cursor = [], None
     while True:
-        with database.read() as session:
+        with database.read_session() as session:
             page = RunRepository(session).list_page(
                 got.job.id, limit=2, cursor=cursor, order="best_rms", descending=descending
             )
@@ -265,7 +265,7 @@ def test_filters_hold_together(database):
 
 def test_another_projects_runs_are_not_seen(database):
     got, (run_id,) = claimed(database)
-    with database.read() as session:
+    with database.read_session() as session:
         foreign = RunRepository(session, "proj_other")
         assert foreign.list_page(got.job.id).items == ()
         assert foreign.read_table(got.job.id) == []

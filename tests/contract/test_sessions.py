@@ -14,19 +14,19 @@ from tests.stored import job_of, submit
 
 
 def names(database):
-    with database.read() as session:
+    with database.read_session() as session:
         return set(session.scalars(select(Project.id)))
 
 
 def test_a_writing_session_commits_at_its_end(database):
-    with database.write() as session:
+    with database.write_session() as session:
         session.add(Project(id="proj_a", name="a"))
     assert names(database) == {DEFAULT_PROJECT, "proj_a"}
 
 
 def test_a_writing_session_that_fails_leaves_nothing(database):
     def fail():
-        with database.write() as session:
+        with database.write_session() as session:
             session.add(Project(id="proj_a", name="a"))
             session.flush()
             raise ZeroDivisionError
@@ -37,15 +37,15 @@ def test_a_writing_session_that_fails_leaves_nothing(database):
 
 
 def test_a_reading_session_cannot_write(database):
-    with pytest.raises(DBAPIError, match=r"(?i)read-?only"), database.read() as session:
+    with pytest.raises(DBAPIError, match=r"(?i)read-?only"), database.read_session() as session:
         session.execute(text("DELETE FROM projects"))
-    with database.write() as session:  # and the same connection can, afterwards
+    with database.write_session() as session:  # and the same connection can, afterwards
         session.add(Project(id="proj_a", name="a"))
     assert "proj_a" in names(database)
 
 
 def test_readers_do_not_wait_for_a_writer(database):
-    with database.write() as session:
+    with database.write_session() as session:
         session.add(Project(id="proj_a", name="a"))
         session.flush()
         assert names(database) == {DEFAULT_PROJECT}
@@ -56,7 +56,7 @@ def test_writers_wait_for_each_other_and_none_is_lost(database):
 
     def raise_priority():
         for _ in range(10):
-            with database.write() as session:
+            with database.write_session() as session:
                 lock = select(Job).where(Job.id == job_id).with_for_update()
                 session.scalars(lock).one().priority += 1
 
@@ -69,15 +69,15 @@ def test_writers_wait_for_each_other_and_none_is_lost(database):
 
 
 def test_foreign_keys_are_kept(database):
-    with pytest.raises(IntegrityError), database.write() as session:
+    with pytest.raises(IntegrityError), database.write_session() as session:
         session.add(Job(id="job_1", project_id="proj_none", name="", spec={}, n_runs=1))
 
 
 def test_a_moment_comes_back_in_utc_to_the_microsecond(database):
     moment = datetime(2026, 3, 1, 12, 0, 0, 123456, timezone(timedelta(hours=9)))
-    with database.write() as session:
+    with database.write_session() as session:
         session.add(Project(id="proj_a", name="a", created_at=moment))
-    with database.read() as session:
+    with database.read_session() as session:
         kept = session.get_one(Project, "proj_a").created_at
         later = select(Project.id).where(Project.created_at > moment - timedelta(seconds=1))
         assert "proj_a" in session.scalars(later).all()
@@ -87,20 +87,20 @@ def test_a_moment_comes_back_in_utc_to_the_microsecond(database):
 
 def test_a_moment_without_time_zone_is_refused(database):
     naive = datetime(2026, 3, 1)  # noqa: DTZ001 - what is to be refused
-    with pytest.raises(UnstorableValue, match="no time zone"), database.write() as session:
+    with pytest.raises(UnstorableValue, match="no time zone"), database.write_session() as session:
         session.add(Project(id="proj_a", name="a", created_at=naive))
 
 
 def test_nothing_is_null_and_not_a_document(database):
-    with database.write() as session:
+    with database.write_session() as session:
         session.add(ApiKey(id="key_1", project_id=DEFAULT_PROJECT, name="", digest="d", scopes=[]))
-    with database.read() as session:
+    with database.read_session() as session:
         assert session.get_one(ApiKey, "key_1").expires_at is None
         assert session.scalar(text("SELECT count(*) FROM runs WHERE result IS NULL")) == 0
 
 
 def test_sqlite_runs_as_agreed(sqlite_database):
-    with sqlite_database.read() as session:
+    with sqlite_database.read_session() as session:
         pragmas = {
             name: session.scalar(text(f"PRAGMA {name}"))
             for name in ("journal_mode", "synchronous", "busy_timeout", "foreign_keys")

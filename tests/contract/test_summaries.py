@@ -24,7 +24,7 @@ METHOD = GroupKey("axis", "/algorithm/method")
 def filled(database, cells, values):
     """A job with these cells, whose runs gave these values; None: the run failed."""
     submit(database, n_runs=len(cells))
-    with database.write() as session:
+    with database.write_session() as session:
         got = LeaseQueue(session).claim_job("d1")
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(
@@ -50,13 +50,13 @@ def filled(database, cells, values):
         )
         for i, (run, value) in enumerate(zip(runs_of(database, got.job.id), values, strict=True))
     ]
-    with database.write() as session:
+    with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes(outcomes)
     return got.job.id
 
 
 def summary(database, job, keys, *quantities, limit=100):
-    with database.read() as session:
+    with database.read_session() as session:
         return read_groups(session, job, keys, quantities, limit)
 
 
@@ -166,7 +166,7 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
     ]
     values = [0.1, 0.1, 0.1, 4.0, 2.0, None, 0.1, 0.1, 0.1, 5.0, 6.0, 5.0]
     job = filled(database, cells, values)
-    with database.read() as session:
+    with database.read_session() as session:
         found = [
             find_quietest_run(session, job, cell).number
             for cell in ({}, {"/model": "tube"}, {"/model": {"name": "own"}})
@@ -177,19 +177,19 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
 
 def test_groups_of_a_job_are_not_told_to_another_project(database):
     job = filled(database, [{"/noise/sigma": 0.0}], [1.0])
-    with database.read() as session:
+    with database.read_session() as session:
         assert read_groups(session, job, [SIGMA], [SummaryQuantity("rms")], 10, "proj_other") == []
 
 
 def test_floors_are_written_under_the_lease_only(database):
     submit(database, n_runs=1)
-    with database.write() as session:
+    with database.write_session() as session:
         lease = LeaseQueue(session).claim_job("d1").lease
         LeaseQueue(session).write_floors(lease, {"axes": [], "problems": []})
-    with database.read() as session:
+    with database.read_session() as session:
         assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}
     late = Lease(lease.job_id, lease.attempt + 1, "d2")
-    with database.write() as session, pytest.raises(LeaseLost):
+    with database.write_session() as session, pytest.raises(LeaseLost):
         LeaseQueue(session).write_floors(late, {"axes": ["late"], "problems": []})
-    with database.read() as session:
+    with database.read_session() as session:
         assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}

@@ -48,11 +48,11 @@ def test_jobs_that_come_back_wake_too(database):
     got, _ = claimed(database)
     with open_notifier(database) as waker:
         settle(waker)
-        with database.write() as session:
+        with database.write_session() as session:
             LeaseQueue(session).release_job(got.lease)
         assert waker.wait_for_change(LONG)
         settle(waker)
-        with database.write() as session:
+        with database.write_session() as session:
             JobRepository(session).cancel(got.job.id)
             JobRepository(session).resume(got.job.id)
         assert waker.wait_for_change(LONG)
@@ -78,7 +78,7 @@ def test_a_stop_ends_the_wait(database):
 def test_a_broken_connection_is_replaced(postgres_database):
     with open_notifier(postgres_database) as waker:
         settle(waker)
-        with postgres_database.write() as session:
+        with postgres_database.write_session() as session:
             session.execute(
                 text(
                     "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "

@@ -116,10 +116,10 @@ def test_an_earlier_run_seeds_all_cells_and_its_values_are_part_of_the_hash(plac
 def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
     (first,), _ = carried_out(place)
     (second,), _ = carried_out(place, seed=2)
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         accept_reference(session, "tube", ReferenceIn(run=first.id, by="me"))
     job = place.submit(warm_start="reference:tube")
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         told = accept_reference(session, "tube", ReferenceIn(run=second.id))
     assert place.job(job).spec["warm_start"] == first.id
     assert (told.run, [one.run for one in told.history]) == (second.id, [first.id])
@@ -136,7 +136,7 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
 )
 def test_a_warm_start_that_is_not_there_is_told(place, warm, said):
     (first,), _ = carried_out(place)
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         accept_reference(session, "tube", ReferenceIn(run=first.id))
     with pytest.raises(InvalidRequest) as caught:
         place.submit(warm_start=warm)
@@ -166,7 +166,7 @@ SEEDS = {"path": "/seed", "values": [1, 2, 3, 4]}
 def before_the_first_wait(place, body):
     """Numbers of the runs that come before one waits for another."""
     place.submit(**{"algorithm": QUICK, **body})
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
     numbers = {run.id: run.number for run in place.runs(claim.job.id)}
     coming = takewhile(
@@ -213,14 +213,14 @@ def test_runs_that_begin_cold_do_not_wait_beside_those_that_follow_one_another(p
 def statements_behind(place, n_failed):
     """SQL statements that it takes to learn what the last of a chain begins with."""
     job = place.submit(**chained({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK))
-    with place.database.write() as session:
+    with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
         rows = RunWriter(session, claim.lease).list_pending()
         rows[0].state, rows[0].estimates = JobState.SUCCEEDED, {"T": {"value": 2.0, "stderr": None}}
         for row in rows[1:-1]:
             row.state = JobState.FAILED
     seen = []
-    with place.database.read() as session:
+    with place.database.read_session() as session:
         engine = session.get_bind()
     event.listen(engine, "before_cursor_execute", lambda *told: seen.append(told[2]))
     (last,) = JobRuns(place.database, claim, place.store).iterate_runs()

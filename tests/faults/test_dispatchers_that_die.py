@@ -21,7 +21,7 @@ N_JOBS, N_RUNS = 24, 2
 
 
 def _work_on(database, claim, trouble):
-    with database.write() as session:
+    with database.write_session() as session:
         ledger = RunWriter(session, claim.lease)
         ledger.create_runs(NewRun(number=i) for i in range(N_RUNS))
         pending = ledger.list_pending()
@@ -37,9 +37,9 @@ def _work_on(database, claim, trouble):
             best_rms=float(run.number + 1),
             result={"by": claim.lease.owner, "attempt": claim.lease.attempt},
         )
-        with database.write() as session:
+        with database.write_session() as session:
             RunWriter(session, claim.lease).record_outcomes([outcome])
-    with database.write() as session:
+    with database.write_session() as session:
         LeaseQueue(session).finish_job(claim.lease, JobState.SUCCEEDED)
 
 

@@ -162,11 +162,11 @@ def test_many_small_chunks_are_counted_together() -> None:
 @pytest.mark.parametrize(
     ("records", "words"),
     [
-        ((MESSAGE,), "names channel 1"),
-        ((replace(CHANNEL, schema_id=3),), "names schema 3"),
-        ((CHANNEL, replace(CHANNEL, topic="/b")), "a second time"),
-        ((Schema(0, b"", "", ""),), "not free"),
-        ((Schema(1, b"", "", "a"), Schema(1, b"", "", "b")), "not free"),
+        ((MESSAGE,), "refers to channel 1"),
+        ((replace(CHANNEL, schema_id=3),), "refers to schema 3"),
+        ((CHANNEL, replace(CHANNEL, topic="/b")), "with another definition"),
+        ((Schema(0, b"", "", ""),), "not available"),
+        ((Schema(1, b"", "", "a"), Schema(1, b"", "", "b")), "not available"),
         ((Schema(1, bytes(2 * ONE_MIB), "", "a"),), "at most 1048576"),
         ((CHANNEL, replace(MESSAGE, log_time=2**63)), "2⁶³"),
         ((chunk_of(b"", "brotli", b""),), "'brotli'"),

@@ -58,7 +58,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
             }
         )
         job = submit.submit_job(parts.database, body, settings).id
-        with parts.database.write() as session:
+        with parts.database.write_session() as session:
             claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
         assert claim is not None
         _end(parts.database, claim)

@@ -177,7 +177,7 @@ def test_starts_are_told_apart_from_dispatchers_that_were_lost(
     page = client.get(f"/jobs/{filled.finished}").text
     assert "<dt>Started</dt>" in page
     assert "dispatchers lost" not in page
-    with parts.database.write() as session:
+    with parts.database.write_session() as session:
         session.get(Job, filled.finished).lost_leases = 1
     page = client.get(f"/jobs/{filled.finished}").text
     assert "1 of at most 3 dispatchers lost" in page

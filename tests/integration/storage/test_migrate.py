@@ -37,7 +37,7 @@ def test_going_down_removes_every_table_and_up_again_brings_them_back(empty_data
 
 
 def test_a_new_database_has_the_default_project(database):
-    with database.read() as session:
+    with database.read_session() as session:
         assert [one.id for one in session.query(Project)] == ["proj_default"]
 
 
@@ -160,7 +160,7 @@ def test_a_second_revision_carries_the_rows_over_and_back(database, revisions):
     assert copies(database) == ["default"]
     migrate.downgrade_database(database, "0001")
     assert columns(database) == before
-    with database.read() as session:
+    with database.read_session() as session:
         assert [one.name for one in session.query(Project)] == ["default"]
     assert migrate.list_differences(database) == []
 

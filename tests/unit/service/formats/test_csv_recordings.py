@@ -39,7 +39,7 @@ def test_the_time_column_goes_by_several_names(name: str) -> None:
 def test_times_in_another_unit_become_seconds(unit: str, row: float, seconds: float) -> None:
     recording, notes = read_csv(f"t [{unit}],u\n0,1\n{row},2\n{2 * row},3\n".encode())
     assert recording.channel("u").times.tolist() == [0.0, seconds, 2 * seconds]
-    told = f"times were converted from {unit} to s: lags and time constants are in s"
+    told = f"times were converted from {unit} to s: delays and time constants are in s"
     assert notes == (() if unit == "Sec" else (told,))
 
 
@@ -160,7 +160,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
         ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),
-        ("t,u\n0,1,5\n2,2,5\n", "if commas are decimal here, part the columns by semicolons"),
+        ("t,u\n0,1,5\n2,2,5\n", "if commas are decimal signs, separate the columns by semicolons"),
         ("t,u\n0,nan\n1,\n", "every value is missing"),
         ("t,u\n0,1\nnan,2\n", "the time is missing"),
         ("t,u\n0,1\n,2\n", "the time is missing"),
@@ -187,7 +187,7 @@ def test_a_row_without_end_is_refused_before_it_fills_the_memory() -> None:
 
 
 def test_time_told_twice_or_wrongly_is_refused() -> None:
-    assert "leave one out" in refused("t,u\n0,1\n", sample_time=0.1).detail
+    assert "remove one of them" in refused("t,u\n0,1\n", sample_time=0.1).detail
     assert "positive" in refused("u,y\n0,1\n", sample_time=0.0).detail
 
 

@@ -301,7 +301,9 @@ def test_a_model_without_a_rule_stays_as_it_is() -> None:
 
 
 def test_more_candidates_than_samples_are_refused() -> None:
-    with pytest.raises(InvalidSettings, match="14 candidates cannot be distinguished with 9 samples"):
+    with pytest.raises(
+        InvalidSettings, match="14 candidates cannot be distinguished with 9 samples"
+    ):
         select_model_terms(parse_model(document(frols(3))), [record_of(TRUTH, samples=11)])
 
 

@@ -207,7 +207,9 @@ def test_no_record_and_a_constant_output_among_several_are_refused() -> None:
 
 
 def test_a_record_shorter_than_the_largest_lag_is_refused() -> None:
-    with pytest.raises(RecordTooShort, match=r"lasts 0\.25 s, but the delay of 'x' needs more than"):
+    with pytest.raises(
+        RecordTooShort, match=r"lasts 0\.25 s, but the delay of 'x' needs more than"
+    ):
         Problem.build(duffing(), [record(6)])
     with pytest.raises(RecordTooShort, match=r"the delay of 'u' needs more than 0\.4 s"):
         Problem.build(lag_element(), [record(6)])
@@ -267,7 +269,11 @@ def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
 @pytest.mark.parametrize(
     ("initial", "name", "told"),
     [
-        (0, "x(0)", "an initial state is a parameter if the model's document gives it bounds, initial: {x: {"),
+        (
+            0,
+            "x(0)",
+            "an initial state is a parameter if the model's document gives it bounds, initial: {x: {",
+        ),
         (
             {"lower": -1, "upper": 1},
             "x(0)[2]",
