@@ -1,1 +1,1 @@
-"""Simulate a run, closed loops."""
+"""Simulation of runs and closed loops."""

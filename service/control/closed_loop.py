@@ -1,4 +1,4 @@
-"""The loop that a request closes around a run's model: its controller, and what is told of it."""
+"""Closed-loop simulation of a run's model with a PID controller, and its answer."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel
 from sysid.models.model import Model
 
-if TYPE_CHECKING:  # the compiler comes with these, and most requests never need it
+if TYPE_CHECKING:  # these import the compiler, which most requests never need
     from sysid.control.controllers import PidControl, Transport
     from sysid.control.linear_form import IdentifiedModel
 
 
-_REST_TOLERANCE = 0.02  # of a step: what moves or differs by less is at rest
+_REST_TOLERANCE = 0.02  # of a step: smaller movements count as rest
 _LIMIT_TOLERANCE = 1e-9  # of the limit
 _START_ADVICE = (
     "the step metrics include its settling. Give the initial states, such as x(0), "
@@ -38,7 +38,7 @@ _START_ADVICE = (
 
 @dataclass(frozen=True, slots=True)
 class LoopResponse:
-    """What a closed loop does: outputs, what enters the plant, what the controller gives."""
+    """Response of a closed loop: outputs, plant input, controller command, and their assessment."""
 
     outputs: list[Channel]
     plant_input: Channel
@@ -58,21 +58,21 @@ def simulate_closed_loop(
     inputs: Sequence[Channel],
     control: ControlIn,
 ) -> LoopResponse:
-    """The model in the loop.
+    """Simulate the model in a closed loop.
 
     Parameters
     ----------
     values : mapping of str to float
-        Of the model's parameters and starts.
+        Values of the model's parameters and initial states.
     times : FloatArray, shape (N,)
-        In s.
+        Sampling times in s.
     inputs : sequence of Channel
-        Those that are not controlled.
+        The inputs that are not controlled.
 
     Raises
     ------
     InvalidRequest
-        If the controller cannot be, or the loop diverges.
+        If the controller is invalid, or the loop diverges.
     """
     from sysid.control.closed_loop import close_loop
 
@@ -107,7 +107,7 @@ def simulate_closed_loop(
 
 
 def find_control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
-    """Signals that the model has not, and a controller by hand and by a rule at once."""
+    """Report unknown signals, and a controller that is set both by hand and by a tuning rule."""
     for role, name, signals in (
         ("input", control.input, [one.name for one in model.inputs]),
         ("output", control.output, [one.name for one in model.outputs]),
@@ -152,7 +152,7 @@ def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedM
 def _build_controller(
     identified: "IdentifiedModel", control: ControlIn
 ) -> tuple["PidControl", TuningOut | None]:
-    """The controller, its numbers given or by a rule."""
+    """Build the controller from its settings or from a tuning rule."""
     from sysid.control.controllers import PidControl, Transport
 
     transport = None if control.transport is None else Transport(**control.transport.model_dump())
@@ -214,7 +214,7 @@ def _tune_controller(
 
 
 def _compute_margins(identified: "IdentifiedModel", control: "PidControl") -> MarginsOut | None:
-    """Margins, where the model has a transfer function in s."""
+    """Compute the stability margins if the model has a transfer function in s."""
     from sysid.control.linear_form import NotLinear
     from sysid.control.margins import compute_margins
 
@@ -251,7 +251,10 @@ def _check_loop_finite(
     *,
     is_tuned: bool,
 ) -> None:
-    """Refuse a loop that diverges: its gain is to blame, or steps (s) too long for a stable one."""
+    """Refuse a loop that diverges.
+
+    The cause is its gain, or simulation steps (s) that are too long for a stable loop.
+    """
     try:
         check_finite_outputs(outputs, times)
     except InvalidRequest as error:
@@ -273,7 +276,7 @@ def _check_loop_finite(
 def _compute_step_metrics(
     times: FloatArray, outputs: Sequence[Channel], control: ControlIn
 ) -> StepMetricsOut | None:
-    """Judge the controlled output, if the reference is a step."""
+    """Compute the step metrics of the controlled output if the reference is a step."""
     from sysid.control.step_response import measure_step_response
 
     if not isinstance(control.reference, StepInput):
@@ -296,7 +299,7 @@ def _describe_tuning(tuning: TuningOut) -> Iterator[str]:
 def _describe_start(
     times: FloatArray, outputs: Sequence[Channel], control: ControlIn
 ) -> Iterator[str]:
-    """What to mind where the loop may not be at rest when its reference steps."""
+    """Warn if the loop may not be at rest when its reference steps."""
     if not isinstance(control.reference, StepInput):
         return
     step = control.reference
@@ -319,7 +322,7 @@ def _describe_start(
 def _describe_stability(
     metrics: StepMetricsOut | None, margins: MarginsOut | None, controller: ControllerOut
 ) -> Iterator[str]:
-    """That a loop is unstable or keeps swinging, said plainly."""
+    """Report a loop that is unstable or keeps oscillating."""
     if metrics is not None and metrics.swing is not None:
         unit = plain_unit(metrics.unit)
         decays = margins is not None and margins.is_stable and not controller.saturated_percent

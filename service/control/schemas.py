@@ -1,4 +1,4 @@
-"""What is sent and told when an identified model is simulated."""
+"""Bodies and answers of simulations of an identified model."""
 
 from pydantic import Field
 
@@ -15,7 +15,10 @@ from sysid.control.tuning import ControllerKind, TuningRule
 
 
 class TransportIn(Body):
-    """gain · e^(-delay s) / (time_constant s + 1) between controller and plant; times in s."""
+    """Transfer function between controller and plant, gain · e^(-delay s) / (time_constant s + 1).
+
+    Times are in s.
+    """
 
     gain: float = 1.0
     time_constant: float = Field(default=0.0, ge=0)
@@ -23,10 +26,10 @@ class TransportIn(Body):
 
 
 class TuningIn(Body):
-    """A rule that chooses gain and times: for linear models in the differential form.
+    """Rule that chooses gain and times of the controller, for linear differential models.
 
-    `closed_loop_time_constant` (τ_c in s) is that of SIMC, the effective dead time if it is not
-    given: longer is slower and more robust.
+    `closed_loop_time_constant` (τ_c in s) is that of SIMC. By default it is the effective dead
+    time. A longer one gives a slower and more robust loop.
     """
 
     rule: TuningRule = "simc"
@@ -35,16 +38,18 @@ class TuningIn(Body):
 
 
 class ControlIn(Body):
-    """A controller in the standard (ISA) form, r the `reference` and y the `output`.
+    """Controller in the standard (ISA) form, with r the `reference` and y the `output`.
 
-    v = gain · (setpoint_weight · r - y + 1/integral_time ∫(r - y) dt + derivative), `input` := v
-    within ± `limit`, or from `lower` to `upper`. Times in s; without `integral_time` and
-    `derivative_time` it is proportional control. The derivative is
-    derivative_time · s/(1 + s · derivative_time/derivative_filter) of -y, or of r - y with
-    `derivative_on` error. At a limit the integral is led back with `tracking_time`, by default
-    √(integral_time · derivative_time), or integral_time without derivative. Instead of gain and
-    times give `tuning`. Around a model in the differential form the controller is continuous,
-    around a recursion it acts once a step.
+    v = gain · (setpoint_weight · r - y + 1/integral_time ∫(r - y) dt + derivative). The `input` is
+    v, limited to ± `limit`, or to `lower` … `upper`. Times are in s. Without `integral_time` and
+    `derivative_time` it is proportional control.
+
+    The derivative is derivative_time · s/(1 + s · derivative_time/derivative_filter) of -y. With
+    `derivative_on` error it acts on r - y. At a limit `tracking_time` resets the integral. Its
+    default is √(integral_time · derivative_time), or integral_time without derivative.
+
+    Instead of gain and times, `tuning` names a rule. Around a differential model the controller is
+    continuous. Around a recursion it acts once a step.
     """
 
     input: str
@@ -77,11 +82,11 @@ _EXAMPLE_CONTROL = {
 
 
 class RunSimulateIn(Body):
-    """A run's model on new inputs or in a closed loop, from t = 0 on.
+    """Simulation of a run's model with new inputs or in a closed loop, from t = 0.
 
-    `parameters` replace what was identified; a state's start may be given as ``x(0)``, and one
-    that the model does not start itself starts at zero. `sample_time` is that of the run's first
-    dataset if it is not given.
+    `parameters` replace estimates. An initial state is given as ``x(0)``. Initial states that the
+    model does not fix are zero by default. The default `sample_time` is that of the run's first
+    dataset.
     """
 
     inputs: dict[str, RunInputIn] = Field(default={})
@@ -94,16 +99,20 @@ class RunSimulateIn(Body):
 
 
 class StepMetricsOut(Answer):
-    """What the response to a step of the reference is judged by; null where it never happens.
+    """Metrics of a step response; null where the event never happens.
 
-    `settling_time` is when the output last enters `band` (2 % of the step) around its mean over
-    the last tenth of the record (`final_value`), and null where `is_settled` is false: it leaves
-    the band in that tenth still. `steady_error` is the reference minus that mean.
-    `overshoot_percent` is told of the reference, `overshoot_of_final_percent` and `rise_time`
-    (10 to 90 %) of the way from where the output stood to that mean. Of a loop that `runs_away`,
-    which leaves the reference farther and farther behind, none of these is told. `iae` and `itae`
-    are ∫|e| dt and ∫t |e| dt of the error e from the step to the end, in `unit` times s and s².
-    `swing` (peak to peak) and `swing_period` (s) tell of an output that keeps swinging.
+    `settling_time` is when the output last enters `band` (2 % of the step) around `final_value`.
+    This is the mean over the last tenth of the record. `is_settled` is false if the output leaves
+    the band within that tenth; `settling_time` is then null. `steady_error` is the reference minus
+    `final_value`.
+
+    `overshoot_percent` refers to the reference. `overshoot_of_final_percent` and `rise_time` (10 to
+    90 %) refer to the change from the initial output to `final_value`. They are null for a loop
+    that `runs_away`, that is, leaves the reference further and further behind.
+
+    `iae` and `itae` are ∫|e| dt and ∫t |e| dt of the error e from the step to the end. Their units
+    are `unit` times s and s². `swing` (peak to peak) and `swing_period` (s) describe a sustained
+    oscillation.
     """
 
     output: str
@@ -124,10 +133,10 @@ class StepMetricsOut(Answer):
 
 
 class ControllerOut(Answer):
-    """The controller as it was used, chosen by hand or by a rule, and what it gave.
+    """Controller as it was used, set by hand or by a rule, and its command.
 
-    Times in s. `tracking_time` is null where nothing winds up; `saturated_percent` of the samples
-    are at a limit.
+    Times are in s. `tracking_time` is null without anti-windup. `saturated_percent` is the share of
+    samples at a limit.
     """
 
     gain: float
@@ -145,10 +154,10 @@ class ControllerOut(Answer):
 
 
 class TuningOut(Answer):
-    """What a tuning rule was given and where it was published.
+    """Process that a tuning rule used, and the rule's source.
 
-    The process is gain e^(-delay s)/((time_constant s + 1)(second_time_constant s + 1)), where
-    more time constants are halved into these (half rule); without `time_constant` it integrates,
+    The process is gain e^(-delay s)/((time_constant s + 1)(second_time_constant s + 1)). Further
+    time constants are included by the half rule. Without `time_constant` the process integrates,
     and `process_gain` is per s.
     """
 
@@ -164,10 +173,11 @@ class TuningOut(Answer):
 
 
 class MarginsOut(Answer):
-    """Stability and margins of the loop without limits, dead times as they are; null: none.
+    """Stability and margins of the loop without limits and with exact dead times.
 
-    `gain_margin` is a factor, below 1 of a loop that needs its gain, `phase_margin` in degrees,
-    `delay_margin` in s, `crossover_frequency` in rad/s, `sensitivity_peak` (M_s) usually 1.2 to 2.
+    Null means that there is no such margin. `gain_margin` is a factor; below 1 the loop needs its
+    gain to be stable. `phase_margin` is in degrees, `delay_margin` in s, `crossover_frequency` in
+    rad/s. `sensitivity_peak` (M_s) is usually 1.2 to 2.
     """
 
     is_stable: bool
@@ -179,7 +189,7 @@ class MarginsOut(Answer):
 
 
 class RunSimulationOut(Answer):
-    """What a run's model does: signals reduced so that extremes stay visible."""
+    """Simulated signals of a run's model, reduced so that extremes stay visible."""
 
     id: str
     parameters: dict[str, float]

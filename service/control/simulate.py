@@ -1,4 +1,4 @@
-"""Use case: the model of a run simulated on new inputs, or in a loop that is closed around it."""
+"""Use case: simulate the model of a run with new inputs, or in a closed loop."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from sysid.models.model import FixedInitial, Model
 
 @dataclass(frozen=True, slots=True)
 class _SimulationRequest:
-    """What a request asks of a run, looked up."""
+    """Simulation request with model, values and signals resolved."""
 
     model: Model
     values: dict[str, float]
@@ -45,7 +45,7 @@ class _SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class _SimulationResult:
-    """What the model does, and what is to be said of it."""
+    """Simulated signals, and notes about them."""
 
     outputs: list[Channel]
     inputs: list[Channel]
@@ -56,7 +56,7 @@ class _SimulationResult:
 def simulate_run(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, max_points: int
 ) -> RunSimulationOut:
-    """Simulate a run's model; with `store`, what comes out becomes a dataset.
+    """Simulate a run's model. With `store` the result becomes a dataset.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def _read_request(
 
 
 def _describe_early_inputs(model: Model, given: Sequence[Channel], period: float) -> list[str]:
-    """What to say of signals from before t = 0: the solver begins where the first of them does."""
+    """Report signals from before t = 0. The solver begins where the first of them begins."""
     first = min(given, key=lambda one: float(one.times[0]), default=None)
     if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
         return []
@@ -138,10 +138,10 @@ def _describe_early_inputs(model: Model, given: Sequence[Channel], period: float
 def _choose_sample_time(
     session: Session, stored: StoredRun, body: RunSimulateIn
 ) -> tuple[float, list[str]]:
-    """The sampling period in s, and what is to be said of it."""
+    """Choose the sampling period in s, with notes about it."""
     try:
         known = DatasetRepository(session).get(stored.body["datasets"][0]).sample_time
-    except StorageError:  # it was deleted since; the run can still be simulated
+    except StorageError:  # deleted since; the run can still be simulated
         known = None
     period = body.sample_time or known
     if period is None:
@@ -164,7 +164,7 @@ def _choose_sample_time(
 
 
 def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
-    """Value of every parameter and of every start that the model does not fix."""
+    """Collect the values of all parameters and of all initial states that the model leaves open."""
     model = stored.model
     rest = {
         f"{state.name}(0)": 0.0
@@ -173,7 +173,7 @@ def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, 
     }
     own = {parameter.name for parameter in model.parameters}
     found = {p["name"]: p["value"] for p in stored.estimates if p["name"] in own}
-    # What is tied follows the parameters it is tied to, unless a value is given for itself.
+    # A tied parameter follows its expression, unless the request gives it a value.
     tied = {p["name"] for p in stored.estimates if p["status"] == "tied"} if given else set()
     by_document = {p.name for p in model.parameters if p.tied is not None}
     kept = {name: value for name, value in found.items() if name not in tied & by_document}
@@ -181,7 +181,7 @@ def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, 
 
 
 def _simulate_open_loop(asked: _SimulationRequest) -> list[Channel]:
-    # The compiler comes with this import, and most requests never need it.
+    # This imports the compiler, which most requests never need.
     from sysid.simulation.simulate import simulate as simulated
 
     found = simulated(asked.model, asked.inputs, asked.values, times=asked.times).channels
@@ -213,7 +213,7 @@ def _store_simulation(
     found: _SimulationResult,
     reference: Channel | None,
 ) -> DatasetOut:
-    """The simulation as a dataset that knows its run; the same request gives the same one."""
+    """Store the simulation as a dataset of its run. The same request gives the same dataset."""
     request = body.model_dump(mode="json", exclude={"name", "store"})
     key = hash_source({"run": run_id, "simulation": request, "values": asked.values})
     with database.read_session() as session:
@@ -258,7 +258,7 @@ def _find_input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError
     if body.control is not None:
         found = list(find_control_faults(model, body.control))
         yield from found
-        if found:  # which inputs are still to be given is not known then
+        if found:  # the missing inputs are unknown then
             return
     for name in body.inputs:
         if name not in known:

@@ -1,4 +1,4 @@
-"""What the dispatcher makes beside its turns: documents of ended jobs, in a thread of their own."""
+"""Background thread of the dispatcher, which builds documents of ended jobs."""
 
 import logging
 import threading
@@ -17,7 +17,7 @@ STOP_SECONDS = 2.0
 
 Key = TypeVar("Key", bound=Hashable)
 DocumentSteps = Iterator[Document | None]
-"""The making of a document, step by step: the last thing it gives is the document."""
+"""Steps that build a document. The last value is the document."""
 DocumentMaker = Callable[[], DocumentSteps]
 
 
@@ -29,10 +29,10 @@ class _BackgroundJob:
 
 
 class BackgroundJobs(Generic[Key]):
-    """One thread for all jobs: each has a step in turn, so that a short one is not held up.
+    """One thread for all jobs. Each job gets one step in turn, so that short ones are not delayed.
 
-    Compiling a model takes a tenth of a second and simulating a long record more; the workers must
-    be fed meanwhile.
+    Compiling a model takes a tenth of a second, and simulating a long record takes more. Meanwhile
+    the dispatcher must keep the workers busy.
     """
 
     def __init__(self) -> None:
@@ -46,11 +46,11 @@ class BackgroundJobs(Generic[Key]):
 
     @property
     def pending_keys(self) -> tuple[Key, ...]:
-        """Keys whose documents were begun, and neither taken nor dropped."""
+        """Keys of documents that were started and neither taken nor cancelled."""
         return tuple(self._making)
 
     def start_job(self, key: Key, make: DocumentMaker) -> None:
-        """Make a document for that key."""
+        """Start to build the document of a key."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run_jobs, name="aside", daemon=True)
             self._thread.start()
@@ -58,21 +58,21 @@ class BackgroundJobs(Generic[Key]):
         self._queue.put(one)
 
     def list_done(self) -> tuple[Key, ...]:
-        """Keys whose documents are there to be taken."""
+        """List the keys of finished documents."""
         return tuple(key for key, one in self._making.items() if one.future.done())
 
     def take_result(self, key: Key) -> Document | None:
-        """The document that was made; whatever its making raised is raised here."""
+        """Take the finished document. An error of its steps is raised here."""
         return self._making.pop(key).future.result()
 
     def cancel_job(self, key: Key) -> None:
-        """The document is no longer wanted."""
+        """Cancel a document."""
         one = self._making.pop(key, None)
         if one is not None:
             one.future.cancel()
 
     def stop(self) -> None:
-        """Make nothing more."""
+        """Stop the thread."""
         self._ending.set()
         self._queue.put(None)
         if self._thread is not None:
@@ -86,7 +86,7 @@ class BackgroundJobs(Generic[Key]):
                 one.latest = next(one.steps)
             except StopIteration:
                 _set_outcome(one, None)
-            except Exception as error:  # noqa: BLE001 - the thread's border: raised where it is taken
+            except Exception as error:  # noqa: BLE001 - border of the thread: `take_result` raises it
                 _set_outcome(one, error)
             else:
                 self._queue.put(one)

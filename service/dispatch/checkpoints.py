@@ -1,4 +1,4 @@
-"""A run's state as bytes in SQL. Only this program writes and reads them, in its own database."""
+"""Serialisation of a run's state for SQL. Only this program reads and writes it."""
 
 import pickle
 import zlib
@@ -10,12 +10,12 @@ _HEADER = f"lagid {version('lagid')} run state 1\n".encode()
 
 
 def pack_state(state: RunState) -> bytes:
-    """The state as bytes, headed by the version that can read them."""
+    """Serialise the state, with a header for the version that can read it."""
     return _HEADER + zlib.compress(pickle.dumps(state, protocol=5), level=1)
 
 
 def unpack_state(data: bytes | None) -> RunState | None:
-    """The state, or None if there is none or another version wrote it: the run starts anew."""
+    """Restore the state; None if there is none or another version wrote it."""
     if data is None or not data.startswith(_HEADER):
         return None
     state = pickle.loads(zlib.decompress(data[len(_HEADER) :]))

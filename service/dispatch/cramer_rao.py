@@ -1,10 +1,11 @@
-"""What the runs of a job with noise are measured by: true values, and the Cramér–Rao floor.
+"""Reference values and Cramér–Rao bounds for the runs of a job with noise.
 
-A job may pose several problems (axes over datasets or bounds, say); each has a truth of its own.
-σ enters in proportion, so one floor a problem serves every σ. It is made here, in the dispatcher
-and when all runs of the job are over, so that the web process need not compute (decision 15); in a
-thread of its own, problem by problem, so that the workers are fed
-meanwhile (`service.dispatch.background`).
+A job may have several problems, for example axes over datasets or bounds. Each has its own true
+values. Bounds are proportional to σ, so one bound per problem serves every σ.
+
+The dispatcher computes them when all runs of the job have ended, so that the web process need not
+(decision 15). It does so problem by problem in a background thread, to keep the workers busy
+(`service.dispatch.background`).
 """
 
 import logging
@@ -44,7 +45,7 @@ from workers.tasks import prepare_run_records
 
 _log = logging.getLogger(__name__)
 
-# Fields of a run that do not change what its parameters are measured by.
+# Fields of a run that do not affect its reference values.
 IRRELEVANT_FIELDS = (
     "/noise",
     "/seed",
@@ -60,20 +61,20 @@ LEFT_OUT_NOTE = (
     "have Cramér–Rao bounds and reference values"
 )
 MOST_WORK = 10_000_000
-"""Samples to simulate for the floors of one job: below a second in most models."""
+"""Samples to simulate for the bounds of one job: below a second for most models."""
 
 
 def build_bounds_maker(database: Database, claim: Claim, source: JobRuns) -> DocumentMaker | None:
-    """Makes the document of a job's floors, a problem a step; None for a job without noise.
+    """Return the steps that build the bounds document of a job; None for a job without noise.
 
-    All runs of the job must be over, and their results written. The document has ``axes``, the
-    paths that tell the problems apart, ``note`` on problems that it leaves out, and ``problems``,
-    each with
+    All runs of the job must have ended, and their results must be written. Each step handles one
+    problem. The document has ``axes``, the paths that distinguish the problems, ``note`` on omitted
+    problems, and ``problems``, each with
 
     - ``cell``: its values of the axes;
     - ``reference``: ``kind`` (``truth``, or ``estimate``: the best run at the smallest σ), the
       ``run`` and ``sigma`` of an estimate, and ``values`` by parameter; or null;
-    - ``stderr``: the floor of each free parameter for σ = 1, null where there is none;
+    - ``stderr``: the bound of each free parameter for σ = 1, null if there is none;
     - ``rms``: that of the response;
     - ``note``: why something is missing, or nothing.
     """
@@ -85,14 +86,14 @@ def build_bounds_maker(database: Database, claim: Claim, source: JobRuns) -> Doc
 
 
 class _BoundsMaker:
-    """Collects the floors of one job; `left` is the work that may still be done."""
+    """Computes the bounds of one job within a limit of work."""
 
     def __init__(self, database: Database, job: Job, source: JobRuns) -> None:
         self._database, self._job, self._source = database, job, source
         self._left = MOST_WORK
 
     def iterate_steps(self) -> Iterator[Document | None]:
-        """Nothing after each problem, and then the document."""
+        """Yield None after each problem, and the document at the end."""
         axes = [
             axis["path"]
             for axis in self._job.spec["sweep"]["axes"]
@@ -129,7 +130,7 @@ class _BoundsMaker:
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no Cramér–Rao bound: %s", self._job.id, error)
             return {**entry, "note": f"no Cramér–Rao bound: {error}"}
-        except Exception as error:  # noqa: BLE001 - the results are there; a floor is not worth them
+        except Exception as error:  # noqa: BLE001 - the results must not be lost for a bound
             _log.exception("%s: no Cramér–Rao bound", self._job.id)
             return {**entry, "note": f"no Cramér–Rao bound: internal error: {type(error).__name__}"}
 
@@ -186,7 +187,7 @@ def _to_bounds_document(found: CramerRaoBound) -> Document:
 def _widen_bounds(
     spec: ProblemSpec, values: Mapping[str, float]
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The changes of the parameters, with bounds between which the known values lie."""
+    """Iterate over the parameter changes, with bounds widened to include the reference values."""
     bounds = {p.name: (p.lower, p.upper) for p in parse_model(spec.model).parameters}
     changes = spec.settings.parameters
     for name in {**bounds, **changes}:

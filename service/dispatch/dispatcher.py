@@ -1,6 +1,6 @@
-"""The dispatcher: claims jobs by lease, drives the workers, writes what they find.
+"""Dispatcher: claims jobs by lease, drives the workers, and writes results.
 
-A process of its own (`service.dispatch.process`); any number of them share one queue.
+It is a process of its own (`service.dispatch.process`). Any number of dispatchers share one queue.
 """
 
 import logging
@@ -45,16 +45,16 @@ BUSY_SECONDS = 0.2
 """How often a busy dispatcher looks for cancelled and waiting jobs."""
 STEP_SECONDS = 0.1
 RELEASE_SECONDS = 5.0
-"""What giving the jobs back may take once the parent or the workers are gone."""
+"""Time limit for releasing the jobs once the parent or the workers are gone."""
 MOST_JOBS = 64
-"""Jobs in hand at a time: they share the workers, and each is read as it is needed. As many again
-may come if they are short or urgent: a single identification does not wait for 64 sweeps."""
+"""Jobs held at a time. They share the workers, and their runs are read when needed. As many again
+may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
 SHORT_RUNS = 8
-"""A job of so many runs is short."""
+"""A job with at most this many runs is short."""
 
 
 class Dispatcher:
-    """Joins the queue, the workers and the records of several jobs at a time."""
+    """Connects the queue, the workers and the recorders of several jobs."""
 
     def __init__(
         self,
@@ -68,28 +68,28 @@ class Dispatcher:
         self.stopping = threading.Event()
         self._database, self._store, self._crew = database, store, crew
         self._woken = threading.Event()
-        self._woken.set()  # what was queued before is not heard of
+        self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
-        # By lease: a job may come back under a new attempt while packs of the old one fly.
+        # Keyed by lease: a job may return as a new attempt while packs of the old one still run.
         self._feeder: Scheduler[Lease] = Scheduler(crew, project_cores=project_cores)
         self._recorders: dict[Lease, RunRecorder] = {}
         self._priorities: dict[Lease, int] = {}
         self._is_filling = False
         self._floors: dict[
             Lease, DocumentMaker
-        ] = {}  # of jobs with noise, to be made when their runs end
+        ] = {}  # for jobs with noise, built when their runs end
         self._aside: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._looked = 0.0
         self._waking = threading.Thread(target=self._listen_for_wakeups, name="waker", daemon=True)
 
     def run_until_stopped(self) -> None:
-        """Work until `stopping` is set; then give every job back with its checkpoints.
+        """Work until `stopping` is set. Then release every job with its checkpoints.
 
         Raises
         ------
         ClusterLost
-            If the workers are gone; the jobs were given back, as lost.
+            If the workers are lost. The jobs were released as lost.
         """
         self._leases.start_heartbeat({"cpus": self._crew.slots, "pid": os.getpid()})
         _log.info("ready: %s with %d cores", self._leases.owner, self._crew.slots)
@@ -104,7 +104,7 @@ class Dispatcher:
         self._release_jobs()
 
     def run_round(self) -> None:
-        """One round: look at the queue, feed and collect, write."""
+        """Run one round: check the queue, feed and collect runs, write."""
         if not self._recorders:
             self._woken.wait(IDLE_SECONDS)
         pause = time.monotonic() - self._looked
@@ -119,7 +119,7 @@ class Dispatcher:
             self._conclude_job(lease)
         for recorder in self._list_held_recorders():
             if not self._leases.is_held(recorder.lease):
-                continue  # the heartbeat that waits, or the next one, tells whose it is
+                continue  # the pending heartbeat, or the next one, decides
             try:
                 retry_transient(recorder.write_due)
             except LeaseLost as error:
@@ -139,11 +139,11 @@ class Dispatcher:
             claim = retry_transient(partial(self._leases.claim_job, admission))
             if claim is not None:
                 self._take_job(claim)
-                self._is_filling = True  # the next one in the next turn: rivals get some
+                self._is_filling = True  # one job per round, so that other dispatchers get some
                 self._woken.set()
 
     def _build_admission(self) -> Admission | None:
-        """What may still come; None is everything."""
+        """Return which jobs may still be claimed; None admits every job."""
         if len(self._recorders) < MOST_JOBS:
             return None
         return Admission(SHORT_RUNS, min(self._priorities.values()))
@@ -181,7 +181,7 @@ class Dispatcher:
         recorder.is_stopped = True
 
     def _end_runs(self, lease: Lease) -> None:
-        """The runs of a job are over: its floors are made before it ends, if it has any."""
+        """Handle a job whose runs have ended. Its bounds, if any, are computed before it ends."""
         recorder, floors = self._recorders[lease], self._floors.pop(lease, None)
         if floors is None or recorder.is_stopped:
             self._conclude_job(lease)
@@ -195,7 +195,7 @@ class Dispatcher:
             self._aside.start_job(lease, floors)
 
     def _list_ready_to_conclude(self) -> list[Lease]:
-        """Jobs whose floors were made, or are no longer wanted."""
+        """List jobs whose bounds are ready, or are no longer wanted."""
         stopped = [one for one in self._aside.pending_keys if self._recorders[one].is_stopped]
         for lease in stopped:
             self._aside.cancel_job(lease)
@@ -229,12 +229,12 @@ class Dispatcher:
 
 
 def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
-    """Run a dispatcher; what cannot be used is told in one line. Gives the exit code.
+    """Run a dispatcher and return the exit code. Expected errors are logged in one line.
 
     Parameters
     ----------
     local : LocalRay, optional
-        A Ray that was started before; it ends here.
+        A Ray that is already running; it is closed here.
     """
     try:
         return serve_jobs(settings, local)
@@ -249,7 +249,7 @@ def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
 
 
 def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
-    """Run a dispatcher until it is told to stop.
+    """Run a dispatcher until it is stopped.
 
     Raises
     ------
@@ -259,10 +259,10 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format=LOG_FORMAT)
     settings.prepare_data_folder()
     database = Database(settings.resolved_database_url)
-    retry_transient(partial(migrate.upgrade_database, database))  # it may be starting as well
+    retry_transient(partial(migrate.upgrade_database, database))  # the database may be starting too
     store = open_store(settings.resolved_store_url)
     compiling = threading.Thread(target=warm_up_worker, name="warm", daemon=True)
-    compiling.start()  # the compiler and Ray's start wait on different things
+    compiling.start()  # in parallel with the start of Ray
     where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory_bytes)
     crew = RayExecutor(where, local)
     try:
@@ -282,7 +282,7 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
 
 
 def _stop_on_signals(stopping: threading.Event, crew: RayExecutor) -> None:
-    """SIGTERM, SIGINT, and the end of standard input where a supervisor holds it."""
+    """Stop on SIGTERM, on SIGINT, and when a supervisor closes standard input."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         stopping.set()  # the waker's thread sees it and wakes the main loop
@@ -296,7 +296,7 @@ def _stop_on_signals(stopping: threading.Event, crew: RayExecutor) -> None:
 
 
 def _exit_with_parent(stopping: threading.Event, crew: RayExecutor) -> None:
-    # Not through the buffer: its lock would be held at the interpreter's end.
+    # Not through the buffer, because its lock would be held when the interpreter exits.
     while os.read(sys.stdin.fileno(), 1024):
         pass
     stopping.set()
@@ -305,7 +305,7 @@ def _exit_with_parent(stopping: threading.Event, crew: RayExecutor) -> None:
 
 
 def _exit_with_cluster(stopping: threading.Event, crew: RayExecutor) -> None:
-    """The main thread sees it as well, unless it is in a call of Ray's that does not return."""
+    """Exit when the cluster is lost, even if the main thread hangs in a call to Ray."""
     while not stopping.wait(IDLE_SECONDS):
         if not crew.is_alive():
             time.sleep(RELEASE_SECONDS)
@@ -313,7 +313,7 @@ def _exit_with_cluster(stopping: threading.Event, crew: RayExecutor) -> None:
 
 
 def _exit_now(crew: RayExecutor) -> None:
-    """End the process without Ray's own end, which waits for what may be gone."""
+    """End the process without Ray's own shutdown, which may wait for lost processes."""
     crew.abandon_cluster()
     logging.shutdown()
     os._exit(RESTART_EXIT_CODE)

@@ -1,4 +1,4 @@
-"""The fitted signals of runs: a file of each, the files of several as one object."""
+"""Storage of fitted signals: one file per run, several files per object."""
 
 import io
 import time
@@ -14,16 +14,16 @@ from sysid.data.records import Record
 from workers.protocol import Records
 
 UPLOAD_BYTES = 4 << 20
-"""Bytes that are kept in memory until they are stored with those of other runs."""
+"""Bytes held in memory until they are stored with those of other runs."""
 RETRY_SECONDS = 15.0
-"""How long a store that takes nothing, such as a full disk, is waited for."""
+"""Longest wait for a store that accepts nothing, such as a full disk."""
 RETRY_PAUSE_SECONDS = 0.3
 _unavailable_stores: "WeakSet[ObjectStore]" = WeakSet()
-"""Stores that have not come back in time."""
+"""Stores that timed out."""
 
 
 class SignalsLocation(NamedTuple):
-    """Where a run's file is stored; `start` is None where it is the whole object."""
+    """Location of a run's file; `start` is None if it is the whole object."""
 
     sha256: str
     start: int | None = None
@@ -31,14 +31,14 @@ class SignalsLocation(NamedTuple):
 
 
 FittedPart = tuple[FitRole, Records, tuple[tuple[FloatArray, ...], ...]]
-"""What the records are for, the records, and the simulated outputs of each."""
+"""Role of the records, the records, and the simulated outputs of each."""
 
 
 class _RetryingStore:
-    """Puts objects into a store that may be full or away for a while.
+    """Puts objects into a store that may be full or unavailable for a while.
 
-    A store that has not come back in time is not waited for again until it has taken something,
-    by none of the jobs that a dispatcher holds: all of them wait meanwhile.
+    After a time-out a store is not retried until it has accepted an object. This holds for all jobs
+    of the dispatcher, because all of them would wait.
     """
 
     def __init__(self, store: ObjectStore) -> None:
@@ -60,7 +60,7 @@ class _RetryingStore:
 
 
 class _Upload:
-    """Files behind one another, which become one object. What made that fail is told to all."""
+    """Concatenated files that become one object. Its failure is reported to all of them."""
 
     def __init__(self, store: _RetryingStore) -> None:
         self._store = store
@@ -71,7 +71,7 @@ class _Upload:
 
     @property
     def is_closed(self) -> bool:
-        """Whether another file would come too late."""
+        """Whether no more files can be added."""
         return self._sha256 is not None or self._failed is not None
 
     def add_file(self, file: bytes) -> int:
@@ -102,32 +102,32 @@ class _Upload:
 
 
 class StoredSignals(NamedTuple):
-    """A run's file that waits to be stored."""
+    """File of a run that waits to be stored."""
 
     upload: _Upload
     start: int
     size: int
 
     def store_file(self) -> SignalsLocation:
-        """Store it, with the others of its parcel.
+        """Store the file with the others of its upload.
 
         Raises
         ------
         ObjectStoreFailed
-            If it cannot be written, now or before.
+            If it cannot be written, now or earlier.
         """
         return self.upload.locate_file(self.start, self.size)
 
 
 class SignalsBatch:
-    """Collects the files of runs: an object of each would cost more than the file itself."""
+    """Collects the files of runs, because an object per file would cost more than the file."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = _RetryingStore(store)
         self._parcel = _Upload(self._store)
 
     def add_file(self, file: bytes) -> StoredSignals:
-        """Put a file to those that are stored next; a full parcel is stored at once.
+        """Add a file to the current upload. A full upload is stored at once.
 
         Raises
         ------
@@ -148,7 +148,7 @@ def add_fitted_signals(
     run: str,
     parts: Sequence[FittedPart],
 ) -> StoredSignals:
-    """What a run's model gives beside what was measured, as a file on the shelf.
+    """Write measured and simulated outputs of a run to a file, and add it to the batch.
 
     Parameters
     ----------

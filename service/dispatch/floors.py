@@ -1,8 +1,9 @@
-"""What the runs of a job with noise are measured by: true values, and the Cramér–Rao floor.
+"""Reference values and Cramér–Rao bounds for the runs of a job with noise.
 
-A job may pose several problems (axes over datasets or bounds, say); each has a truth of its own.
-σ enters in proportion, so one floor a problem serves every σ. It is made here, in the dispatcher
-and when all runs of the job are over, so that the web process need not compute (decision 15); in a
-thread of its own, problem by problem, so that the workers are fed
-meanwhile (`service.dispatch.background`).
+A job may have several problems, for example axes over datasets or bounds. Each has its own true
+values. Bounds are proportional to σ, so one bound per problem serves every σ.
+
+The dispatcher computes them when all runs of the job have ended, so that the web process need not
+(decision 15). It does so problem by problem in a background thread, to keep the workers busy
+(`service.dispatch.background`).
 """

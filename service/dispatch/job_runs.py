@@ -1,4 +1,4 @@
-"""From a job's rows to specifications that workers can carry out."""
+"""Conversion of a job's rows to specifications for the workers."""
 
 import logging
 from collections import OrderedDict
@@ -59,20 +59,20 @@ _log = logging.getLogger(__name__)
 
 READ_AHEAD = 200
 MOST_READY_RUNS = 64
-"""Runs of different chains that are read at a time."""
+"""Runs of different chains read at a time."""
 CACHED_SAMPLES = 1_000_000
-"""Of records that a job keeps in memory, 16 bytes each, besides those last asked for."""
+"""Samples that a job caches, 16 bytes each, in addition to the latest records."""
 
 
 class DataKey(NamedTuple):
-    """Which datasets, and which of their channels are the signals of the model."""
+    """Datasets, and the channels of the model's signals."""
 
     datasets: tuple[str, ...]
     channels: SignalChannels
 
 
 class JobRuns:
-    """The runs and records of one claimed job; implements `workers.protocol.JobSource`."""
+    """Runs and records of one claimed job; implements `workers.protocol.JobSource`."""
 
     def __init__(
         self,
@@ -90,9 +90,9 @@ class JobRuns:
         self._groups: list[AxisGroup] | None = None
 
     def iterate_runs(self) -> Iterator[JobEntry]:
-        """The unfinished runs, each from its checkpoint if it has one.
+        """Iterate over the unfinished runs, each from its checkpoint if it has one.
 
-        In order; where runs wait for others in their chains, those come first that need not wait.
+        Runs come in order. In chains of warm starts, the runs that need not wait come first.
         """
         try:
             checkpoints = retry_transient(self._read_checkpoints)
@@ -107,7 +107,7 @@ class JobRuns:
                 fresh = [run for run, state in states.items() if state is None]
                 retry_transient(partial(self._forget_progress, fresh))
                 yield from self._to_coming_runs([(row, states.pop(row.id)) for row in rows])
-        except LeaseLost as error:  # the recorder will meet it too, and stop the job
+        except LeaseLost as error:  # the recorder meets it too, and stops the job
             _log.warning("no more runs are read: %s", error)
 
     def _iterate_in_order(self) -> Iterator[list[Run]]:
@@ -117,7 +117,7 @@ class JobRuns:
             rows = self._read_next_rows(rows[-1].number)
 
     def _iterate_chains(self, chains: OpenChains) -> Iterator[list[Run]]:
-        """Runs that may begin, of many chains; no runs while all that are left wait."""
+        """Iterate over ready runs of many chains. Yields no rows while all remaining runs wait."""
         made = retry_transient(self._count_made_runs)
         while not chains.is_exhausted:
             numbers = chains.take_ready(MOST_READY_RUNS, made)
@@ -131,7 +131,7 @@ class JobRuns:
             yield rows
 
     def _to_coming_runs(self, rows: list[tuple[Run, RunState | None]]) -> Iterator[JobEntry]:
-        """The runs of these rows, or what is known of them already."""
+        """Convert rows to runs, or to earlier runs with the same specification."""
         queued = [
             retry_transient(partial(self._build_queued_run, row, state)) for row, state in rows
         ]
@@ -145,12 +145,12 @@ class JobRuns:
             yield one if source is None else ReusedRun(one.run, source)
 
     def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
-        """The run of one cell, with what it begins with.
+        """Build the specification of one cell's run, with its warm start.
 
         Raises
         ------
         SysidError, ServiceError, StorageError
-            If its settings cannot be used, or its model is not there.
+            If its settings are invalid, or its model is missing.
         """
         body = build_run_body(self._job.spec, cell)
         model = load_stored_model(body["model"])
@@ -167,14 +167,14 @@ class JobRuns:
         return RunSpec(problem, to_algorithm(body["algorithm"]), int(body["seed"]), warm)
 
     def load_records(self, key: str) -> Records:
-        """The records of that key, read from the object store.
+        """Load the records of that key from the object store, or from the cache.
 
         Raises
         ------
         RecordsUnavailable
-            If a dataset or a channel is not there, or cannot be used.
+            If a dataset or a channel is missing or invalid.
         """
-        if key not in self._read:  # every run of a sweep asks, to store its signals
+        if key not in self._read:  # needed by every run of a sweep to store its signals
             self._read[key] = self._read_records(key)
             while len(self._read) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
                 self._read.popitem(last=False)
@@ -203,7 +203,7 @@ class JobRuns:
             return DatasetRepository(session, self._job.project_id).get_all(datasets)
 
     def save_signals(self, run: str, found: Identification) -> StoredSignals | None:
-        """Make the file of a run's fitted signals, to be stored with those of others.
+        """Write the file of a run's fitted signals, to be stored with those of other runs.
 
         Raises
         ------
@@ -220,7 +220,7 @@ class JobRuns:
         return add_fitted_signals(self._shelf, run, parts)
 
     def note_failure(self, run: str) -> None:
-        """Nothing will be saved of a run: those behind it in its chain wait no longer."""
+        """Record the failure of a run, so that later runs of its chain stop waiting."""
         self._problems.pop(run, None)
         self._warm.record_failure(run)
 
@@ -229,16 +229,16 @@ class JobRuns:
             return RunWriter(session, self._lease).read_checkpoints()
 
     def _read_next_rows(self, after: int) -> list[Run]:
-        """Unfinished runs behind that number; the next ones are made where none is left."""
+        """Read unfinished runs after that number. If none is left, the next ones are created."""
         while not (rows := retry_transient(partial(self._read_pending, after))):
             if not retry_transient(self._make_runs):
                 break
         return rows
 
     def _make_runs(self) -> bool:
-        """Make the next runs of the sweep; whether some were left to be made.
+        """Create the next runs of the sweep, and return whether some were left to create.
 
-        Which are made already the database knows, so that any dispatcher goes on from there.
+        The database counts the created runs, so that any dispatcher can continue.
         """
         made = self._count_made_runs()
         if made >= self._job.n_runs:
@@ -276,7 +276,7 @@ class JobRuns:
         return QueuedRun(row.id, spec, state, row.kills)
 
     def _find_computed_runs(self, queued: list[QueuedRun | InvalidRun]) -> dict[str, str]:
-        """Runs that were computed before, each with the run that did; all are marked."""
+        """Find earlier runs with the same specification, and write all hashes."""
         hashes = {
             one.run: key
             for one in queued

@@ -1,4 +1,4 @@
-"""The leases of one dispatcher: claimed, kept alive, given back; and those of dead ones reaped."""
+"""Leases of one dispatcher: claimed, renewed, released. Expired ones of others are reaped."""
 
 import logging
 import os
@@ -27,24 +27,24 @@ from service.storage.sessions import Database
 _log = logging.getLogger(__name__)
 
 RETRY_SECONDS = 0.5
-"""After a heartbeat that could not be written, until the next."""
+"""Pause after a heartbeat that could not be written."""
 
 
 class HeldLeases:
-    """The jobs this dispatcher may write for.
+    """Jobs that this dispatcher may write for.
 
-    A thread renews all leases with one statement, three times within their length, and reaps the
-    expired ones of anybody. A lease that did not come back `is_lost`; one that was forgotten is
-    renewed no longer, and expires. While a heartbeat waits for the database, of a lease that is
-    late nothing is known: nothing should be written under it, but it may still be ours.
+    A thread renews all leases with one statement, three times within their length. It also reaps
+    expired leases of any dispatcher. A lease that was not renewed `is_lost`. A forgotten lease is
+    no longer renewed, and expires. While a heartbeat waits for the database, the state of a late
+    lease is unknown. Nothing should be written under it, but it may still be held.
 
     Parameters
     ----------
     seconds : float
         Length of a lease.
     clock, stopwatch : callable
-        The time of day as rows have it (by default the database's), and the seconds that pass for
-        this process.
+        The time of day of the rows (by default the database's), and the elapsed seconds of this
+        process.
     """
 
     def __init__(
@@ -59,14 +59,14 @@ class HeldLeases:
         self._database, self._length = database, timedelta(seconds=seconds)
         self._clock, self._stopwatch = clock, stopwatch
         self._held: dict[Lease, float] = {}  # when each was renewed
-        self._has_asked = False  # for a job, and was not answered
+        self._has_asked = False  # a claim was sent and not answered
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run_heartbeat, name="heartbeat", daemon=True)
 
     def start_heartbeat(self, details: dict[str, object]) -> None:
-        """Announce the dispatcher and begin to beat."""
+        """Register the dispatcher and start the heartbeat."""
         told = {LEASE_SECONDS_KEY: self._length.total_seconds(), **describe_process(), **details}
         retry_transient(partial(self._announce_dispatcher, told))
         self._thread.start()
@@ -77,10 +77,10 @@ class HeldLeases:
         reap_jobs(self._database, self._clock)
 
     def claim_job(self, admission: Admission | None = None) -> Claim | None:
-        """Take the next job that `admission` lets in, if one waits."""
+        """Claim the next job that `admission` lets in, if one waits."""
         begun = self._stopwatch()
         claim, had_asked = None, self._has_asked
-        self._has_asked = True  # a claim whose answer is lost may have been made
+        self._has_asked = True  # a claim may succeed even if its answer is lost
         with self._database.write_session() as session:
             queue = LeaseQueue(session, self._clock)
             if had_asked:
@@ -94,7 +94,7 @@ class HeldLeases:
         return claim
 
     def check_queue(self, admission: Admission | None = None) -> QueueStatus:
-        """Whether a job waits that `admission` lets in, and which of ours are to be cancelled."""
+        """Check whether an admissible job waits, and which held jobs are to be cancelled."""
         with self._database.read_session() as session:
             return read_queue_status(session, self.owner, admission)
 
@@ -103,28 +103,28 @@ class HeldLeases:
             return [lease.job_id for lease in self._held]
 
     def is_lost(self, lease: Lease) -> bool:
-        """Whether the lease is known to be another's by now, or was forgotten."""
+        """Test whether the lease is known to be another's, or was forgotten."""
         with self._lock:
             return lease not in self._held
 
     def is_held(self, lease: Lease) -> bool:
-        """Whether the lease is ours: it was renewed within its length."""
+        """Test whether the lease is held, that is, was renewed within its length."""
         with self._lock:
             renewed = self._held.get(lease)
         return renewed is not None and self._stopwatch() - renewed <= self._length.total_seconds()
 
     def forget_lease(self, lease: Lease) -> None:
-        """The job has ended, or was dropped: renew its lease no longer."""
+        """Stop renewing the lease of a job that has ended or was dropped."""
         with self._lock:
             self._held.pop(lease, None)
 
     def release_all(self, *, lost: bool = False) -> None:
-        """Give every job back, so that another dispatcher has it at once.
+        """Release every job, so that another dispatcher can claim it at once.
 
         Parameters
         ----------
         lost : bool
-            Whether this counts as a lease that was lost.
+            Whether this counts as a lost lease.
         """
         with self._lock:
             held = tuple(self._held)
@@ -149,14 +149,14 @@ class HeldLeases:
             return LeaseQueue(session, self._clock).has_progressed(self.owner)
 
     def stop_heartbeat(self) -> None:
-        """Stop beating and take leave."""
+        """Stop the heartbeat and unregister the dispatcher."""
         self._ending.set()
         self._thread.join(5.0)
         with self._database.write_session() as session:
             DispatcherRepository(session).remove_dispatcher(self.owner)
 
     def renew_leases(self) -> None:
-        """One heartbeat: renew what is held, and reap what has expired."""
+        """Send one heartbeat: renew the held leases, and reap expired ones."""
         begun = self._stopwatch()
         with self._lock:
             before = tuple(self._held)
@@ -183,7 +183,7 @@ class HeldLeases:
             try:
                 self.renew_leases()
                 pause, self._is_cut_off = third, False
-            except SQLAlchemyError as error:  # it may come back before the leases end
+            except SQLAlchemyError as error:  # the database may return before the leases end
                 if not self._is_cut_off:
                     _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
                 pause, self._is_cut_off = min(third, RETRY_SECONDS), True

@@ -1,7 +1,7 @@
-"""``python -m service.dispatch.process``: a dispatcher, ready as soon as can be.
+"""``python -m service.dispatch.process``: a dispatcher that starts quickly.
 
-A start is what a recovery waits for. Ray's is mostly waiting, so the program is read, and its
-loops are loaded, beside it; therefore nothing heavy is imported here.
+A recovery waits for this start. Starting Ray is mostly waiting, so the program is imported and its
+compiled loops are loaded in parallel. Nothing heavy is therefore imported here.
 """
 
 import logging
@@ -16,7 +16,7 @@ _log = logging.getLogger("lagid.dispatcher")
 
 
 def run_process(settings: Settings) -> int:
-    """Run a dispatcher until it is told to stop; gives the exit code."""
+    """Run a dispatcher until it is stopped, and return the exit code."""
     local = None
     if settings.ray_address is None:
         reading = threading.Thread(target=_import_dispatcher, name="reading")
@@ -33,7 +33,7 @@ def run_process(settings: Settings) -> int:
 
 
 def _import_dispatcher() -> None:
-    """Import the dispatcher and load the loops; what fails here, fails again for whoever waits."""
+    """Import the dispatcher and load the compiled loops. The caller meets any error again."""
     import service.dispatch.dispatcher  # noqa: F401
     from workers.warmup import warm_up_worker
 

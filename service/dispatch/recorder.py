@@ -1,4 +1,4 @@
-"""What the dispatcher writes about the runs of one job: in bulk, fenced by the lease."""
+"""Writes of the dispatcher about the runs of one job: in bulk, fenced by the lease."""
 
 import logging
 import math
@@ -29,22 +29,22 @@ from workers.protocol import RunConclusion, RunFailure
 _log = logging.getLogger(__name__)
 
 RESULTS_SECONDS = 1.0
-"""A transaction costs as much as the rows of many runs; what comes after a pause goes at once."""
+"""A transaction costs as much as the rows of many runs. After a pause, rows are written at once."""
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 MOST_REASONS = 3
 
 SaveSignals = Callable[[str, Identification], StoredSignals | None]
-"""Makes the file of a run's fitted signals, which can be stored."""
+"""Writes the file of a run's fitted signals, ready to be stored."""
 
 
 @dataclass(slots=True)
 class _LiveRun:
-    """A run in progress: its latest state, and how much of it is written."""
+    """Run in progress: its latest state, and how much of it is written."""
 
     state: RunState
     seconds: float
-    first_generation: int = 0  # its generation when this attempt took it up
+    first_generation: int = 0  # its generation at the start of this attempt
     written: dict[int, int] = field(default_factory=dict)
     migrants: int = 0
     changed: bool = True
@@ -52,7 +52,7 @@ class _LiveRun:
 
 @dataclass(slots=True)
 class _PendingWrites:
-    """What the next transaction will write."""
+    """Rows of the next transaction."""
 
     started: list[str] = field(default_factory=list)
     reused: dict[str, str] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class _PendingWrites:
 class RunRecorder:
     """Writes one job's runs; implements `workers.protocol.RunObserver`.
 
-    Nothing is written when something happens, but by `flush`: results at most every
+    Events are collected, and `write_due` writes them. Results are written at most every
     `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
     """
 
@@ -89,9 +89,8 @@ class RunRecorder:
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MOST_REASONS)
         self._reasons = list(before.failure_reasons)
-        self._waiting = (
-            before.checkpoint_evaluations
-        )  # evaluations of runs that have not gone on yet
+        # Evaluations of runs that have not continued yet.
+        self._waiting = before.checkpoint_evaluations
         self._database, self._save_signals = database, save_signals
         self._live: dict[str, _LiveRun] = {}
         self._pending = _PendingWrites()
@@ -106,16 +105,16 @@ class RunRecorder:
         self._news = False
 
     def record_start(self, run: str) -> None:
-        """The run was given to a worker."""
+        """Record that the run was sent to a worker."""
         self._pending.started.append(run)
 
     def record_worker_death(self, run: str, kills: int) -> None:
-        """A worker died over the run alone, `kills` times since it last went on."""
+        """Record that the run alone killed its worker, `kills` times since its last progress."""
         self._pending.kills[run] = kills
-        self._wrote = 0.0  # at once: what counts them may die as well
+        self._wrote = 0.0  # write at once: the dispatcher may die too
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
-        """The run can go on from `state`."""
+        """Record a state from which the run can continue."""
         live = self._live.get(run)
         if live is None:
             begun_at = state.generation if run in self._waiting else 0
@@ -125,7 +124,7 @@ class RunRecorder:
         self._news = True
 
     def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
-        """The run is complete."""
+        """Record the result of a complete run."""
         self._waiting.pop(run, None)
         found, live = concluded.identification, self._live.pop(run, None)
         self._collect_history(run, found.history, found.migrations, live)
@@ -144,7 +143,7 @@ class RunRecorder:
         self._news = True
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
-        """The run cannot be carried out."""
+        """Record that the run failed."""
         self._tell_failed(run)
         live, evaluations = self._live.pop(run, None), self._waiting.pop(run, 0)
         if live is not None:
@@ -164,25 +163,25 @@ class RunRecorder:
         self._news = True
 
     def record_reuse(self, run: str, source: str) -> None:
-        """The run is what another run was."""
+        """Record that the run takes over the result of `source`."""
         self._pending.reused[run] = source
         self._waiting.pop(run, None)
         self._n_done += 1
-        self._n_begun += 1  # it tells nothing of how long the others take
+        self._n_begun += 1  # reused runs do not count for the speed
         self._n_known += 1
         self._news = True
 
     def should_stop(self) -> bool:
-        """Whether the job was cancelled or its lease lost."""
+        """Test whether the job was cancelled or its lease lost."""
         return self.is_stopped
 
     def write_due(self) -> None:
-        """Write what is due.
+        """Write everything that is due.
 
         Raises
         ------
         LeaseLost
-            If the job is no longer this dispatcher's; nothing was written.
+            If another dispatcher holds the job. Nothing was written.
         """
         now = time.monotonic()
         tell = self._news and now - self._told > PROGRESS_SECONDS
@@ -192,13 +191,14 @@ class RunRecorder:
             self._commit_writes(now, tell=tell, keep=keep)
 
     def write_all(self) -> None:
-        """Write everything, checkpoints too, because the dispatcher stops."""
+        """Write everything, including checkpoints, because the dispatcher stops."""
         self._commit_writes(time.monotonic(), tell=True, keep=True)
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
 
-        Where floors are told, the results were written before (`store`): they are made of them.
+        With `floors`, the results are already written (`write_results`), because the bounds refer
+        to them.
         """
         self._store_signals()
         with self._database.write_session() as session:
@@ -218,18 +218,18 @@ class RunRecorder:
                 queue.finish_job(self.lease, JobState.SUCCEEDED, complaint)
 
     def write_results(self) -> None:
-        """Write the last results; the job goes on."""
+        """Write the last results without ending the job."""
         self._commit_writes(time.monotonic(), tell=True, keep=False)
 
     def cancel_job(self) -> None:
-        """End the job as cancelled; what its runs gave before stays."""
+        """End the job as cancelled. Earlier results of its runs remain."""
         self._store_signals()
         with self._database.write_session() as session:
             self._write_rows(session, tell=True, keep=True)
             LeaseQueue(session).finish_job(self.lease, JobState.CANCELLED)
 
     def _compute_progress(self) -> JobProgress:
-        """How far the job is; the generation is that of the run that is furthest."""
+        """Compute the job's progress; its generation is that of the most advanced run."""
         states = [live.state for live in self._live.values()]
         best = min([self._best, *_list_rms(self._taken), *(state.rms for state in states)])
         return JobProgress(
@@ -249,7 +249,7 @@ class RunRecorder:
         )
 
     def _estimate_seconds_left(self) -> float | None:
-        """What is left if the rest goes as fast as what was done since the claim."""
+        """Estimate the remaining time from the speed since the claim."""
         total = self._generations * self._n_runs
         open_runs = sum(live.state.generation for live in self._live.values())
         before = sum(live.first_generation for live in self._live.values())
@@ -282,14 +282,14 @@ class RunRecorder:
         self._mark_written(now, tell=tell, keep=keep)
 
     def _report_unstored_signals(self, runs: Sequence[str], error: Exception) -> None:
-        """The numbers are worth more than the plot: they are written without it."""
+        """Report unstored signals. The results are written without them."""
         others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
         text = f"the signals of {runs[0]}{others} are not stored: {error}"
         _log.error(text)
         self._pending.messages.append(text)
 
     def _store_signals(self) -> None:
-        """Store the files of ended runs, before the rows that name them."""
+        """Store the files of ended runs, before the rows that refer to them."""
         places: dict[str, SignalsLocation] = {}
         failed: dict[int, tuple[Exception, list[str]]] = {}
         for run, shelved in self._pending.signals.items():

@@ -1,4 +1,4 @@
-"""From an identification to the rows that are stored of it: pure functions."""
+"""Conversion of an identification to the rows to store: pure functions."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ from workers.protocol import RunConclusion
 
 
 def to_run_outcome(run: str, concluded: RunConclusion, seconds: float) -> RunOutcome:
-    """The row of a run that succeeded, its signals left out."""
+    """Build the row of a run that succeeded, without its signals."""
     found, without = concluded.identification, to_finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
@@ -33,7 +33,7 @@ def to_run_outcome(run: str, concluded: RunConclusion, seconds: float) -> RunOut
 def to_history_points(
     run: str, history: tuple[tuple[Improvement, ...], ...], written: Mapping[int, int]
 ) -> Iterator[HistoryPoint]:
-    """Improvements beyond the first `written` of each island."""
+    """Iterate over improvements beyond the first `written` of each island."""
     for island, improvements in enumerate(history):
         first = written.get(island, 0)
         for number, one in enumerate(improvements[first:], start=first):
@@ -53,7 +53,7 @@ def to_history_points(
 def to_migrant_points(
     run: str, migrants: tuple[Migrant, ...], written: int
 ) -> Iterator[MigrantPoint]:
-    """Migrants beyond the first `written`."""
+    """Iterate over migrants beyond the first `written`."""
     for number, one in enumerate(migrants[written:], start=written):
         if math.isfinite(one.fitness):
             yield MigrantPoint(run, number, *one)

@@ -1,4 +1,4 @@
-"""Keep a dispatcher running beside the web process, and leave no process behind."""
+"""Supervisor that keeps a dispatcher running, and leaves no process behind."""
 
 import contextlib
 import logging
@@ -23,25 +23,25 @@ _log = logging.getLogger(__name__)
 FIRST_PAUSE_SECONDS = 0.2
 LONGEST_PAUSE_SECONDS = 5.0
 STEADY_SECONDS = 60.0
-"""A child that lived so long is restarted after the first pause again."""
+"""After this lifetime a child is restarted with the first pause again."""
 LIVED_SECONDS = 5.0
-"""So is one that was killed, or lost its workers, after so long: it did not fail to start."""
+"""The same for a child that was killed or lost its workers: its start had not failed."""
 RESTART_EXIT_CODE = 75
-"""Exit code of a child that should be started again at once (EX_TEMPFAIL of sysexits)."""
+"""Exit code of a child to restart at once (EX_TEMPFAIL of sysexits)."""
 STOP_SECONDS = 2.0
 POLL_SECONDS = 1.0
 STOPPED_SECONDS = 12.0
-"""A child that was stopped (SIGSTOP) past its lease is killed: it may hold SQLite's write lock."""
+"""A child stopped (SIGSTOP) beyond its lease is killed: it may hold SQLite's write lock."""
 
 SUPERVISED_VARIABLE = "LAGID_SUPERVISED"
-"""Set for the child: it ends when its standard input does, that is, when this process dies."""
+"""Set for the child. It then ends when its standard input closes, as when this process dies."""
 
 
 class Supervisor:
-    """Runs a command as a child in a session of its own, again and again until `stop`.
+    """Runs a command as a child in its own session, and restarts it until `stop`.
 
-    The session is what finds every process that the child has started, also after the child
-    itself was killed: Ray's helpers put themselves into process groups of their own.
+    The session identifies every process that the child has started, even after the child was
+    killed. Ray's helpers use process groups of their own.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class Supervisor:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the child: asked first, killed after `STOP_SECONDS`; then whatever it left.
+        """Stop the child, kill it after `STOP_SECONDS`, and clear what it left.
 
-        A second call, from another thread too, waits for the first: a child that is asked twice
-        would not end in order.
+        A second call, also from another thread, waits for the first. A child that receives two
+        signals would not end in order.
         """
         with self._one_stop:
             if not self._stopping.is_set():
@@ -84,7 +84,7 @@ class Supervisor:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child that runs now."""
+        """Process id of the running child."""
         child = self._child
         return None if child is None or child.poll() is not None else child.pid
 
@@ -120,7 +120,7 @@ class Supervisor:
             self._child = subprocess.Popen(
                 self._command,
                 env={**os.environ, **self._environment, SUPERVISED_VARIABLE: "1"},
-                stdin=subprocess.PIPE,  # never written to: its end tells the child of our death
+                stdin=subprocess.PIPE,  # never written to: its end signals our death
                 stdout=sink,
                 stderr=sink,
                 start_new_session=True,
@@ -130,7 +130,7 @@ class Supervisor:
 
 @contextmanager
 def supervise_dispatcher(settings: Settings) -> Iterator[Supervisor]:
-    """Keep a dispatcher with these settings running for the length of the block."""
+    """Keep a dispatcher with these settings running during the block."""
     supervisor = Supervisor(
         [sys.executable, "-m", "service.dispatch.process"],
         to_environment(settings),
@@ -144,14 +144,14 @@ def supervise_dispatcher(settings: Settings) -> Iterator[Supervisor]:
 
 
 def to_environment(settings: Settings) -> dict[str, str]:
-    """The settings as environment variables, so that a child has the same."""
+    """Convert the settings to environment variables for a child."""
     values = settings.model_dump(mode="json", exclude_none=True)
     values["data_dir"] = str(settings.data_dir.absolute())
     return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
 
 
 def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:
-    """Wait for the end of a child; gives its exit code."""
+    """Wait for the end of a child and return its exit code."""
     awake = time.monotonic()
     while True:
         try:
@@ -168,13 +168,13 @@ def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:
 
 
 def clear_session(leader: int) -> None:
-    """Kill every process of the session of a child that has ended; clear what its Ray left."""
+    """Kill every process in the session of an ended child, and clear its Ray files."""
     kill_processes(find_session_processes(leader))
     clear_ray_remains(leader)
 
 
 def find_session_processes(session: int) -> tuple[int, ...]:
-    """Numbers of the processes of a session."""
+    """Find the ids of the processes of a session."""
     pids = []
     for pid in psutil.pids():
         with contextlib.suppress(ProcessLookupError, PermissionError):

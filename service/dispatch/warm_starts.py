@@ -1,10 +1,9 @@
-"""What each run of a job begins with: nothing, an earlier run's estimates, or its neighbour's.
+"""Warm starts of a job's runs: none, an earlier run's estimates, or those of the previous run.
 
-With ``"previous"`` a run waits for those before it in its chain, so that the result depends on
-neither the number of workers nor their speed. Where the one before failed, the last before it that
-succeeded serves; where there is none, the run begins cold.
-
-Which runs of a sweep's chains may begin: of every chain one after another, of many chains.
+With ``"previous"`` a run waits for those before it in its chain. The result is therefore
+independent of the number of workers and of their speed. A run starts from the last run before it
+that succeeded, or cold if there is none. Chains run in parallel, and each chain one run after
+another.
 """
 
 from collections import deque
@@ -26,36 +25,37 @@ from sysid.identification.result import Identification
 from workers.protocol import WarmStartValues
 
 MOST_OPEN_CHAINS = 1_000
-"""Chains under way at a time: more cores than that hardly work on one job."""
+"""Most open chains. More cores hardly ever work on one job."""
 
 
 @dataclass(slots=True)
 class _OpenChain:
-    """A chain under way."""
+    """Chain in progress."""
 
     numbers: range
     position: int = 0  # position of its next run
     running: set[int] = field(default_factory=set)
     values: Mapping[str, float] | None = None  # of the last run that succeeded
     last_success: int = -1  # the number of that run
-    has_skipped: bool = False  # runs were passed over that an earlier attempt ended
+    has_skipped: bool = False  # runs that an earlier attempt ended were skipped
 
 
 class OpenChains:
-    """The chains of one job, opened one after another as runs are wanted.
+    """Chains of one job, opened one after another as runs are needed.
 
-    Of a chain it knows its place, the runs that are out and the last values; of no chain the runs.
+    For each chain it stores the position, the running runs and the last values. It does not store
+    runs.
 
     Parameters
     ----------
-    chain : Chain
-        What a chain of this sweep is.
+    chain : ChainLayout
+        Layout of the chains of this sweep.
     n_runs : int
         Runs of the job.
     waits : callable
-        Whether the run of a number waits until those before it in its chain are over.
+        Whether the run with a number waits for those before it in its chain.
     ended : container of int
-        Numbers of runs that an earlier attempt has ended: they are not given.
+        Numbers of runs that an earlier attempt has ended. They are skipped.
     """
 
     def __init__(
@@ -68,21 +68,21 @@ class OpenChains:
         self._chain, self._waits, self._ended = chain, waits, ended
         self._n_chains, self._opened = n_runs // chain.length, 0
         self._open: dict[int, _OpenChain] = {}
-        self._n_unfinished = 0  # open chains of which not every run was given
+        self._n_unfinished = 0  # open chains with runs left to take
         self._free: deque[int] = deque()  # chains whose next run may begin
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether every run was given."""
+        """Whether every run was taken."""
         return self._opened == self._n_chains and self._n_unfinished == 0
 
     @property
     def has_ready(self) -> bool:
-        """Whether a run may begin: one that `ready` did not give has not been made."""
+        """Whether a run may begin. One that `take_ready` did not return is not created yet."""
         return bool(self._free)
 
     def take_ready(self, limit: int, made: int) -> list[int]:
-        """At most `limit` numbers below `made` of runs that may begin; each is given once."""
+        """Take at most `limit` numbers below `made` of runs that may begin, each once."""
         self._open_chains(limit)
         found: list[int] = []
         for _ in range(len(self._free)):
@@ -95,7 +95,7 @@ class OpenChains:
         return found
 
     def end_run(self, number: int, values: Mapping[str, float] | None = None) -> None:
-        """A run has ended; `values` are its estimates if it succeeded. To be told again is fine."""
+        """End a run; `values` are its estimates if it succeeded. Repeated calls are harmless."""
         key = self._chain.find_chain(number)
         one = self._open.get(key)
         if one is None or number not in one.running:
@@ -112,9 +112,9 @@ class OpenChains:
     def find_previous_values(
         self, number: int, stored: Callable[[range], tuple[int, Mapping[str, float]] | None]
     ) -> Mapping[str, float] | None:
-        """Estimates of the last run before that one in its chain that succeeded, if one did.
+        """Find the estimates of the last successful run before that one in its chain.
 
-        `stored` finds it, with its number, among those that an earlier attempt has ended.
+        `stored` finds it, with its number, among runs that an earlier attempt has ended.
         """
         one = self._open[self._chain.find_chain(number)]
         if one.has_skipped:
@@ -158,7 +158,10 @@ WARM_START_PATH = "/warm_start"
 
 
 class WarmStarts:
-    """Of one claimed job. What its own runs gave is known at once, before it is written."""
+    """Warm starts of one claimed job.
+
+    Results of its own runs are available before they are written.
+    """
 
     def __init__(self, database: Database, job: Job) -> None:
         self._database, self._job = database, job
@@ -167,7 +170,7 @@ class WarmStarts:
         self._earlier: dict[str, Mapping[str, float]] = {}
 
     def open_chains(self) -> OpenChains | None:
-        """The chains of the job, begun where it was left; None if no run waits for another."""
+        """Open the chains of the job where it was left; None if no run waits for another."""
         waits = _WaitRule(self._job)
         axes = SweepIn.model_validate(self._job.spec["sweep"]).axes
         chain = ChainLayout.from_axes(axes)
@@ -183,16 +186,16 @@ class WarmStarts:
         return self._chains
 
     def register_run(self, row: Run) -> None:
-        """A run of a chain is given to the workers: others wait until it is over."""
+        """Register a run that is sent to the workers. Later runs of its chain wait for it."""
         self._numbers[row.id] = row.number
 
     def find_values(self, row: Run, body: Mapping[str, Any]) -> WarmStartValues:
-        """Values for a run to begin with; those before it in its chain are over.
+        """Find the values that a run begins with. Earlier runs of its chain have ended.
 
         Raises
         ------
         StorageError
-            If the run that it names is not there.
+            If the run that it names is missing.
         """
         reference = body["warm_start"]
         if reference is None:
@@ -204,16 +207,16 @@ class WarmStarts:
         return () if values is None else (values,)
 
     def record_success(self, run: str, found: Identification) -> None:
-        """A run of the job has succeeded."""
+        """Record that a run of the job has succeeded."""
         self._end_run(run, {one.name: float(one.value) for one in found.estimates})
 
     def record_reuse(self, run: str, source: str) -> None:
-        """A run of the job is what another was."""
+        """Record that a run takes over the result of `source`."""
         if run in self._numbers:
             self._end_run(run, self._read_estimates(source))
 
     def record_failure(self, run: str) -> None:
-        """A run of the job has failed."""
+        """Record that a run of the job has failed."""
         self._end_run(run, None)
 
     def _end_run(self, run: str, values: Mapping[str, float] | None) -> None:
@@ -222,7 +225,7 @@ class WarmStarts:
             self._chains.end_run(number, values)
 
     def _read_last_success(self, before: range) -> tuple[int, Mapping[str, float]] | None:
-        """Number and estimates of the last of these runs that succeeded."""
+        """Read number and estimates of the last successful run among these."""
         query = select(Run.number, Run.estimates).where(
             Run.job_id == self._job.id,
             Run.state == JobState.SUCCEEDED,
@@ -243,7 +246,7 @@ class WarmStarts:
 
 
 class _WaitRule:
-    """Which runs of a job wait for their neighbour: all, none, or those that an axis tells to."""
+    """Rule which runs wait for the previous one: all, none, or as an axis says."""
 
     def __init__(self, job: Job) -> None:
         groups = read_axis_groups(job.spec)

@@ -1,4 +1,4 @@
-"""A sweep: from axes to cells, and from a cell to the body of its run."""
+"""Sweeps: from axes to cells, and from a cell to the body of its run."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,11 +9,11 @@ from service.core.errors import FieldError
 from service.jobs.schemas import JobIn, SweepAxis
 from sysid.core.errors import split_pointer, suggest_name
 
-# Fields that decide on the job as a whole; a cell of it cannot have its own.
+# Fields of the job as a whole. A cell cannot change them.
 UNSWEPT_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
 
 MOST_LABEL_CHARACTERS = 64
-"""Characters of the name of a label at most."""
+"""Longest name of a label in characters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class SweepCell:
 
 @dataclass(frozen=True, slots=True)
 class AxisPosition:
-    """What one position of one group of axes sets, and where in the body it was written."""
+    """Values set by one position of one group of axes, with their pointer in the body."""
 
     pointer: str
     cell: SweepCell
@@ -34,7 +34,7 @@ class AxisPosition:
 
 @dataclass(frozen=True, slots=True)
 class AxisGroup(Sequence[AxisPosition]):
-    """The positions of one group of axes, each made when it is asked for.
+    """Positions of one group of axes, built on access.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class AxisGroup(Sequence[AxisPosition]):
 
     @classmethod
     def from_axes(cls, axes: Sequence[SweepAxis], numbers: Sequence[int]) -> "AxisGroup":
-        """The group of the axes of these numbers."""
+        """Build the group of the axes with these numbers."""
         return cls(tuple((number, axes[number], expand_values(axes[number])) for number in numbers))
 
     def __len__(self) -> int:
@@ -63,7 +63,7 @@ class AxisGroup(Sequence[AxisPosition]):
 
 
 def group_axes(axes: Sequence[SweepAxis]) -> list[list[int]]:
-    """Numbers of the axes that step together, group by group."""
+    """List the numbers of the axes that step together, group by group."""
     groups: dict[str, list[int]] = {}
     for number, axis in enumerate(axes):
         groups.setdefault(f"zip {axis.zip}" if axis.zip else f"axis {number}", []).append(number)
@@ -71,17 +71,17 @@ def group_axes(axes: Sequence[SweepAxis]) -> list[list[int]]:
 
 
 def count_runs(job: JobIn, groups: list[list[int]]) -> int:
-    """Number of runs that the crossed groups give."""
+    """Count the runs that the crossed groups give."""
     return prod(count_values(job.sweep.axes[numbers[0]]) for numbers in groups)
 
 
 def build_axis_groups(axes: Sequence[SweepAxis], groups: list[list[int]]) -> list[AxisGroup]:
-    """What each position of each group sets."""
+    """Build the groups of axes."""
     return [AxisGroup.from_axes(axes, numbers) for numbers in groups]
 
 
 def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> Iterator[SweepCell]:
-    """Cells of the crossed groups from number `start` on; one empty cell without axes."""
+    """Iterate over the crossed groups' cells from number `start`; without axes one empty cell."""
     lengths = [len(steps) for steps in groups]
     for number in range(start, prod(lengths)):
         values: dict[str, Any] = {}
@@ -94,7 +94,7 @@ def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> I
 
 
 def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:
-    """Position of a cell in each of the crossed groups, the last of which goes fastest."""
+    """Find the position of a cell in each of the crossed groups. The last group varies fastest."""
     found = []
     for length in reversed(lengths):
         number, position = divmod(number, length)
@@ -103,14 +103,14 @@ def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:
 
 
 def count_values(axis: SweepAxis) -> int:
-    """Number of values of an axis."""
+    """Count the values of an axis."""
     if axis.log is not None:
         return axis.log[2]
     return len(axis.values if axis.values is not None else range(*(axis.range or [0])))
 
 
 def expand_values(axis: SweepAxis) -> Sequence[Any]:
-    """Values of an axis."""
+    """List the values of an axis."""
     if axis.values is not None:
         return axis.values
     if axis.range is not None:
@@ -124,7 +124,7 @@ def expand_values(axis: SweepAxis) -> Sequence[Any]:
 
 
 def _to_whole_number(value: float) -> float | int:
-    """A whole number as such, so that fields of whole numbers take it."""
+    """Convert whole numbers to int, so that integer fields accept them."""
     return int(value) if value.is_integer() and value < 2**53 else value
 
 
@@ -134,7 +134,7 @@ def _build_pointer(number: int, axis: SweepAxis, position: int) -> str:
 
 
 def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
-    """What is wrong with the axes themselves: paths, lengths, labels."""
+    """Report faults of the axes themselves: paths, lengths, labels."""
     document = job.to_normal_form()
     lengths: dict[str, int] = {}
     seen: set[str] = set()
@@ -164,7 +164,7 @@ def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
 
 
 def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]:
-    """Names that a database cannot look up in a document, which would merge its groups."""
+    """Report label names that a database cannot look up in a document, which would merge groups."""
     for position, labels in enumerate(axis.labels or ()):
         for name in labels:
             if (
@@ -177,7 +177,7 @@ def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]
                     f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable "
                     "characters without quotation marks and backslashes",
                 )
-                return  # the other positions mostly have the same names
+                return  # the other positions usually have the same names
 
 
 def _describe_bad_spacing(axis: SweepAxis) -> str | None:
@@ -192,12 +192,12 @@ def _describe_bad_spacing(axis: SweepAxis) -> str | None:
 
 
 def _describe_unknown_path(document: Mapping[str, Any], path: str) -> str | None:
-    """Why a path is not a field of the body, or None."""
+    """Explain why a path is not a field of the body, or return None."""
     parts = split_pointer(path)
     if parts[0] in UNSWEPT_FIELDS:
         return f"{path!r} cannot be swept"
     if parts[0] in ("channels", "weights") and len(parts) == 2:
-        return None  # which signals there are, the check of each value tells
+        return None  # the check of each value reports unknown signals
     if parts[0] == "parameters" and len(parts) in (2, 3):
         return None
     here: Any = document

@@ -1,4 +1,4 @@
-"""What can be known of a job before it runs: every fault is found here, and found now."""
+"""Checks of a job before it runs. Every fault that can be detected is reported at once."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -33,25 +33,25 @@ from sysid.models.polynomial import check_candidate_count
 from sysid.models.ties import apply_ties, resolve_ties
 
 JobBody = dict[str, Any]
-MOST_NAMED_EXPERIMENTS = 1000  # experiments that are believed before they are known
-MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
+MOST_NAMED_EXPERIMENTS = 1000  # experiments assumed while datasets are missing
+MOST_GENES = 10_000_000  # individuals × parameters: 80 MB for each copy of a population
 
 
 class JobChecker:
-    """Checks bodies of one job against what is stored; what it has read it remembers.
+    """Checks the bodies of one job against stored data; it caches what it has read.
 
-    `errors` of a body has every fault in it. A body without faults has, in `resolved`, its
-    datasets as identifiers and an own model as its document.
+    `find_faults` reports every fault of a body. `resolve_body` replaces names of datasets by
+    identifiers, and the model of a valid body by its document.
     """
 
     def __init__(self, session: Session, unstored: Iterable[Dataset] = ()) -> None:
-        """`unstored`: datasets that are known by their identifiers before they are stored."""
+        """`unstored` are datasets that already have identifiers but are not stored yet."""
         self._session = session
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
         self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
     def find_faults(self, body: JobBody) -> list[FieldError]:
-        """Every fault of a body in its normal form."""
+        """List every fault of a body in its normal form."""
         found = [*find_setting_conflicts(body), *self._find_missing_datasets(body)]
         known = self.resolve_model(body["model"])
         if isinstance(known, list):
@@ -75,7 +75,7 @@ class JobChecker:
         return found + list(find_signal_faults(body, model))
 
     def resolve_body(self, body: JobBody) -> JobBody:
-        """The body with identifiers of datasets, and an own model as its document."""
+        """Resolve a body: identifiers for datasets, the document for a model of its own."""
         model = self.resolve_model(body["model"])
         assert not isinstance(model, list)
         body = {**body, "model": model[1], "datasets": self.resolve_dataset_ids(body["datasets"])}
@@ -89,11 +89,11 @@ class JobChecker:
         return body
 
     def resolve_warm_start(self, reference: str | None) -> str | None:
-        """The run that is meant now: what is accepted later does not change a job that waits."""
+        """Resolve the run that is meant now. Later acceptances do not change a queued job."""
         return warm_starts.resolve_warm_start(self._session, reference)
 
     def resolve_model(self, reference: Any) -> tuple[Model, Any] | list[FieldError]:
-        """The model and what to store for it, or what is wrong with it."""
+        """Return the model and the value to store for it, or its faults."""
         key = repr(reference)
         if key not in self._models:
             try:
@@ -105,20 +105,20 @@ class JobChecker:
         return self._models[key]
 
     def resolve_dataset_ids(self, references: list[str]) -> list[str]:
-        """Identifiers of datasets that are known to be there."""
+        """List the identifiers of datasets that exist."""
         found = (self.get_dataset(reference) for reference in references)
         return [one.id for one in found if isinstance(one, Dataset)]
 
     def get_dataset(self, reference: str) -> Dataset | str:
-        """The dataset of that identifier or name, or why there is none."""
+        """Return the dataset with this identifier or name, or why there is none."""
         if reference not in self._datasets:
             self._datasets[reference] = resolve_dataset(self._session, reference)
         return self._datasets[reference]
 
     def _list_parameters(self, body: JobBody, model: Model) -> tuple[Parameter, ...]:
-        """The model's parameters, and the initial states to be estimated in each experiment.
+        """List the model's parameters and the initial states to be estimated in each experiment.
 
-        Of datasets that are missing, as many experiments as are named.
+        If datasets are missing, the named experiments are counted instead.
         """
         found = [self.get_dataset(reference) for reference in body["datasets"]]
         pieces = sum(count_experiments(one) for one in found if isinstance(one, Dataset))
@@ -129,14 +129,14 @@ class JobChecker:
         return (*model.parameters, *build_initial_parameters(model, pieces))
 
     def _count_samples(self, body: JobBody) -> int:
-        """Samples of all datasets for the estimate together; a dataset that is missing has many."""
+        """Count the samples of all estimation datasets. A missing dataset counts as very long."""
         found = [self.get_dataset(reference) for reference in body["datasets"]]
         if not all(isinstance(one, Dataset) for one in found):
             return MOST_GENES
         return sum(one.n_samples for one in found if isinstance(one, Dataset))
 
     def _count_scored_samples(self, body: JobBody, model: Model) -> int:
-        """Samples of all outputs that are fitted, if none is missing."""
+        """Count the fitted samples of all outputs, if no dataset is missing."""
         kept: float = (body["validation"] or {}).get("fraction") or 0.0
         samples = self._count_samples(body)
         skipped = body["skip"] * len(body["datasets"])
@@ -149,7 +149,7 @@ class JobChecker:
                 yield FieldError(pointer, dataset)
 
     def _find_repeated_recordings(self, body: JobBody) -> Iterator[FieldError]:
-        """Datasets that are named twice, or kept for validation though they are fitted."""
+        """Report datasets that are named twice, or used for both estimation and validation."""
         places: dict[str, tuple[str, str]] = {}
         for pointer, reference in _list_dataset_references(body):
             dataset = self.get_dataset(reference)
@@ -200,13 +200,12 @@ class JobChecker:
     def _find_sample_faults(
         self, body: JobBody, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
-        if (
-            model.rule is None
-        ):  # of candidates not all are kept; `check_candidate_count` looks at them
+        # Not all candidate terms are selected: `check_candidate_count` checks those models.
+        if model.rule is None:
             yield from _check_sample_count(parameters, self._count_scored_samples(body, model))
 
     def _list_datasets(self, body: JobBody) -> list[tuple[str, Dataset]]:
-        """The datasets of a body that there are, with their places."""
+        """List the existing datasets of a body with their pointers."""
         found = (
             (pointer, self.get_dataset(reference))
             for pointer, reference in _list_dataset_references(body)
@@ -215,7 +214,7 @@ class JobChecker:
 
 
 def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
-    """What the wire type says against a body into which a sweep put a value."""
+    """Report type faults of a body into which a sweep put a value."""
     try:
         JobIn.model_validate(body)
     except ValidationError as error:
@@ -227,7 +226,7 @@ def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
 def _find_unused_parameters(
     model: Model, parameters: tuple[Parameter, ...], weights: Mapping[str, float] | None
 ) -> list[FieldError]:
-    """Parameters that no output depends on, and the like."""
+    """Report parameters that affect no output, and similar unused settings."""
     return [
         FieldError(one.pointer, one.detail)
         for one in find_unused_settings(model, parameters, weights)
@@ -266,7 +265,7 @@ def _find_freedom_faults(
 
 
 def fault_in_job(reference: Any, fault: FieldError) -> FieldError:
-    """A fault of a model at its place in the job that names the model or holds it."""
+    """Move the fault of a model to its pointer in the job that names or contains the model."""
     if isinstance(reference, Mapping):
         return FieldError("/model" + fault.pointer, fault.detail, fault.column)
     return fault

@@ -1,4 +1,4 @@
-"""The parameters that a job has: its model's, and the starts of every experiment that it fits."""
+"""Parameters of a job: those of its model, and the initial states of every fitted experiment."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -16,16 +16,16 @@ _NUMBERED = re.compile(r"\(0\)\[(\d{1,6})\]$")
 
 
 def count_experiments(dataset: Dataset) -> int:
-    """Each segment of a recording is an experiment of its own; without segments it is one."""
+    """Count the experiments of a dataset: its segments, or one without segments."""
     return max(1, len(dataset.details.get("segments") or ()))
 
 
 def list_job_parameters(
     session: Session, model: Model, body: Mapping[str, Any]
 ) -> tuple[Parameter, ...]:
-    """All parameters of a job that was accepted, in their order.
+    """List all parameters of an accepted job, in order.
 
-    Of datasets that were deleted since nothing is known but what the body names, such as the start
+    For datasets deleted since, only the names in the body are known, such as the initial state
     ``x(0)[3]``.
     """
     repository, experiments = DatasetRepository(session), 0
@@ -39,6 +39,6 @@ def list_job_parameters(
 
 
 def count_named_experiments(parameters: Iterable[str]) -> int:
-    """How many experiments there are at least, by the starts that are named."""
+    """Count the experiments that the named initial states imply (a lower bound)."""
     named = (_NUMBERED.search(name) for name in parameters)
     return max((int(one[1]) for one in named if one), default=1)

@@ -1,8 +1,6 @@
-"""What can be known of the records of a job before it runs: channels, units, lengths.
+"""Checks of records and settings before a job runs: channels, units, lengths, conflicts.
 
-What is wrong with the settings of a body, whatever records there are.
-
-It needs no database, so that the command line checks as the service does.
+They need no database, so that the command line checks as the service does.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RecordLength:
-    """What is known of the length of one record; `words` say which part of it is meant."""
+    """Length of one record; `part` names the part that is meant."""
 
     duration: float
     samples: int
@@ -34,24 +32,24 @@ class RecordLength:
     part: str = ""
 
     def take_estimation_part(self, fraction: float) -> "RecordLength | None":
-        """The part for estimation; None if it, or the part for validation, has no sample."""
+        """Return the estimation part; None if it or the validation part has no sample."""
         left = self.samples - round(fraction * self.samples)
         if not 0 < left < self.samples:
             return None
-        # Where an irregular record is cut is not known here: its whole length is asked for.
+        # The cut of an irregular record is unknown here, so its whole length is checked.
         duration = self.duration if self.period is None else (left - 1) * self.period
         return RecordLength(duration, left, self.period, "estimation part: ")
 
 
 def list_signals(model: Model) -> tuple[list[str], list[str]]:
-    """Names of a model's inputs and outputs: the signals that channels are given to."""
+    """List the names of a model's inputs and outputs, to which channels are mapped."""
     return [one.name for one in model.inputs], [one.name for one in model.outputs]
 
 
 def find_channel_faults(
     channels: Mapping[str, str], model: Model, dataset: "Dataset"
 ) -> Iterator[FieldError]:
-    """Signals of the model for which a dataset has no channel."""
+    """Report signals of the model for which a dataset has no channel."""
     known = [channel["name"] for channel in dataset.channels]
     for signal, channel in map_channels(model, channels).by_signal.items():
         if channel not in known:
@@ -63,7 +61,7 @@ def find_channel_faults(
 
 
 def find_channels_given_twice(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
-    """Inputs to which the channel of an output is given."""
+    """Report inputs that are mapped to the channel of an output."""
     mapped = map_channels(model, channels)
     for signal, fault in find_shared_channels(dict(mapped.inputs), dict(mapped.outputs)).items():
         yield FieldError(f"/channels/{signal}" if signal in channels else "/channels", fault)
@@ -72,12 +70,12 @@ def find_channels_given_twice(channels: Mapping[str, str], model: Model) -> Iter
 def find_unit_faults(
     model: Model, channels: Mapping[str, str], datasets: "Sequence[tuple[str, Dataset]]"
 ) -> Iterator[FieldError]:
-    """Channels in another unit than the model has, or than a dataset before has.
+    """Report channels whose unit differs from the model's or from an earlier dataset's.
 
     Parameters
     ----------
     datasets : sequence of (str, Dataset)
-        Each with its place in the job body.
+        Each with its pointer in the job body.
     """
     units = SignalUnits(model)
     by_signal = map_channels(model, channels).by_signal
@@ -92,12 +90,12 @@ def find_unit_faults(
 
 
 def list_record_lengths(dataset: "Dataset") -> list[RecordLength]:
-    """The records that a dataset gives: its segments, or all of it."""
+    """List the lengths of a dataset's records: its segments, or the whole dataset."""
     period = dataset.sample_time
     spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
     if not spans:
         return [RecordLength(dataset.duration, dataset.n_samples, period)]
-    if period is None:  # how many samples each has is not stored; all together are enough to ask
+    if period is None:  # samples per segment are not stored: the total suffices
         return [RecordLength(min(spans), dataset.n_samples, None)]
     return [RecordLength(span, round(span / period) + 1, period) for span in sorted(set(spans))]
 
@@ -105,7 +103,7 @@ def list_record_lengths(dataset: "Dataset") -> list[RecordLength]:
 def find_length_faults(
     pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: RecordLength, skip: int
 ) -> Iterator[FieldError]:
-    """Lags that may reach back as far as a piece lasts, and a memory that it does not fill."""
+    """Report delays longer than a record, and a record shorter than the model's memory."""
     period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
     substeps = model.solver.substeps
     error = _check_longest_delay(model, parameters, period / substeps, piece.duration)
@@ -122,7 +120,7 @@ def find_length_faults(
 def _check_longest_delay(
     model: Model, parameters: tuple[Parameter, ...], step: float, duration: float
 ) -> RecordTooShort | None:
-    """What is wrong with the longest of the lags, if it is too long."""
+    """Return the error of the longest delay, if it is too long."""
     if not duration > 0:
         return RecordTooShort(duration, 0.0, "a simulation")
     spans = {p.name: get_interval(p) for p in parameters}
@@ -141,7 +139,7 @@ JobBody = dict[str, Any]
 
 
 def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
-    """Channels, holds and weights of signals that the model does not have."""
+    """Report channels, holds and weights of signals that the model does not have."""
     inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
     for name in body["channels"]:
         if name not in (*inputs, *outputs):
@@ -162,7 +160,7 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
 
 
 def find_setting_conflicts(body: JobBody) -> list[FieldError]:
-    """Settings of search and loss that do not go together."""
+    """Report settings of search and loss that conflict."""
     found: list[FieldError] = []
     collect_faults(to_algorithm, found, body["algorithm"])
     collect_faults(to_loss, found, body["loss"])
@@ -175,7 +173,7 @@ def find_setting_conflicts(body: JobBody) -> list[FieldError]:
 def find_setting_faults(
     body: JobBody, model: Model, parameters: tuple[Parameter, ...]
 ) -> list[FieldError]:
-    """Faults of a body that its model shows: names that it does not have, values that are none."""
+    """Report faults that the model reveals: unknown names and invalid values."""
     found = find_setting_conflicts(body)
     override_by_request(found, parameters, body["parameters"])
     return [*found, *find_signal_faults(body, model)]
@@ -184,7 +182,7 @@ def find_setting_faults(
 def override_by_request(
     errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
 ) -> tuple[Parameter, ...]:
-    """The parameters with all changes that can be made; of each of the others its fault."""
+    """Apply all valid parameter changes, and collect the faults of the others."""
     for name, change in changes.items():
         parameters = (
             collect_faults(override_parameters, errors, parameters, {name: change}) or parameters
@@ -193,7 +191,7 @@ def override_by_request(
 
 
 def collect_faults(make: Any, errors: list[FieldError], *arguments: Any) -> Any:
-    """What `make` gives; None where it raises, and its faults among `errors`."""
+    """Call `make` and return its result. If it raises, return None and append to `errors`."""
     try:
         return make(*arguments)
     except SysidError as error:

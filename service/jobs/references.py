@@ -1,4 +1,4 @@
-"""Use cases of references: accept a run under a name, read them, find the run to start from."""
+"""Use cases of references: accept a run under a name, read references, resolve a warm start."""
 
 from sqlalchemy.orm import Session
 
@@ -23,8 +23,7 @@ def accept_reference(session: Session, name: str, body: ReferenceIn) -> Referenc
     Raises
     ------
     InvalidRequest
-        If the name cannot be used, or there is no such run, or it did not succeed, or the name
-        stands for another model.
+        If the name is invalid or stands for another model, or if there is no such successful run.
     """
     _check_name(name)
     run = _get_succeeded_run(session, body.run, "/run")
@@ -34,7 +33,7 @@ def accept_reference(session: Session, name: str, body: ReferenceIn) -> Referenc
 
 
 def get_reference(session: Session, name: str) -> ReferenceOut:
-    """A reference with its history; `RowNotFound` with the nearest name."""
+    """Read a reference with its history. `RowNotFound` suggests the nearest name."""
     repository = ReferenceRepository(session)
     try:
         latest, *before = repository.list_history(name)
@@ -47,18 +46,18 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
 
 
 def list_references(session: Session, cursor: str | None, limit: int) -> Page[ReferenceOut]:
-    """References in use, by name."""
+    """List the references in use, by name."""
     found = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
     return Page(items=[_to_reference_out(one, []) for one in found.items], next=found.next)
 
 
 def resolve_reference(session: Session, reference: str, pointer: str = "/warm_start") -> Run:
-    """The run that ``run_…`` or ``reference:name`` means.
+    """Find the run that ``run_…`` or ``reference:name`` means.
 
     Raises
     ------
     InvalidRequest
-        At the pointer, if there is none, or it did not succeed.
+        At the pointer, if there is no such run, or it did not succeed.
     """
     named = reference.removeprefix(REFERENCE_PREFIX)
     if named == reference:
@@ -75,7 +74,7 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
 
 
 def _check_name(name: str) -> None:
-    """Refuse names that could not be told from a run, or from the parts of a path."""
+    """Refuse names that look like a run's id or like parts of a path."""
     if not 1 <= len(name) <= MOST_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
         wanted = f"1 to {MOST_NAME_CHARACTERS} printable characters without outer blanks"
     elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
@@ -92,7 +91,7 @@ def _check_name(name: str) -> None:
 
 
 def _check_model(session: Session, name: str, run: Run) -> None:
-    """Refuse a run of another model than the one that a name stands for."""
+    """Refuse a run of another model than that of the name."""
     try:
         latest = ReferenceRepository(session).get_latest(name)
     except RowNotFound:

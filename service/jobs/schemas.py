@@ -1,9 +1,7 @@
-"""The job body and what is told about a job.
+"""Body of a job, and answers about jobs and accepted references.
 
-Names to choose from, defaults and bounds are those of `sysid.core.settings`. Where a bound is
-narrower than there, it is what one request may ask of a server.
-
-What is told about accepted references.
+Names, defaults and bounds are those of `sysid.core.settings`. A narrower bound here limits what one
+request may ask of a server.
 """
 
 from datetime import datetime
@@ -32,7 +30,7 @@ from sysid.data.records import Hold
 from sysid.models.parameters import ParameterScale
 
 SEARCH, LOSS = GeneticAlgorithm(), Loss()
-"""The settings of the core, for their defaults."""
+"""Core settings, which provide the defaults."""
 
 WholeNumber = Annotated[int, Field(gt=-(2**62), lt=2**62)]
 PositiveCount = Annotated[int, Field(ge=1, le=MAX_GENERATIONS)]
@@ -56,7 +54,7 @@ class ParameterIn(Body):
 
 
 class ValidationIn(Body):
-    """Data kept for validation: other datasets, or the last fraction of each record."""
+    """Validation data: other datasets, or the last fraction of each record."""
 
     datasets: list[str] | None = Field(default=None, min_length=1)
     fraction: float | None = Field(default=None, gt=0, lt=1)
@@ -69,10 +67,10 @@ class ValidationIn(Body):
 
 
 class LossIn(Body):
-    """What is minimised: squares, or soft-l1 with a scale in the output's unit.
+    """Loss function: squares, or soft-l1 with a scale in the output's unit.
 
-    With the noise model ar1 the estimates are those of generalised least squares in the end; auto
-    is that where residuals are coloured and the model does not forget where it began, else white.
+    The noise model ar1 gives generalised least-squares estimates. auto selects ar1 if the residuals
+    are coloured and the model integrates (initial errors persist), else white.
     """
 
     kind: LossKind = LOSS.kind
@@ -97,12 +95,13 @@ class MigrationIn(Body):
 
 
 class StopIn(Body):
-    """End conditions besides the generations.
+    """End conditions in addition to the generations.
 
-    `settled`: `improved` ends when searches from random places and from beside the best individual
-    found it again two times more than that, a third of all of them, the more of them the less those
-    from random places agree; where the fitness jumps nearby, that many of either kind, and nearly
-    all; null: never.
+    `settled`: `improved` stops once independent restarts have confirmed the best individual. This
+    takes `settled` + 2 confirmations, and a third of all restarts. Restarts begin at random places
+    and near the best individual. The fewer of the random ones agree, the more confirmations are
+    needed. If the fitness has jumps nearby, `settled` of either kind and nearly all restarts must
+    agree. Null disables it.
     """
 
     evaluations: EvaluationLimit | None = SEARCH.stop.evaluations
@@ -112,7 +111,7 @@ class StopIn(Body):
 
 
 class IslandIn(Body):
-    """What one island does otherwise."""
+    """Settings in which one island differs."""
 
     method: SearchMethod | None = None
     bits: Bits | None = None
@@ -142,11 +141,11 @@ AxisLabels = Annotated[dict[str, float | str], Field(max_length=32)]
 
 
 class SweepAxis(Body):
-    """One axis of a sweep: the field it changes and the values it takes.
+    """One axis of a sweep: the field it changes and its values.
 
-    Exactly one of `values`, `range` (start, stop[, step]; whole numbers, stop left out) and `log`
-    (start, stop, count; both ends taken) is given. Axes of one `zip` name step together; all
-    others are crossed. `labels` belong to the values, one each.
+    Give exactly one of `values`, `range` and `log`. `range` is start, stop[, step] in whole
+    numbers, without stop. `log` is start, stop, count, with both ends. Axes with the same `zip`
+    name step together; all others are crossed. `labels` belong to the values, one each.
     """
 
     path: Pointer
@@ -169,7 +168,7 @@ class SweepAxis(Body):
 
 
 class SweepIn(Body):
-    """A job of many runs: the crossed axes give one run a cell."""
+    """Sweep: the crossed axes give one run per cell."""
 
     axes: list[SweepAxis] = Field(default=[], max_length=16)
 
@@ -193,11 +192,11 @@ def _check_reference(value: str) -> str:
 
 
 LEAST_X, MOST_X = 1e-100, 1e100
-"""Sizes of x in a trend, whose squares are computed."""
+"""Magnitudes of x in a trend. Their squares must be finite."""
 
 
 def is_valid_x(value: float) -> bool:
-    """Whether a number can be the x of a trend."""
+    """Test whether a number can be the x of a trend."""
     return value == 0 or LEAST_X <= abs(value) <= MOST_X
 
 
@@ -213,11 +212,11 @@ TrendX = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_check_x)]
 
 
 class TrendIn(Body):
-    """How parameters depend on a label.
+    """Trend of parameters over a label.
 
-    `x` is the name of a label that is a number in every cell, `parameters` those to look at (all
-    that are free by default), `predict` the values of x for which predictions are wanted.
-    `reference` is a run (run_…, or `reference:` and a name) that the batch is compared with.
+    `x` names a label that is a number in every cell. `parameters` are those to analyse (by default
+    all free ones). `predict` are the values of x to predict at. `reference` is a run (run_…, or
+    `reference:` and a name) to compare the batch with.
     """
 
     x: str = Field(min_length=1, max_length=64)
@@ -227,7 +226,7 @@ class TrendIn(Body):
 
 
 def check_model_reference(value: Any) -> Any:
-    """A model as a body may give it: by name or as a document."""
+    """Check a model in a body: a name or a document."""
     if not isinstance(value, str | dict):
         raise PydanticCustomError(
             "model_reference",
@@ -237,7 +236,7 @@ def check_model_reference(value: Any) -> Any:
 
 
 class IdentificationIn(Body):
-    """What a job and the recipes that make jobs have in common: the model, and how to fit it."""
+    """Fields common to a job and to the recipes that make jobs: the model, and how to fit it."""
 
     name: str | None = Field(default=None, max_length=200)
     model: Annotated[Any, AfterValidator(check_model_reference)]
@@ -260,13 +259,13 @@ class IdentificationIn(Body):
         return check_depth(value)
 
     def dump_set_fields(self, *also: str) -> dict[str, Any]:
-        """These fields, and those named besides, as far as they were given."""
+        """Dump these fields and those in `also`, if they were set."""
         names = {*IdentificationIn.model_fields, *also}
         return self.model_dump(include=names, exclude_unset=True)
 
 
 class JobIn(IdentificationIn):
-    """A job: what is to be identified, from which data, and how."""
+    """Job: model, data, and how to identify."""
 
     datasets: list[str] = Field(min_length=1, max_length=1000)
     validation: ValidationIn | None = None
@@ -279,7 +278,7 @@ class JobIn(IdentificationIn):
     trend: TrendIn | None = None
 
     def to_normal_form(self) -> dict[str, Any]:
-        """The body with every default written out, as it is stored and handed to workers."""
+        """Return the body with every default written out, as it is stored and sent to workers."""
         document = self.model_dump(mode="json")
         document["parameters"] = {
             name: change.model_dump(mode="json", exclude_none=True)
@@ -289,7 +288,7 @@ class JobIn(IdentificationIn):
 
 
 class ProgressOut(Answer):
-    """How far a job has come."""
+    """Progress of a job."""
 
     runs: int
     finished: int
@@ -326,7 +325,7 @@ class JobOut(Answer):
 
 
 class ReferenceIn(Body):
-    """Accept a run as the reference of a name; `by` and `note` are kept with it."""
+    """Acceptance of a run as a reference; `by` and `note` are stored with it."""
 
     run: str = Field(max_length=100)
     by: str | None = Field(default=None, max_length=200)
@@ -343,7 +342,7 @@ class AcceptanceOut(Answer):
 
 
 class ReferenceOut(Answer):
-    """A reference: the run in use, what it gave, and what was accepted before it."""
+    """Reference: the run in use, its estimates, and earlier acceptances."""
 
     name: str
     run: str

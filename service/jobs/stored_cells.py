@@ -1,8 +1,8 @@
-"""The cells of a job that is stored: those that were made when it was submitted, and the others.
+"""Cells of a stored job: the first are stored at submission, the others later.
 
-A sweep of 100,000 runs is one row and its first cells when it is submitted. The dispatcher that
-has the job makes the others as it comes to them, from the axes as they are stored: what their
-values name was found at submission, so that a name that means something else later changes nothing.
+Submission stores a sweep of 100,000 runs as one row and its first cells. The dispatcher that holds
+the job creates the others from the stored axes when it needs them. Names in axis values are
+resolved at submission. A name that changes its meaning later therefore changes nothing.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,14 +16,14 @@ from service.queue.run_writes import NewRun as StoredCell
 from service.storage.columns import Document
 
 CELLS_AT_SUBMISSION = 2_000
-"""Cells that are made at submission; most jobs have no more."""
+"""Cells created at submission. Most jobs have no more."""
 
 REFERENCE_FIELDS = ("/model", "/datasets", "/validation", "/warm_start")
-"""Fields that name what is stored, or hold such names."""
+"""Fields that name stored objects or contain such names."""
 
 
 def read_axis_groups(spec: Mapping[str, Any]) -> list[AxisGroup]:
-    """The crossed groups of a stored job's axes."""
+    """Read the crossed groups of a stored job's axes."""
     axes = SweepIn.model_validate(spec["sweep"]).axes
     return build_axis_groups(axes, group_axes(axes))
 
@@ -31,7 +31,7 @@ def read_axis_groups(spec: Mapping[str, Any]) -> list[AxisGroup]:
 def build_stored_cells(
     spec: Mapping[str, Any], groups: list[AxisGroup], start: int = 0
 ) -> Iterator[StoredCell]:
-    """The rows of a job's runs, from number `start` on."""
+    """Build the rows of a job's runs from number `start`."""
     for number, cell in enumerate(iterate_cells(groups, start), start):
         yield StoredCell(
             number=number,
@@ -44,12 +44,12 @@ def build_stored_cells(
 
 
 def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -> list[Document]:
-    """The axes of a checked job with identifiers for names, and objects with their defaults.
+    """Resolve the axes of a checked job: names to identifiers, objects with their defaults.
 
     Parameters
     ----------
     spec : dict
-        The body as `JobChecker.resolve_body` gives it.
+        The body from `JobChecker.resolve_body`.
     """
     axes = [dict(axis) for axis in spec["sweep"]["axes"]]
     for steps in groups:
@@ -68,7 +68,7 @@ def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -
 
 
 def _resolve_values(checker: JobChecker, spec: Document, cell: SweepCell) -> dict[str, Any]:
-    """The values of one step as they are stored."""
+    """Return the values of one step as they are stored."""
     whole = checker.resolve_body(
         JobIn.model_validate(build_run_body(spec, cell.values)).to_normal_form()
     )
@@ -87,7 +87,7 @@ def _is_object(value: Any) -> bool:
 
 
 def _find_field_value(spec: Mapping[str, Any], cell: SweepCell, *parts: str) -> Any:
-    """A field of the run's body, found without making the body."""
+    """Find the value of a field in the run's body without building the body."""
     path = "/" + "/".join(parts)
     if path in cell.values:
         return cell.values[path]

@@ -1,6 +1,6 @@
-"""A run as it is stored: its rows, its own request, and its model.
+"""Stored run: its rows, its own request, and its model.
 
-It lies in `jobs`, because a run's request is its job's; all that uses runs lies above.
+It is in `jobs` because a run's request is its job's. Everything that uses runs is in higher layers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredRun:
-    """A run with what it means.
+    """Stored run with its request and model.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class StoredRun:
         The job's request with the values of the run's cell in it.
     model : Model
         With the terms that were selected on the run's data. A run that selects terms has all
-        candidates and a `rule` until it has its result.
+        candidates and a `rule` until it has a result.
     """
 
     job: Job
@@ -53,18 +53,18 @@ class StoredRun:
 
     @classmethod
     def from_rows(cls, job: Job, run: Run) -> "StoredRun":
-        """Make the value from the rows of a run and its job."""
+        """Build the value from the rows of a run and its job."""
         body = build_run_body(job.spec, run.cell)
         return cls(job, run, body, apply_selection(load_stored_model(body["model"]), run.result))
 
     @property
     def requested_model(self) -> Model:
-        """The model as the request has it: with all its candidate terms."""
+        """The model as requested, with all its candidate terms."""
         return load_stored_model(self.body["model"])
 
     @property
     def result(self) -> Mapping[str, Any]:
-        """The result document; empty as long as there is none."""
+        """The result document; empty until there is one."""
         return self.run.result or {}
 
     @property
@@ -83,7 +83,7 @@ class StoredRun:
         return find_rms_unit(session, self.body)
 
     def parameters(self, session: Session) -> tuple[Parameter, ...]:
-        """Give all parameters with the job's changes, starts of all experiments included."""
+        """List all parameters with the job's changes, and the initial states of all experiments."""
         parameters = list_job_parameters(session, self.model, self.body)
         return override_parameters(parameters, self._changes(parameters))
 
@@ -101,7 +101,7 @@ class StoredRun:
         return read_records(store, rows, self.channels)
 
     def records(self, session: Session, store: ObjectStore) -> list[Record]:
-        """Read the records that the run was fitted to: without validation, with added noise."""
+        """Read the records that the run was fitted to: no validation part, noise added."""
         records: Sequence[Record] = self.read_datasets(session, store, self.body["datasets"])
         fraction = (self.body["validation"] or {}).get("fraction")
         if fraction is not None:
@@ -111,7 +111,7 @@ class StoredRun:
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
         """Build the problem that the run solved."""
-        # The compiler comes with this import.
+        # This imports the compiler.
         from sysid.simulation.problem import Problem
 
         records = self.records(session, store)
@@ -121,7 +121,7 @@ class StoredRun:
         return Problem.from_settings(self.model, records, fit_settings_of(body))
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
-        """Changes of these parameters; the request may name terms that were not selected."""
+        """Select the changes of these parameters. The request may name unselected terms."""
         names = {parameter.name for parameter in parameters}
         return {name: one for name, one in self.body["parameters"].items() if name in names}
 
@@ -144,7 +144,7 @@ def load_estimated_run(session: Session, run_id: str, purpose: str) -> StoredRun
     Parameters
     ----------
     purpose : str
-        What the estimates are for, as the message says: "to …".
+        Purpose of the estimates for the message: "to …".
 
     Raises
     ------

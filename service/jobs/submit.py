@@ -34,7 +34,7 @@ from service.storage.tables import Dataset, Job
 
 @dataclass(frozen=True, slots=True)
 class CheckedJob:
-    """A job that can be queued: what was asked for, by its digest, and what is stored of it."""
+    """Checked job that can be queued: row to store, digest of its body, and its first cells."""
 
     job: NewJob
     digest: str
@@ -44,18 +44,18 @@ class CheckedJob:
 def submit_job(
     database: Database, body: JobIn, settings: Settings, key: str | None = None
 ) -> JobOut:
-    """Queue a job with its first runs; the dispatcher makes the others as it comes to them.
+    """Queue a job with its first runs. The dispatcher creates the other runs later.
 
-    SQLite's one write lock is held for its rows only, not while it is checked.
+    SQLite's only write lock is held for the rows only, not during the checks.
 
     Raises
     ------
     InvalidRequest
-        With every fault that can be known before the job runs.
+        With every fault that can be detected before the job runs.
     KeyReused
         If the idempotency key was used with another body.
-    TooMuchUnfinished
-        If its project has as much queued and running as it may.
+    QuotaExceeded
+        If the project has too many jobs or runs queued and running.
     """
     with database.read_session() as session:
         checked = check_job(session, body, settings)
@@ -66,14 +66,14 @@ def submit_job(
 def check_job(
     session: Session, body: JobIn, settings: Settings, unstored: Iterable[Dataset] = ()
 ) -> CheckedJob:
-    """The job as it will be stored: with identifiers for names, also in its axes.
+    """Check a job and resolve names to identifiers, also in its axes.
 
     `unstored` are datasets that it may name before they are stored.
 
     Raises
     ------
     InvalidRequest
-        With every fault that can be known before the job runs.
+        With every fault that can be detected before the job runs.
     """
     document = body.to_normal_form()
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
@@ -99,14 +99,14 @@ def check_job(
 def store_job(
     session: Session, checked: CheckedJob, settings: Settings, key: str | None = None
 ) -> Submission:
-    """Write a job that was checked, and its first runs.
+    """Store a checked job and its first runs.
 
     Raises
     ------
     KeyReused
         If the idempotency key was used with another body.
-    TooMuchUnfinished
-        If its project has as much queued and running as it may.
+    QuotaExceeded
+        If the project has too many jobs or runs queued and running.
     """
     submission = JobRepository(session).submit(checked.job, key=key, request_hash=checked.digest)
     if submission.is_new:
@@ -121,11 +121,11 @@ def store_job(
 
 
 def check_limits(session: Session, job: Job, settings: Settings) -> None:
-    """Refuse a job that was just queued if its project now has more unfinished than it may.
+    """Refuse a job just queued if its project now exceeds its limits of unfinished work.
 
     Raises
     ------
-    TooMuchUnfinished
+    QuotaExceeded
         With the counts; the caller's transaction ends with it.
     """
     open_now = count_unfinished(session, job.project_id)
@@ -149,8 +149,8 @@ def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
     ------
     Conflict
         If it is in another state.
-    TooMuchUnfinished
-        If its project has as much queued and running as it may.
+    QuotaExceeded
+        If the project has too many jobs or runs queued and running.
     """
     job = JobRepository(session).resume(job_id)
     check_limits(session, job, settings)
@@ -166,7 +166,7 @@ def clone_job(database: Database, job_id: str, settings: Settings) -> JobOut:
 
 
 def to_job_out(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
-    """A job as it is told."""
+    """Build the answer for a job."""
     model = job.spec["model"]
     return JobOut.from_source(
         job,
@@ -186,7 +186,7 @@ def to_job_out(job: Job, *, with_request: bool = False, rms_unit: str | None = N
 def list_jobs(
     session: Session, cursor: str | None, limit: int, states: list[JobState]
 ) -> Page[JobOut]:
-    """Jobs, latest first."""
+    """List jobs, latest first."""
     found = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
     items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in found.items]
     return Page(items=items, next=found.next)

@@ -1,6 +1,6 @@
-"""Faults of a job with axes: of the job itself, of every value that an axis gives, of its trend.
+"""Checks of a job with axes: the job itself, every axis value, and its trend.
 
-Whether a trend can be made of a job's runs: every one needs its place on the axis.
+A trend needs a numeric label on every run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence, Set
@@ -28,7 +28,7 @@ from sysid.models.model import Model
 
 
 def find_trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
-    """Labels that are missing or no numbers, what the model or the reference does not have."""
+    """Report labels that are missing or not numbers, and names that model or reference lack."""
     if job.warm_start == PREVIOUS and not job.sweep.axes:
         yield FieldError("/warm_start", "'previous' needs a sweep, but this job has one run")
     if job.trend is None:
@@ -75,23 +75,23 @@ def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
             )
 
 
-# Fields that no other field depends on: their values are checked alone, a whole body for each of
-# a hundred thousand seeds would only take time.
+# No other field depends on these fields, so their values are checked alone. A whole body for each
+# of a hundred thousand seeds would take too long.
 INDEPENDENT_FIELDS: Mapping[str, TypeAdapter[Any]] = {
     "/seed": TypeAdapter(Seed),
     "/noise/seed": TypeAdapter(Seed),
     "/noise/sigma": TypeAdapter(Sigma),
 }
 MOST_FAULTY_VALUES = 200
-"""Values that cannot be used, after which no more are looked at: of some that takes 2 ms each."""
+"""Faulty values after which the check ends. Some checks take 2 ms per value."""
 
 
 def find_job_faults(
     session: Session, checker: JobChecker, body: JobIn, most_runs: int
 ) -> list[FieldError]:
-    """Every fault that can be known before the job runs.
+    """List every fault that can be detected before the job runs.
 
-    Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
+    Axis values are checked only if the axes are valid and give at most `most_runs` runs.
     """
     document = body.to_normal_form()
     found = list(find_axis_faults(body))
@@ -118,7 +118,7 @@ def find_job_faults(
 
 
 def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
-    """Recordings that a trend would take for measured at two places, or twice at one."""
+    """Report recordings that a trend would count at two labels, or twice at one."""
     if body.trend is None:
         return
     for number, axis in enumerate(body.sweep.axes):
@@ -128,7 +128,9 @@ def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[Fiel
         for position, (given, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
             x = labels.get(body.trend.x)
             names = given if isinstance(given, list) else [given]
-            for name in (one for one in names if isinstance(one, str)):  # others are told before
+            for name in (
+                one for one in names if isinstance(one, str)
+            ):  # others are reported earlier
                 dataset = checker.get_dataset(name)
                 key = dataset if isinstance(dataset, str) else dataset.sha256
                 at, before = first.setdefault(key, (position, (x, name)))
@@ -146,9 +148,9 @@ def _find_value_faults(
     groups: Sequence[Sequence[AxisPosition]],
     known: Set[FieldError],
 ) -> Iterator[FieldError]:
-    """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
+    """Report faults of axis values; for a range or a logarithmic axis only the first one.
 
-    What the job has without its axes is `known`, and not told of every value again.
+    `known` are the faults of the job without its axes. They are not repeated for every value.
     """
     told: set[str] = set()
     n_wrong = 0
@@ -168,7 +170,7 @@ def _find_value_faults(
 
 
 def _find_type_mismatches(step: AxisPosition, whole: dict[str, Any]) -> Iterator[FieldError]:
-    """Values that a body would take for others, as '3' for 3: workers take a cell's as they are."""
+    """Report values that the body would convert, such as '3' to 3; workers use them unconverted."""
     for path, value in step.cell.values.items():
         if not isinstance(value, str | bool | float):
             continue

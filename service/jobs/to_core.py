@@ -1,6 +1,6 @@
-"""From the documents that are stored and sent to the values of the numerical core.
+"""Conversion of stored and wire documents to values of the numerical core.
 
-It stands apart from the wire types, so that a client loads no NumPy.
+It is separate from the wire types, so that a client does not load NumPy.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from sysid.core.settings import (
 
 
 def to_algorithm(document: Mapping[str, Any]) -> GeneticAlgorithm:
-    """Settings of the search, from the ``algorithm`` of a job body in its normal form.
+    """Build the search settings from the ``algorithm`` of a job body in its normal form.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def to_algorithm(document: Mapping[str, Any]) -> GeneticAlgorithm:
 
 
 def to_loss(document: Mapping[str, Any]) -> Loss:
-    """What is minimised, from the ``loss`` of a job body.
+    """Build the loss from the ``loss`` of a job body.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def to_loss(document: Mapping[str, Any]) -> Loss:
 
 
 def fit_settings_of(body: Mapping[str, Any]) -> FitSettings:
-    """What a fit takes besides its model and its records, from a job body in its normal form.
+    """Build the fit settings, without model and records, from a job body in its normal form.
 
     Raises
     ------

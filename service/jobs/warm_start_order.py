@@ -1,4 +1,4 @@
-"""Which run of a sweep comes before which: what ``"warm_start": "previous"`` follows."""
+"""Order of warm starts in a sweep: which run ``"warm_start": "previous"`` refers to."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from service.jobs.schemas import SweepAxis
 
 @dataclass(frozen=True, slots=True)
 class ChainLayout:
-    """Runs that differ in one group of axes only, in the order of its values.
+    """Chains of runs that differ in one group of axes only, in the order of its values.
 
     Attributes
     ----------
     stride : int
-        Between the numbers of a run and of the one before it.
+        Difference between the numbers of a run and of the previous one.
     length : int
-        Values of that group.
+        Number of values of that group.
     """
 
     stride: int
@@ -24,9 +24,9 @@ class ChainLayout:
 
     @classmethod
     def from_axes(cls, axes: Sequence[SweepAxis]) -> "ChainLayout | None":
-        """The chain along the axis that has labels, else over datasets, else the first.
+        """Choose the chain axis: the one with labels, else the one over datasets, else the first.
 
-        Its other axes go in parallel, each with a chain of its own. None without axes.
+        The values of the other axes give parallel chains. None without axes.
         """
         groups = group_axes(axes)
         if not groups:
@@ -39,17 +39,17 @@ class ChainLayout:
         return cls(stride, lengths[chosen])
 
     def find_previous(self, number: int) -> int | None:
-        """Number of the run before that one; None for the first of its chain."""
+        """Return the number of the previous run; None for the first of its chain."""
         first = number // self.stride % self.length == 0
         return None if first else number - self.stride
 
     def find_chain(self, number: int) -> int:
-        """Number of the chain of a run: chains are counted in the order of their first runs."""
+        """Return the chain number of a run. Chains are numbered by their first runs."""
         block, place = divmod(number, self.stride * self.length)
         return block * self.stride + place % self.stride
 
     def list_runs(self, chain: int) -> range:
-        """Numbers of the runs of a chain, in its order."""
+        """List the numbers of the runs of a chain, in order."""
         block, place = divmod(chain, self.stride)
         first = block * self.stride * self.length + place
         return range(first, first + self.stride * self.length, self.stride)

@@ -1,4 +1,4 @@
-"""Whether a run can be started from another's estimates, and which run a reference means."""
+"""Checks whether a run can start from another's estimates, and resolution of references."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,10 +19,10 @@ WARM_START_POINTER = "/warm_start"
 def find_warm_start_faults(
     session: Session, reference: str | None, model: Model, pointer: str = WARM_START_POINTER
 ) -> list[FieldError]:
-    """Why a body's warm start, or reference, cannot be used: no such run, or of another model.
+    """Report why a warm start or reference cannot be used: no such run, or another model.
 
-    A reference stands for a model. A run that is named as the place to begin from needs no more
-    than the same parameters: it may be of an earlier version of the equations.
+    A reference stands for a model, so its equations must be the same. A run named as a starting
+    point needs the same parameters only. It may belong to an earlier version of the equations.
     """
     if reference in (None, PREVIOUS):
         return []
@@ -37,7 +37,7 @@ def find_warm_start_faults(
 
 
 def resolve_warm_start(session: Session, reference: str | None) -> str | None:
-    """The run that is meant now: what is accepted later does not change a job that waits."""
+    """Resolve the run that is meant now. Later acceptances do not change a queued job."""
     if reference in (None, PREVIOUS):
         return reference
     return references.resolve_reference(session, str(reference), WARM_START_POINTER).id
@@ -54,10 +54,10 @@ def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
 
 
 def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
-    """What differs between the run's parameters and the model's, by names and units."""
+    """Describe how the run's parameters differ from the model's in names and units."""
     known: Mapping[str, Any] = {one["name"]: one for one in (run.result or {})["parameters"]}
     names = [one.name for one in model.parameters]
-    if model.rule is not None:  # which of the candidates have coefficients, the data decide
+    if model.rule is not None:  # the data decide which candidates have coefficients
         names = [name for name in names if name in known] or names[:1]
     missing = [name for name in names if name not in known]
     if missing:

@@ -1,4 +1,4 @@
-"""Use case of a comparison: several candidate structures on the same data, side by side."""
+"""Use case of a comparison: several model structures on the same data, side by side."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
@@ -25,12 +25,12 @@ _DATA_DIFFERENCES = {
 
 
 def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
-    """Runs side by side, the best RMS first.
+    """Compare runs, the best RMS first.
 
     Raises
     ------
     InvalidRequest
-        If a run is not there, has no result, is named twice, or was fitted to other data than
+        If a run is missing, has no result, is named twice, or was fitted to other data than
         the first.
     """
     candidates = _read_candidates(session, runs)
@@ -70,7 +70,7 @@ def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
 
 
 def _collect_data_settings(one: StoredRun) -> dict[str, Any]:
-    """What must be the same: else the RMS of two runs say nothing about their models."""
+    """Collect the settings that must be equal, or else the RMS of two runs do not compare."""
     body = one.body
     return {
         "datasets": body["datasets"],
@@ -100,7 +100,7 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
 
 
 def _build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
-    """Name of each run: its model, and the run's number where two have the same model."""
+    """Build the title of each run: its model, with the run's number if models repeat."""
     names = [one.model.name for one in ordered]
     return {
         one.run.id: name if names.count(name) == 1 else f"{name}, run {one.run.number + 1}"
@@ -135,7 +135,7 @@ def _to_compared_run(one: StoredRun, title: str) -> ComparedRun:
 def _compare_parameters(
     ordered: Sequence[StoredRun], titles: Mapping[str, str]
 ) -> Iterator[ComparedParameter]:
-    """Parameters that have the same name and unit in two runs or more."""
+    """Compare parameters that have the same name and unit in at least two runs."""
     kept: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
     for one in ordered:
         for estimate in one.result["parameters"]:
@@ -163,7 +163,7 @@ def _compare_parameters(
 
 
 def _find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
-    """The two estimates whose 95 % intervals are furthest apart; None if all of them meet."""
+    """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap."""
     known = [i for i, one in enumerate(estimates) if _has_ends(one["interval95"])]
     gaps = {
         (i, j): max(estimates[i]["interval95"][0], estimates[j]["interval95"][0])
@@ -189,7 +189,7 @@ def _describe_difference(
 
 
 def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
-    """Unit of the RMS of all, if it is the same: several outputs are weighted together."""
+    """Find the common unit of the RMS. Weighted outputs have none."""
     units = set()
     for one in ordered:
         agreement = one.result["agreement"]["estimation"]
@@ -199,7 +199,7 @@ def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
 
 
 def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
-    """What keeps numbers of the table from being compared."""
+    """Report why numbers of the table do not compare."""
     if len({one.body["prediction"] for one in ordered}) > 1:
         yield (
             "some runs predict one step ahead and others simulate. "

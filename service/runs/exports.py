@@ -1,4 +1,4 @@
-"""Use case: the identified model of a run as text for other programs."""
+"""Use case: export the identified model of a run for other programs."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -29,7 +29,7 @@ _MEDIA_TYPES: Mapping[ExportFormat, tuple[str, str]] = {
 
 
 class ExportFile(NamedTuple):
-    """A file: its text, media type and name."""
+    """File with its text, media type and name."""
 
     text: str
     media_type: str
@@ -37,7 +37,7 @@ class ExportFile(NamedTuple):
 
 
 def export_run(session: Session, run_id: str, format: ExportFormat, pade_order: int) -> ExportFile:
-    """The model of a run in one of the formats.
+    """Export the model of a run in one of the formats.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def export_run(session: Session, run_id: str, format: ExportFormat, pade_order: 
     Conflict
         If the run has no estimates.
     InvalidRequest
-        If the model cannot be written in that format; the reason names the term in the way.
+        If the format cannot express the model; the message names the term.
     """
     stored = load_estimated_run(session, run_id, "export")
     try:
@@ -80,7 +80,7 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
 
 
 def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
-    """The datasets of the estimation, as far as they have not been deleted since."""
+    """Read the estimation datasets that have not been deleted since."""
     found = []
     for name in body["datasets"]:
         try:
@@ -96,7 +96,7 @@ def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
 
 
 def _compute_covariance(result: JobBody, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
-    """From correlations and standard errors; ``nan`` where one of them is missing."""
+    """Compute the covariance from correlations and standard errors; ``nan`` if one is missing."""
     found = result.get("correlation")
     if found is None:
         return None
@@ -109,14 +109,14 @@ def _compute_covariance(result: JobBody, values: tuple[IdentifiedValue, ...]) ->
 def _find_channels(
     name: str, stored: StoredRun, rows: list[Dataset]
 ) -> Iterator[Mapping[str, Any]]:
-    """What the datasets say of the recorded channels of a signal of the model."""
+    """Iterate over the datasets' descriptions of the channel of a signal."""
     recorded = stored.channels.by_signal[name]
     for row in rows:
         yield from (one for one in row.channels if one["name"] == recorded)
 
 
 def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
-    """The sampling period that all measured outputs have; None if they have no common one."""
+    """Find the common sampling period of all measured outputs; None if there is none."""
     periods = [
         one["sample_time"]
         for output in stored.model.outputs

@@ -1,7 +1,4 @@
-"""Use case of a run's response: measured against simulated, experiment by experiment.
-
-The fitted signals of a run, as they are stored: an object, or a part of one.
-"""
+"""Use case of a run's response: measured and simulated outputs, from the stored signals."""
 
 from functools import lru_cache
 from itertools import groupby
@@ -17,12 +14,12 @@ from service.storage.objects import ObjectStore
 from service.storage.tables import Run
 from sysid.data.records import Channel
 
-# An object never changes, so what was read of it stays true; a zoom asks for it again and again.
+# Objects never change, so their contents can be cached. A zoom reads the same object repeatedly.
 _CACHE_SIZE = 4
 
 
 def read_fitted_signals(store: ObjectStore, run: Run) -> tuple[FittedOutput, ...]:
-    """What was measured and simulated, output by output; the run has signals.
+    """Read the measured and simulated outputs of a run that has signals.
 
     Raises
     ------
@@ -45,7 +42,7 @@ def _read_object(
 def build_response(
     session: Session, store: ObjectStore, run_id: str, max_points: int
 ) -> ResponseOut:
-    """Measured and simulated outputs of a run, reduced so that extremes stay visible.
+    """Build measured and simulated outputs of a run, reduced so that extremes stay visible.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Use case: the identified model of a run, run freely over another recording and judged by it.
+"""Use case: simulate the identified model of a run on another recording, and measure the fit.
 
-What was identified is kept as it is. A start of a state belongs to its record: where the model
-does not fix it, it is found on the record, alone, as on the validation data of a job.
+All estimates are fixed. Initial states belong to a recording. Those that the model does not fix are
+therefore estimated on it, as on the validation data of a job.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 MOST_SAMPLES = 1_000_000
 MOST_RECORDS = 2000
 MOST_STEPS = 1_000_000_000
-"""Of integration or recursion, in a search for starts: some ten seconds."""
+"""Integration or recursion steps in a search for initial states: about ten seconds."""
 LEAST_SIMULATIONS = 100
 MOST_WORK = 30_000_000
-"""Measured values times starts that are searched together: their derivatives are in memory."""
+"""Measured values × initial states searched together. Their derivatives are held in memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeRun:
-    """The records, what the model gives for every output of each, and how well they agree."""
+    """Records, simulated outputs of each, and their agreement."""
 
     run: str
     dataset: str
@@ -59,7 +59,7 @@ class FreeRun:
 def validate_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn, max_points: int
 ) -> FreeRunOut:
-    """Run a run's model over a dataset.
+    """Simulate a run's model on a dataset and measure the fit.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def validate_run(
 def simulate_free_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn
 ) -> FreeRun:
-    """The same as arrays; raises as `validate_run` does."""
+    """Simulate as `validate_run` does, but return arrays. Raises the same errors."""
     with database.read_session() as session:
         problem, row = _read_problem(session, store, run_id, body)
     return _evaluate_free_run(problem, run_id, row)
@@ -138,11 +138,11 @@ def _find_channel_faults(
 def _find_unit_faults(
     session: Session, stored: StoredRun, row: Dataset, channels: SignalChannels
 ) -> Iterator[FieldError]:
-    """Channels in another unit than the model's, or than what the run was fitted to."""
+    """Report channels whose unit differs from the model's, or from the fitted dataset's."""
     units = SignalUnits(stored.model)
     try:
         fitted = DatasetRepository(session).get(stored.body["datasets"][0])
-    except StorageError:  # deleted since: its units are not known any more
+    except StorageError:  # deleted since, so its units are unknown
         fitted = row
     before_by_signal = stored.channels.by_signal
     for signal, name in channels.by_signal.items():
@@ -172,8 +172,8 @@ def _read_records(store: ObjectStore, row: Dataset, channels: SignalChannels) ->
 
 
 def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) -> "Problem":
-    """All that was identified fixed, so that at most starts of states are free."""
-    # The compiler comes with this import, and most requests never need it.
+    """Build the problem with all estimates fixed, so that at most initial states are free."""
+    # This imports the compiler, which most requests never need.
     from sysid.simulation.problem import Problem
 
     model, request = stored.model, stored.body
@@ -191,7 +191,7 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
 
 
 def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
-    """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
+    """Fix an estimate. That of a tied parameter may lie outside its bounds."""
     value = float(estimate["value"])
     known = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
     return {
@@ -203,10 +203,10 @@ def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _search_starts(problem: "Problem") -> FloatArray:
-    """The starts (D,) that fit best.
+    """Estimate the initial states (D,) that fit best.
 
-    Those of a record touch no other, so each record is searched alone: all at once the effort
-    would grow with the cube of their number.
+    Initial states affect their own record only, so each record is searched alone. A joint search
+    would cost the cube of their number.
     """
     most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
     changes = problem.settings.parameters
@@ -216,7 +216,7 @@ def _search_starts(problem: "Problem") -> FloatArray:
 
 
 def _split_by_record(problem: "Problem") -> "Iterator[Problem]":
-    """Each record of a problem by itself, its starts by the names of the first."""
+    """Split a problem by record. Initial states get the names of the first record."""
     model, changes = problem.untied_model, problem.settings.parameters
     fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
     for number, record in enumerate(problem.records):
@@ -274,7 +274,7 @@ def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun
 
 
 def _apply_recorded_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
-    """Of an output that may be in any unit, in that of the recording."""
+    """Replace the unit of outputs that may have any unit by that of the recording."""
     known = {one.name: one.unit for one in records[0].outputs}
     channels = tuple(
         replace(one, unit=known[one.output]) if one.unit == "1" else one for one in metrics.channels

@@ -1,7 +1,7 @@
-"""Use case: profile likelihood of a run's parameters, computed when somebody asks.
+"""Use case: profile likelihood of a run's parameters, computed on request.
 
-It runs in a thread of the web process, beside other requests; what would take long is refused
-before it begins, what does take long is stopped, and there is one at a time.
+It runs in a thread of the web process, in parallel with other requests. Work that would take too
+long is refused, or stopped when it does. Only one profile is computed at a time.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
 
-MOST_WORK = 300_000_000  # measured values times parameters, points and profiles
+MOST_WORK = 300_000_000  # measured values × parameters × points × profiles
 LIMIT_SECONDS = 45.0  # a client waits a minute
 CHI_SQUARED_95 = (
     3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
@@ -35,7 +35,7 @@ _profile_lock = Lock()
 def compute_profiles(
     database: Database, store: ObjectStore, run_id: str, body: ProfileIn
 ) -> Profiles:
-    """Profiles of some parameters of a run, of all free ones if none is named.
+    """Compute the profiles of some parameters of a run, by default of all free ones.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
 def _profile_parameters(
     problem: "Problem", theta: FloatArray, names: list[str], points: int
 ) -> Iterator[ProfileOut]:
-    # The compiler comes with this import, and most requests never need it.
+    # This imports the compiler, which most requests never need.
     from sysid.uncertainty.profile_likelihood import compute_profile
 
     end = monotonic() + LIMIT_SECONDS

@@ -1,7 +1,7 @@
-"""Use case of a run's residuals: correlation functions with their bands, and their tests.
+"""Use case of a run's residuals: correlation functions with their bands, and residual tests.
 
-A result stores the verdicts only: the functions are computed again from the fitted signals and
-the inputs when somebody asks, so that a sweep of 100,000 runs does not carry them.
+A result stores the verdicts only, so that a sweep of 100,000 runs stays small. The functions are
+computed again on request, from the fitted signals and the inputs.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,9 +37,10 @@ JobBody = Mapping[str, Any]
 
 
 class ResidualAnalysis(NamedTuple):
-    """Correlation functions of a run's residuals and the verdict on them.
+    """Correlation functions of a run's residuals and their verdict.
 
-    `names` are those of the experiments; `missing` says which inputs could not be read.
+    `experiments` are the names of the experiments; `input_note` says which inputs could not be
+    read.
     """
 
     experiments: list[str]
@@ -49,7 +50,7 @@ class ResidualAnalysis(NamedTuple):
 
 
 def get_residuals(session: Session, store: ObjectStore, run_id: str) -> ResidualsOut:
-    """Correlation functions of a run's residuals.
+    """Compute the correlation functions of a run's residuals.
 
     Raises
     ------
@@ -73,7 +74,7 @@ def get_residuals(session: Session, store: ObjectStore, run_id: str) -> Residual
 def analyse_residuals(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> ResidualAnalysis | None:
-    """The same as values; None as long as no signals are stored."""
+    """Analyse residuals as `get_residuals` does, but return values; None without signals."""
     if stored.run.signals_sha256 is None:
         return None
     fits = read_fitted_signals(store, stored.run)
@@ -93,7 +94,7 @@ def analyse_residuals(
 
 
 def _count_past_coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
-    """Of each output, the coefficients on past outputs of a prediction one step ahead."""
+    """Count each output's coefficients on past outputs, for one-step predictions."""
     if stored.body["prediction"] != "one-step":
         return {}
     return count_past_output_coefficients(stored.model, stored.parameters(session))
@@ -115,7 +116,7 @@ def _build_series(
     inputs: Sequence[tuple[Channel, ...]],
     times: Mapping[str, float],
 ) -> Iterator[ResidualSeries]:
-    """Residuals of the tested outputs as the loss saw them, less those that were skipped."""
+    """Build the residuals of the tested outputs as the loss uses them, without skipped samples."""
     loss = body["loss"]
     scale = float(loss["scale"]) if loss["kind"] == "soft-l1" else 0.0
     weights = _compute_weights(body, fits)
@@ -141,14 +142,14 @@ def _build_series(
 def _count_earlier_samples(
     body: JobBody, fits: Sequence[FittedOutput]
 ) -> dict[tuple[int, str], int]:
-    """Samples of a record that lie before the part that was kept for validation."""
+    """Count the samples of a record before its validation part."""
     if (body["validation"] or {}).get("fraction") is None:
         return {}
     return {(f.number, f.name): f.times.size for f in fits if f.role == "estimation"}
 
 
 def _compute_weights(body: JobBody, fits: Sequence[FittedOutput]) -> dict[str, float]:
-    """Weights of the outputs as the problem had them: they matter to a loss with a scale."""
+    """Compute the output weights of the problem. They matter for a loss with a scale."""
     names = {fit.name for fit in fits}
     if len(names) == 1:
         return dict.fromkeys(names, 1.0)
@@ -172,7 +173,7 @@ def _compute_default_weight(body: JobBody, fits: Sequence[FittedOutput], name: s
 def _read_inputs(
     session: Session, store: ObjectStore, stored: StoredRun, is_validation: bool
 ) -> tuple[list[tuple[Channel, ...]], str]:
-    """Inputs of every tested record, and a note if they are not to be had any more."""
+    """Read the inputs of every tested record, with a note if they cannot be read."""
     kept = stored.body["validation"] or {}
     names = kept["datasets"] if is_validation and kept.get("datasets") else stored.body["datasets"]
     try:

@@ -1,7 +1,4 @@
-"""The result of an identification as the interface tells it: a document, from pure functions.
-
-Residual tests and onset delays as documents: what a result stores of them, and the answers.
-"""
+"""Conversion of an identification to the result document, with residual tests and onset delays."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +14,7 @@ from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 
 
 def to_residual_document(found: ResidualTests | None) -> dict[str, Any]:
-    """Verdicts and statistics, without the correlation functions; empty if there was no test."""
+    """Convert verdicts and statistics, without correlation functions; empty without tests."""
     if found is None:
         return {}
     return {
@@ -29,7 +26,7 @@ def to_residual_document(found: ResidualTests | None) -> dict[str, Any]:
 
 
 def to_test_document(one: ResidualTest) -> dict[str, Any]:
-    """One test; what was not tested has null for its numbers, and says why."""
+    """Convert one test. Numbers that were not computed are null, with a reason."""
     return {
         **_read(one, "experiment", "output"),
         "test": one.kind,
@@ -40,7 +37,7 @@ def to_test_document(one: ResidualTest) -> dict[str, Any]:
 
 
 def to_onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
-    """Onset delays in seconds; one that cannot be told is null and says why."""
+    """Convert onset delays in seconds. One that cannot be estimated is null, with a reason."""
     return [
         {
             **_read(one, "experiment", "input", "output", "delay"),
@@ -52,7 +49,7 @@ def to_onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
 
 
 def to_result_document(found: Identification, seconds: float) -> dict[str, Any]:
-    """The result as the interface tells it; numbers that are not finite become null."""
+    """Convert an identification to its result document; non-finite numbers become null."""
     return {
         "valid": found.valid,
         "parameters": [_to_estimate_document(one) for one in found.estimates],
@@ -123,12 +120,12 @@ def _to_correlation_document(uncertainty: Uncertainty | None) -> dict[str, Any] 
 
 
 def _read(source: object, *names: str) -> dict[str, Any]:
-    """Attributes of a value as a document."""
+    """Read attributes of a value as a document."""
     return {name: _to_json(getattr(source, name)) for name in names}
 
 
 def _to_json(value: Any) -> Any:
-    """A value as JSON takes it: arrays as lists, what is not finite as null."""
+    """Convert a value to JSON: arrays to lists, non-finite numbers to null."""
     if isinstance(value, float):
         return to_finite(value)
     if isinstance(value, tuple | list | np.ndarray):

@@ -20,12 +20,12 @@ from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, Migrati
 from service.storage.tables import Job, Run
 from sysid.models.parameters import Parameter
 
-MOST_OPEN_PROGRESS = 0.99  # what a run that is not over shows at most: refinement is still to come
+MOST_OPEN_PROGRESS = 0.99  # of an unfinished run: refinement is still to come
 
 
 @dataclass(frozen=True, slots=True)
 class RunQuery:
-    """Which runs of a job are wanted, and in which order."""
+    """Filter and order of a list of runs."""
 
     states: Sequence[JobState] = ()
     cell: Sequence[str] = ()
@@ -37,7 +37,7 @@ class RunQuery:
 def list_runs(
     session: Session, job_id: str, cursor: str | None, limit: int, choice: RunQuery
 ) -> Page[RunOut]:
-    """Runs of a job."""
+    """List the runs of a job."""
     job = JobRepository(session).get(job_id)
     found = RunRepository(session).list_page(
         job.id,
@@ -55,7 +55,7 @@ def list_runs(
 
 
 def get_run(session: Session, run_id: str) -> RunOut:
-    """One run with its result document."""
+    """Read one run with its result document."""
     stored = load_run(session, run_id)
     run = stored.run
     known = read_written_progress(session, [run.id]) if run.result is None else {}
@@ -67,7 +67,7 @@ def get_run(session: Session, run_id: str) -> RunOut:
 
 
 def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunOut:
-    """A run as it is told: its result document, or how far it is."""
+    """Build the answer for a run: its result document, or its progress."""
     so_far: dict[str, Any] = {
         "rms": run.best_rms,
         "evaluations": run.evaluations,
@@ -100,7 +100,7 @@ def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunO
 
 
 def get_history(session: Session, run_id: str) -> HistoryOut:
-    """Improvements of every island's champion, in the order in which they were found."""
+    """Read the improvements of every island's champion, in order."""
     stored = load_run(session, run_id)
     islands: list[list[ImprovementOut]] = []
     for row in RunRepository(session).read_history(run_id):
@@ -111,13 +111,13 @@ def get_history(session: Session, run_id: str) -> HistoryOut:
 
 
 def get_migrations(session: Session, run_id: str) -> MigrationsOut:
-    """The migration log."""
+    """Read the migration log."""
     rows = RunRepository(session).read_migrations(run_id)
     return MigrationsOut(id=run_id, migrants=[MigrantOut.from_source(row) for row in rows])
 
 
 def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str, Any]]:
-    """What a run that ended without a result had found, without standard errors."""
+    """List the best parameters of a run that ended without a result; no standard errors."""
     points = RunRepository(session).read_history(stored.run.id)
     if not points:
         return []
@@ -146,8 +146,8 @@ def _list_free_names(session: Session, stored: StoredRun) -> list[str]:
 
 
 def _list_free_parameters(session: Session, stored: StoredRun) -> list[Parameter]:
-    """The free parameters of a run, in the order of its history's columns."""
-    if stored.model.rule is not None:  # which of its candidates are sought the result tells
+    """List the free parameters of a run, in the order of its history's columns."""
+    if stored.model.rule is not None:  # the result says which candidates are estimated
         return []
     return [one for one in stored.parameters(session) if one.is_free]
 
@@ -155,7 +155,7 @@ def _list_free_parameters(session: Session, stored: StoredRun) -> list[Parameter
 def _compute_progress(run: Run, job: Job, known: WrittenProgress | None) -> float:
     if run.state.is_terminal:
         return 1.0
-    # A single run's generation is the job's; the history lags behind where nothing gets better.
+    # A single run's generation is the job's. The history is behind if nothing improves.
     of_job = job.generation if job.n_runs == 1 else 0
     reached_so_far = max(of_job, known.generation if known is not None else 0)
     generations: int = build_run_body(job.spec, run.cell)["algorithm"]["generations"]
@@ -163,12 +163,12 @@ def _compute_progress(run: Run, job: Job, known: WrittenProgress | None) -> floa
 
 
 def parse_filters(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
-    """Values asked for as ``key=value``; a value that is not JSON is a text.
+    """Parse filters of the form ``key=value``; a value that is not JSON is a text.
 
     Raises
     ------
     InvalidRequest
-        If one is not of that form; `name` is that of the query's field.
+        If one is not of that form; `name` is the name of the query's field.
     """
     found: dict[str, Any] = {}
     for text in filters:

@@ -1,10 +1,6 @@
-"""What is told about runs. The result's names are those of the numerical core.
+"""Bodies and answers about runs: results, comparisons, free runs, profiles.
 
-Comparison of runs on the same data.
-
-What is sent and told when an identified model runs freely over a recording.
-
-What is sent and told when parameters of a run are profiled.
+The names in results are those of the numerical core.
 """
 
 from datetime import datetime
@@ -18,10 +14,10 @@ from service.datasets.schemas import SeriesOut
 
 
 class RunOut(Answer):
-    """One identification: its cell of the sweep, how far it is, and what it gave.
+    """One identification: its cell of the sweep, progress, and result.
 
-    The fields of the result document (estimates, fit, islands, warnings …) follow once there is
-    one; see the contract in the documentation of the interface.
+    The fields of the result document (estimates, fit, islands, warnings …) are added once it
+    exists. See the contract in the documentation of the interface.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -85,10 +81,10 @@ class ResponseOut(Answer):
 
 
 class CorrelationOut(Answer):
-    """A correlation function of residuals with its bands, and the test made of it.
+    """Correlation function of residuals with its bands, and its test.
 
-    `input` is null for the autocorrelation. `lags` are in periods of `period` seconds, or, where
-    `period` is null, in samples of irregular times. Bands are symmetric about zero.
+    `input` is null for the autocorrelation. `lags` are in periods of `period` seconds. If `period`
+    is null, they are in samples of irregular times. Bands are symmetric about zero.
     """
 
     experiment: int
@@ -114,8 +110,8 @@ class CorrelationOut(Answer):
 class ResidualsOut(Answer):
     """Tests of a run's residuals with their correlation functions.
 
-    `level` is the chance that a true model fails one test or more of all; `passed` is null where
-    nothing could be tested; `note` says what could not be read.
+    `level` is the probability that a true model fails at least one test. `passed` is null if
+    nothing could be tested. `note` says what could not be read.
     """
 
     id: str
@@ -143,7 +139,7 @@ class MigrationsOut(Answer):
 
 
 class ProfileIn(Body):
-    """Which free parameters, and at about how many values of each."""
+    """Free parameters to profile, and the approximate number of values of each."""
 
     parameters: list[Annotated[str, Field(max_length=200)]] | None = Field(
         default=None, min_length=1, max_length=64
@@ -152,11 +148,11 @@ class ProfileIn(Body):
 
 
 class ProfileOut(Answer):
-    """The profile likelihood of one parameter.
+    """Profile likelihood of one parameter.
 
-    `ratio` is n ln(S(v)/S₀) at `values`; an end of `interval95` is null where the ratio stays
-    below the threshold up to the bound, or as far as was looked. `others` are the free parameters
-    besides, estimated anew at each of `values`.
+    `ratio` is n ln(S(v)/S₀) at `values`. An end of `interval95` is null if the ratio stays below
+    the threshold up to the bound, or over the whole search range. `others` are the other free
+    parameters, estimated again at each of `values`.
     """
 
     name: str
@@ -171,7 +167,7 @@ class ProfileOut(Answer):
 
 
 class Profiles(Answer):
-    """Profiles of a run, and the likelihood ratio at which their intervals end."""
+    """Profiles of a run, and the likelihood ratio at the ends of their intervals."""
 
     id: str
     threshold: float
@@ -185,13 +181,13 @@ class ProfilesOut(Profiles):
 
 
 class CompareIn(Body):
-    """Which runs to compare: at least two, of any jobs, fitted to the same data."""
+    """Runs to compare: at least two, of any jobs, fitted to the same data."""
 
     runs: list[str] = Field(min_length=2, max_length=50)
 
 
 class ComparedRun(Answer):
-    """One candidate. `parameters` counts the free ones; AIC and BIC are smaller where better."""
+    """Candidate of a comparison; `parameters` counts the free ones. Low AIC and BIC are better."""
 
     run: str
     job: str
@@ -213,7 +209,7 @@ class ComparedRun(Answer):
 
 
 class ComparedValue(Answer):
-    """What one run says of a parameter; `stderr` and `interval95` are null where it has none."""
+    """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
 
     run: str
     value: float
@@ -223,9 +219,10 @@ class ComparedValue(Answer):
 
 
 class ComparedParameter(Answer):
-    """A parameter that two runs or more have.
+    """Parameter that at least two runs have.
 
-    `differs` if two of its 95 % intervals are apart; null where fewer than two have one.
+    `differs` is true if two of its 95 % intervals do not overlap. It is null if fewer than two have
+    one.
     """
 
     name: str
@@ -236,9 +233,9 @@ class ComparedParameter(Answer):
 
 
 class ComparisonOut(Answer):
-    """Runs side by side, the best first; `unit` is that of the RMS.
+    """Comparison of runs, the best first; `unit` is that of the RMS.
 
-    `notes` are sentences: which parameters depend on the model, which figures do not compare.
+    `notes` say which parameters depend on the model, and which figures do not compare.
     """
 
     unit: str
@@ -248,10 +245,10 @@ class ComparisonOut(Answer):
 
 
 class FreeRunIn(Body):
-    """The model of a run over a stored `dataset`, every segment an experiment of its own.
+    """Simulation of a run's model on a stored `dataset`; every segment is one experiment.
 
-    `channels` say which recorded channel is which signal of the model, where that is another one
-    than in the run's job. The first `skip` samples of every output are not judged.
+    `channels` map signals of the model to recorded channels that differ from the run's job. The
+    first `skip` samples of every output are not scored.
     """
 
     dataset: str
@@ -260,7 +257,7 @@ class FreeRunIn(Body):
 
 
 class AgreementOut(Answer):
-    """How well one output of one experiment (from 1) is told; null where it does not vary."""
+    """Fit of one output of one experiment (counted from 1); null if the output does not vary."""
 
     experiment: int
     output: str
@@ -271,11 +268,11 @@ class AgreementOut(Answer):
 
 
 class FreeRunOut(Answer):
-    """Measured and simulated outputs, and how well they agree.
+    """Measured and simulated outputs, and their agreement.
 
-    `rms` is in `unit`: with several outputs weighted, in standard deviations of each. `starts`
-    are initial states that the model does not fix: they belong to a recording, and are found on
-    it, alone.
+    `rms` is in `unit`. For several outputs it is weighted, in standard deviations of each. `starts`
+    are initial states that the model does not fix. They belong to a recording, so they are
+    estimated on it.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""Use case: all runs of a job as one CSV table, written as it is read."""
+"""Use case: stream all runs of a job as one CSV table."""
 
 import csv
 import io
@@ -16,8 +16,8 @@ from service.storage.sessions import Database
 from service.storage.tables import Run
 
 RUNS_PER_PART = 500
-FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
-"""What a formula begins with, in one spreadsheet or another."""
+FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last four: full width
+"""First characters of formulas in common spreadsheets."""
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = (
     "number",
@@ -33,12 +33,12 @@ COLUMNS = (
     "error",
 )
 COLUMN_UNITS = {"fit_estimation": "%", "fit_validation": "%"}
-"""Of columns that do not have it in their name, and not from the job."""
+"""Units that neither the column's name nor the job gives."""
 
 
 @dataclass(frozen=True, slots=True)
 class _TableLayout:
-    """What the columns of a job's table are; `parameters` are names with their units."""
+    """Columns of a job's table; `parameters` are names with their units."""
 
     paths: tuple[str, ...]
     labels: tuple[str, ...]
@@ -46,18 +46,19 @@ class _TableLayout:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """The parameters, those of several units once."""
+        """The names of the parameters, each once."""
         return tuple(dict.fromkeys(name for name, _ in self.parameters))
 
 
 def stream_table(database: Database, job_id: str) -> Iterator[str]:
-    """Lines of the table, some hundred runs at a time, each part read in a session of its own.
+    """Stream the lines of the table in parts of some hundred runs, each read in its own session.
 
-    One row a run in the order of the sweep: its columns, the values of the axes by their paths,
-    its labels, and estimate, standard error and status of every parameter that a run has. A
-    heading has the unit behind the name, ``L [s]``, and none where there is no dimension; a
-    parameter that has several units, with several models, has columns for each. A text that a
-    spreadsheet would take for a formula begins with an apostrophe, which it hides.
+    Each run is one row, in the order of the sweep. Its columns are fixed fields, axis values by
+    path, labels, and estimate, standard error and status of every parameter. A heading has the unit
+    after the name, ``L [s]``, but none for a dimensionless quantity.
+
+    A parameter that has several units, with several models, has columns for each. A text that a
+    spreadsheet would take for a formula gets a leading apostrophe, which the spreadsheet hides.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def _to_csv_lines(rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _escape_formula(value: object) -> object:
-    """A value that no spreadsheet carries out, and no reader takes for two lines."""
+    """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
     if not isinstance(value, str):
         return value
     is_formula = value.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(value)

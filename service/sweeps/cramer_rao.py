@@ -1,4 +1,4 @@
-"""A job's floors as they are stored with it, and what they say of a group of its runs."""
+"""Stored Cramér–Rao bounds of a job, and their values for a group of its runs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ class StoredBounds:
     Parameters
     ----------
     stored : mapping or None
-        As `service.dispatch.cramer_rao` makes it; None as long as the job runs, and without noise.
+        Document of `service.dispatch.cramer_rao`. None while the job runs, and without noise.
     """
 
     def __init__(self, stored: BoundsDocument | None) -> None:
@@ -21,7 +21,7 @@ class StoredBounds:
         self.problems: Sequence[BoundsDocument] = (stored or {}).get("problems", ())
 
     def find_problem(self, key: Mapping[str, Any]) -> BoundsDocument | None:
-        """The problem of a group, by the values of its keys."""
+        """Find the problem of a group by the values of its keys."""
         if len(self.problems) == 1:
             return self.problems[0]
         if not self.problems or any(path not in key for path in self._axes):
@@ -30,7 +30,7 @@ class StoredBounds:
         return next((one for one in self.problems if one["cell"] == cell), None)
 
     def list_notes(self) -> Iterator[str]:
-        """What the reader of errors and floors must know, each once."""
+        """List the notes that a reader of errors and bounds needs, each once."""
         if not self.problems:
             return
         kinds = {(one["reference"] or {}).get("kind") for one in self.problems}
@@ -56,7 +56,7 @@ def _is_measured_record(reference: Mapping[str, Any]) -> bool:
 
 
 def scale_to_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:
-    """A floor at the σ of a group; None where its runs have several."""
+    """Scale a bound to the σ of a group; None if its runs have several."""
     if per_sigma is None or sigma is None or sigma[0] != sigma[1]:
         return None
     return per_sigma * sigma[0]

@@ -1,11 +1,8 @@
-"""Groups of a job's runs with those that have not been made yet: counted, not made.
+"""Groups of a job's runs, including runs that have not been created yet.
 
-The runs of a job are made in their order, so what is missing are the cells from some number on.
-How many of them belong to a group follows from the lengths of the axes.
-
-Groups of the runs of jobs that have ended, kept in memory: their numbers change no more.
-
-To group 100,000 runs takes seconds, and a page asks for the same again and again.
+The runs of a job are created in order, so the missing ones are the cells from some number on. The
+lengths of the axes give how many of them belong to a group. Groups of ended jobs are cached.
+Grouping 100,000 runs takes seconds, and a page requests the same groups repeatedly.
 """
 
 from collections import OrderedDict
@@ -35,16 +32,16 @@ def group_all_runs(
     quantities: Sequence[SummaryQuantity],
     limit: int,
 ) -> list[RunGroup]:
-    """Groups of all runs of a job in the order of the sweep, at most `limit` + 1 of them.
+    """Group all runs of a job in the order of the sweep, into at most `limit` + 1 groups.
 
-    A run that has not been made counts as queued; in a job that ended without it, as ended alike.
+    A run not yet created counts as queued. In a job that ended without it, it has the job's state.
     """
     found = read_groups(session, job.id, keys, quantities, limit, job.project_id)
     made = RunRepository(session, job.project_id).count_created(job.id)
     if made >= job.n_runs or len(found) > limit:
         return found
     sweep = _GroupedSweep(job.spec, keys)
-    # By their first runs: a database may round the numbers in a key.
+    # Matched by their first runs: a database may round the numbers in a key.
     known = {to_json(sweep.find_key(group.first_number)): group for group in found}
     state = job.state if job.state.is_terminal else JobState.QUEUED
     for part in sweep.iterate_pending(made):
@@ -59,7 +56,7 @@ def group_all_runs(
 
 
 class PendingGroup(NamedTuple):
-    """Runs that are not made and have one position in each group of axes that the keys ask for."""
+    """Runs not yet created that share one position in every axis group of the keys."""
 
     key: tuple[Any, ...]
     first: int
@@ -67,7 +64,7 @@ class PendingGroup(NamedTuple):
 
 
 class _GroupedSweep:
-    """The crossed groups of axes of a job, seen by the keys that its runs are grouped by."""
+    """Crossed axis groups of a job, viewed by the grouping keys of its runs."""
 
     def __init__(self, spec: Mapping[str, Any], keys: Sequence[GroupKey]) -> None:
         self._keys = keys
@@ -80,12 +77,12 @@ class _GroupedSweep:
         ]
 
     def find_key(self, number: int) -> tuple[Any, ...]:
-        """The key of the group that a run belongs to."""
+        """Find the key of the group that a run belongs to."""
         positions = locate_cell(number, self._lengths)
         return self._build_key([positions[place] for place in self._places])
 
     def iterate_pending(self, start: int) -> Iterator[PendingGroup]:
-        """The runs from number `start` on, part by part in the order of the sweep."""
+        """Iterate over the runs from number `start`, group by group in the order of the sweep."""
         lengths = self._lengths
         total = prod(lengths)
         for positions in product(*(range(lengths[place]) for place in self._places)):
@@ -106,7 +103,7 @@ class _GroupedSweep:
 
 
 def count_cells_below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
-    """How many cells before number `end` have the `fixed` positions, given by place."""
+    """Count the cells before number `end` that have the `fixed` positions, given by place."""
     count = 0
     for place, _ in enumerate(lengths):
         later = range(place + 1, len(lengths))
@@ -127,7 +124,7 @@ def _sets_key(steps: AxisGroup, key: GroupKey) -> bool:
 
 
 def _get_key_value(cells: Sequence[SweepCell], key: GroupKey) -> Any:
-    """As the cell of the run would have it: of two labels of one name the later one counts."""
+    """Return the value as the run's cell has it: of two labels with one name the later counts."""
     value = None
     for cell in cells:
         value = (cell.values if key.kind == "axis" else cell.labels).get(key.name, value)
@@ -150,11 +147,11 @@ def _build_empty_group(part: PendingGroup, keys: Sequence[GroupKey]) -> RunGroup
 
 CACHE_SIZE = 32
 MOST_CACHED_GROUPS = 2_000
-"""Groups of more than so many are not kept."""
+"""Larger results are not cached."""
 
 
 class _GroupCache:
-    """What was asked for last."""
+    """Cache of the groups requested last."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -183,9 +180,9 @@ def get_groups(
     quantities: Sequence[SummaryQuantity],
     limit: int,
 ) -> list[RunGroup]:
-    """`service.sweeps.groups.group_all_runs`, from memory where the job has ended since.
+    """Return `service.sweeps.groups.group_all_runs`, cached for jobs that have ended.
 
-    A job that is resumed ends at another time; then its groups are made anew.
+    A resumed job ends at another time, so its groups are computed again.
     """
     if not job.state.is_terminal:
         return group_all_runs(session, job, keys, quantities, limit)

@@ -1,7 +1,7 @@
-"""The noise sweep: how far noise on the output moves what is found (Figure 15).
+"""Noise sweep: effect of output noise on the estimates (Figure 15).
 
-Draws depend on the sweep's seed and the replicate alone. So a run keeps its specification when the
-grid of σ or the number of replicates grows, and is taken over then (`service.queue.reuse`).
+Draws depend only on the sweep's seed and the replicate. A run therefore keeps its specification if
+the grid of σ or the number of replicates grows. Its result is then reused (`service.queue.reuse`).
 """
 
 from collections.abc import Iterator
@@ -27,13 +27,13 @@ from service.sweeps.true_parameters import find_true_parameters
 from sysid.core.errors import InvalidModel, SysidError, UnknownModel
 
 UNSTORED_ID = "the simulated record"
-"""Stands for its identifier until it has one."""
+"""Placeholder until the simulated record has an identifier."""
 
 
 class _RecordSource(NamedTuple):
-    """Where the record comes from: stored datasets, or a simulation that is not stored yet.
+    """Source of the record: stored datasets, or a simulation that is not stored yet.
 
-    `faults`: why there is no record, if it could not be simulated.
+    `faults` explain why the record could not be simulated.
     """
 
     datasets: list[str]
@@ -50,7 +50,7 @@ class _RecordSource(NamedTuple):
 
 
 class _SweepBase(NamedTuple):
-    """The job without its axes, the values of σ as they were given, and the output they are of."""
+    """Job without its axes, the requested values of σ, and the output channel they refer to."""
 
     job: dict[str, Any]
     sigmas: list[float]
@@ -65,9 +65,9 @@ def submit_noise_sweep(
     body: NoiseSweepIn,
     key: str | None = None,
 ) -> JobOut:
-    """Queue the sweep as an ordinary job, after simulating its record if need be.
+    """Queue the sweep as an ordinary job. Its record is simulated first if necessary.
 
-    All is checked before the record is stored: a body that is refused leaves nothing behind.
+    Everything is checked before the record is stored: a refused body leaves nothing behind.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def submit_noise_sweep(
             with database.read_session() as session:
                 jobs.check_job(session, job, settings, source.unstored_rows)
                 if key is not None and JobRepository(session).is_key_used(key):
-                    raise KeyReused(key)  # with the same body the record would be stored
+                    raise KeyReused(key)  # with the same body the record would already be stored
             stored = source.simulated.store_dataset(database, store).dataset.id
             job = job.model_copy(update={"datasets": [stored]})
         return jobs.submit_job(database, job, settings, key)
@@ -128,10 +128,9 @@ def _prepare_source(database: Database, store: ObjectStore, body: NoiseSweepIn) 
 def _build_base(
     session: Session, body: NoiseSweepIn, source: _RecordSource, most_runs: int
 ) -> _SweepBase:
-    """What is known without the samples, of a body without faults.
+    """Build everything that needs no samples, for a body without faults.
 
-    Where the truth is not known σ = 0 is among the values: its best run is what errors are told
-    against.
+    If the true parameters are unknown, σ = 0 is added: errors refer to its best run.
     """
     fields = {"name": "noise sweep", **body.job_fields, "datasets": source.datasets}
     job = JobIn.model_validate(fields)
@@ -158,7 +157,7 @@ def _build_base(
 def _build_job(
     store: ObjectStore, body: NoiseSweepIn, plain: _SweepBase, source: _RecordSource
 ) -> JobIn:
-    """The whole job; where σ is relative, with the values in the output's unit and labels."""
+    """Build the whole job. A relative σ is converted and becomes a label."""
     sigma: dict[str, Any] = {"path": "/noise/sigma", "values": plain.sigmas}
     if body.relative:
         made = None if source.simulated is None else source.simulated.recording
@@ -179,7 +178,7 @@ def _build_job(
 
 
 def _move_fault(error: FieldError, body: NoiseSweepIn) -> FieldError:
-    """The fault of the job at the place of this body that it comes from."""
+    """Move a fault of the job to its pointer in this body."""
     for theirs, ours in _list_moved_pointers(body):
         if error.pointer.startswith(theirs):
             return FieldError(ours + error.pointer.removeprefix(theirs), error.detail, error.column)

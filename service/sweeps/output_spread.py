@@ -1,4 +1,4 @@
-"""How far an output varies: the unit of a relative σ."""
+"""Standard deviation of an output: the unit of a relative σ."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,11 +12,11 @@ from sysid.data.records import Recording
 from sysid.models.model import Model
 
 MOST_READ_VALUES = 10_000_000
-"""Values that are read for it, over all channels: a request must not take minutes."""
+"""Most values to read, over all channels, so that a request does not take minutes."""
 
 
 def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldError]:
-    """Faults of a relative σ: several outputs, or more values than are read."""
+    """Report faults of a relative σ: several outputs, or too many values to read."""
     names = [one.name for one in model.outputs]
     if len(names) > 1:
         yield FieldError(
@@ -36,12 +36,12 @@ def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldErro
 def compute_spread(
     store: ObjectStore, rows: Sequence[Dataset], channel: str, made: Recording | None = None
 ) -> float:
-    """Standard deviation of a channel about its mean in each dataset, over all of them.
+    """Compute the standard deviation of a channel about each dataset's mean, over all datasets.
 
     Parameters
     ----------
     made : Recording, optional
-        The recording of the only row, where it is not stored.
+        The recording of the only row if it is not stored.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from service.sweeps.schemas import ReidentifyIn
 
 AXIS_POINTER = "/sweep/axes/0"
 DATASET_FAULT = re.compile(r"/datasets(?P<place>/\d+): ")
-"""How the fault of a value of the axis begins that is one of its recordings'."""
+"""Start of the fault of one recording in an axis value."""
 
 
 def submit_reidentification(
@@ -24,7 +24,7 @@ def submit_reidentification(
     Raises
     ------
     InvalidRequest
-        With every fault that can be known before the job runs, at its place in this body.
+        With every fault that can be detected before the job runs, at its pointer in this body.
     KeyReused
         If the idempotency key was used with another body.
     """
@@ -49,12 +49,12 @@ def submit_reidentification(
 
 
 def sort_batch(body: ReidentifyIn) -> list[int]:
-    """Places in the batch, in the order of x."""
+    """Sort the entries of the batch by x and return their positions."""
     return sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
 
 
 def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
-    """The job, its cells in the order of x: neighbours begin where their neighbours ended."""
+    """Build the job with its cells in the order of x, so that warm starts come from neighbours."""
     chosen = [body.batch[number] for number in order]
     axis = {
         "path": "/datasets",
@@ -81,13 +81,13 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
 
 
 def _choose_model_name(model: Any) -> str:
-    """What a batch of this model is called; a text that no text is, is told with the model."""
+    """Choose the model's name for the batch. An invalid text is reported with the model."""
     name = model.get("name") if isinstance(model, dict) else model
     return name if isinstance(name, str) and find_text_fault(name) is None else "model"
 
 
 def _to_job_reference(given: str | None) -> str | None:
-    """As a job names it: runs by their id, all else is the name of an accepted reference."""
+    """Convert a reference to the form of a job: a run's id, or ``reference:`` and a name."""
     if given is None or given.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
         return given
     return REFERENCE_PREFIX + given
@@ -101,7 +101,7 @@ def _choose_warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
 
 
 def _move_fault(error: FieldError, order: list[int]) -> FieldError:
-    """The fault of the job at the place of this body that it comes from."""
+    """Move a fault of the job to its pointer in this body."""
     place = _move_pointer(error.pointer, order)
     inner = DATASET_FAULT.match(error.detail)
     if inner and place.startswith("/batch/"):

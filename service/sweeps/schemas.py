@@ -1,9 +1,4 @@
-"""What is told about many runs at once.
-
-The body of the noise sweep, as clients send it.
-
-The body of a batch re-identification, as clients send it.
-"""
+"""Bodies of noise sweeps and batch re-identifications, and summaries of many runs."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -16,7 +11,7 @@ from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
 
 MOST_REPLICATES = 1_000_000
-"""Seeds of replicate r are `seed` times this plus r, so that no two sweeps share one by chance."""
+"""The seed of replicate r is `seed` times this plus r, so that sweeps share no seed by chance."""
 
 
 def _check_distinct(found: list[Any]) -> list[Any]:
@@ -29,7 +24,7 @@ def _check_distinct(found: list[Any]) -> list[Any]:
 
 
 class TruthIn(Body):
-    """What the record without noise is simulated from, as ``POST /v1/datasets:simulate`` does."""
+    """Parameters and inputs of the noise-free record, as in ``POST /v1/datasets:simulate``."""
 
     parameters: dict[str, float]
     inputs: dict[str, InputIn] = Field(default={})
@@ -40,11 +35,11 @@ class TruthIn(Body):
 class NoiseSweepIn(IdentificationIn):
     """Identification under noise: σ × replicates × methods in one job.
 
-    The record is simulated from `truth`, or it is that of `datasets`. Replicate r takes noise and
-    search from the seeds `seed` · 10⁶ + r, at every σ and for every method, so that another grid
-    or more replicates leave the other runs as they are; those are not computed again.
+    The record is simulated from `truth`, or taken from `datasets`. Replicate r seeds noise and
+    search with `seed` · 10⁶ + r, at every σ and for every method. Another grid or more replicates
+    therefore leave the other runs unchanged, and these are not computed again.
 
-    `relative`: σ is in standard deviations of the output. The other fields are those of a job.
+    With `relative`, σ is in standard deviations of the output. The other fields are those of a job.
     """
 
     truth: TruthIn | None = None
@@ -70,24 +65,24 @@ class NoiseSweepIn(IdentificationIn):
 
     @property
     def job_fields(self) -> dict[str, Any]:
-        """The fields that the job has as well, as they were given."""
+        """The fields shared with a job, as far as they were set."""
         return self.dump_set_fields()
 
 
 class BatchEntryIn(Body):
-    """What was measured at one value of the label: `datasets` are fitted together, as one run."""
+    """Measurements at one value of the label. The `datasets` are fitted together as one run."""
 
     x: TrendX
     datasets: list[str] = Field(min_length=1, max_length=1000)
 
 
 class ReidentifyIn(IdentificationIn):
-    """Identify a model anew for several values of a label, such as the lengths of a tube.
+    """Repeated identification of a model for several values of a label, such as tube lengths.
 
-    One run for each entry of `batch`, in the order of x; entries of one x are runs of their own
-    and are pooled. `reference` is a run (run_…) or the name of an accepted reference, which the
-    batch is compared with. `warm_start`: every run begins at the reference, or each at the result
-    of the one before; the reference by default where there is one.
+    Each entry of `batch` is one run, in the order of x. Entries with the same x are separate runs
+    and are pooled. `reference` is a run (run_…) or the name of an accepted reference to compare the
+    batch with. `warm_start` selects where runs begin: at the reference (the default if there is
+    one), or at the previous result.
 
     `look_at` are the parameters of the trend, `predict` the values of x to predict at. The other
     fields are those of a job.
@@ -104,12 +99,12 @@ class ReidentifyIn(IdentificationIn):
 
     @property
     def job_fields(self) -> dict[str, Any]:
-        """The fields that the job has as well, as they were given."""
+        """The fields shared with a job, as far as they were set."""
         return self.dump_set_fields("validation", "seed")
 
 
 class ParameterSummaryOut(Answer):
-    """One parameter over the runs of a group, in its unit."""
+    """Summary of one parameter over the runs of a group, in its unit."""
 
     name: str
     unit: str
@@ -127,7 +122,7 @@ class ParameterSummaryOut(Answer):
 
 
 class GroupOut(Answer):
-    """The runs that share the values of the grouping keys."""
+    """Summary of the runs with the same values of the grouping keys."""
 
     key: dict[str, Any]
     runs: int
@@ -151,10 +146,10 @@ class GroupOut(Answer):
 
 
 class ErrorReferenceOut(Answer):
-    """What the errors of the runs with these values of the axes are told against.
+    """Reference values for the errors of the runs with these axis values.
 
-    `kind` is ``truth`` (the data were simulated from these values) or ``estimate``: that of `run`,
-    the best valid run with the least noise, `sigma`.
+    `kind` is ``truth`` (parameters of the simulation) or ``estimate``. An estimate is that of
+    `run`, the best valid run at the least noise `sigma`.
     """
 
     cell: dict[str, Any]
@@ -168,7 +163,7 @@ class ErrorReferenceOut(Answer):
 class SummaryOut(Answer):
     """Aggregates over the runs of a job.
 
-    References and floors are there once a job with noise has ended.
+    References and floors are added when a job with noise has ended.
     """
 
     job: str

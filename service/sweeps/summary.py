@@ -42,20 +42,20 @@ BOUND_NOTE = (
 def summarise_job(
     session: Session, job_id: str, by: Sequence[str] | None, *, errors_only: bool = False
 ) -> SummaryOut:
-    """Aggregates over the values of some axes or labels of a job.
+    """Aggregate the runs of a job over the values of some axes or labels.
 
     Parameters
     ----------
     by : sequence of str, optional
-        Paths of axes (``/noise/sigma``) and names of labels (``length_m``); by default every
-        axis that is no seed.
+        Paths of axes (``/noise/sigma``) and names of labels (``length_m``). By default every
+        axis that is not a seed.
     errors_only : bool
-        Only the RMS against the records without noise, and the estimates: what figures draw.
+        Only the RMS against the records without noise, and the estimates, as figures need them.
 
     Raises
     ------
     InvalidRequest
-        If a key is neither, or the keys part the runs into too many groups.
+        If a key is unknown, or the keys give too many groups.
     """
     job = JobRepository(session).get(job_id)
     keys = _choose_keys(job, by)
@@ -117,9 +117,10 @@ def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
 
 
 def _read_units(session: Session, job: Job) -> dict[str, str]:
-    """Parameters that some run has estimated, with their units: by what the first ones told.
+    """Read the estimated parameters with their units from the first runs.
 
-    Where an axis changes the model, its first run of every value may know others.
+    If an axis changes the model, the first run of each of its values is read, because models may
+    have different parameters.
     """
     runs = RunRepository(session)
     heads: list[Run] = list(runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED]).items)

@@ -1,4 +1,4 @@
-"""The true parameters of simulated recordings, where they are known."""
+"""True parameters of simulated recordings."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,10 +13,10 @@ from sysid.models.model import EstimatedInitial, Model, name_initial_state
 def find_true_parameters(
     session: Session, reference: Any, datasets: Sequence[Dataset]
 ) -> dict[str, float] | None:
-    """True values of a model's parameters and starts, by their names in a result.
+    """Find the true values of a model's parameters and initial states, by their names in a result.
 
-    None unless every dataset was simulated from this very model with the same parameters: another
-    model's parameters may have the same names and mean something else.
+    None unless every dataset was simulated from this very model with the same parameters. Another
+    model's parameters may have the same names but another meaning.
     """
     model, stored = models.resolve_model(session, reference)
     truths = [

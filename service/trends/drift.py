@@ -1,4 +1,4 @@
-"""What a batch is compared with: a reference run, the trend of its job, and how it was made."""
+"""Comparison of a batch with a reference run and with the trend of that run's job."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,16 +15,16 @@ from sysid.trends.trend import Drift, Trend, TrendEstimate, compute_drift, compu
 
 @dataclass(frozen=True, slots=True)
 class BatchReference:
-    """The run a batch is compared with, and the trend of its job, quantity by quantity.
+    """Reference run of a batch, and the trend of its job, quantity by quantity.
 
     Attributes
     ----------
     x : float or None
-        Its place on the axis of the batch.
+        Its value on the axis of the batch.
     why_no_trend : str
-        Why there is no trend of its job to compare with; empty where there is one.
+        Why its job has no trend to compare with; empty if it has one.
     names : tuple of str
-        Under which it was accepted.
+        Names under which it was accepted.
     """
 
     run: Run
@@ -34,7 +34,7 @@ class BatchReference:
     names: tuple[str, ...] = ()
 
     def explain_gaps(self, x: str, places: Mapping[float, Any]) -> str:
-        """What a reader needs to know where less is compared than may be expected."""
+        """Explain why fewer comparisons are made than expected; empty if all are."""
         if self.trends:
             return ""
         if self.x is not None and self.x in places:
@@ -50,7 +50,7 @@ class BatchReference:
 def compare_with_reference(
     one: TrendQuantity, reference: BatchReference | None, comparisons: int
 ) -> dict[float, list[DriftOut]]:
-    """What is told of each point, by its x."""
+    """Compute the drifts of each point, by its x."""
     found: dict[float, list[DriftOut]] = {}
     if reference is None:
         return found
@@ -76,7 +76,7 @@ def compare_with_reference(
 
 
 def _read_estimate(run: Run, name: str) -> TrendEstimate | None:
-    """Of a parameter or an onset delay, with its standard error."""
+    """Read the estimate of a parameter or an onset delay, with its standard error."""
     one: Any = (run.estimates or {}).get(name)
     if one is None:
         return read_onset_estimates((run.result or {}).get("onset_delays") or []).get(name)

@@ -1,4 +1,4 @@
-"""What the laws and predictions of one quantity need beside them, in words."""
+"""Notes on the laws and predictions of one quantity."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -12,7 +12,7 @@ BIRGE_LIMIT = 1.5  # Birge ratios below that happen by chance in small batches
 
 
 def describe_quantity(one: TrendQuantity, fitted: Trend) -> list[str]:
-    """All of them: of the points, of the laws, of what is predicted."""
+    """List all notes: on the points, the laws, and the predictions."""
     return [
         *_describe_points(one),
         *_describe_laws(one, fitted),
@@ -23,14 +23,14 @@ def describe_quantity(one: TrendQuantity, fitted: Trend) -> list[str]:
 def describe_noise_models(
     x: str, places: Mapping[float, Sequence[TrendRow]], reference: str
 ) -> str:
-    """Which estimates are of another noise model than others; empty where all are of one.
+    """Report that estimates use different noise models; empty if all use one.
 
     Parameters
     ----------
     x : str
         The label's name.
     reference : str
-        Noise model of the reference run; empty where there is none.
+        Noise model of the reference run; empty if there is none.
     """
     found = {at: {read_noise_model(row._asdict()) for row in rows} for at, rows in places.items()}
     if len({reference, *(one for models in found.values() for one in models)} - {""}) < 2:
@@ -99,7 +99,7 @@ def _list_used_x(one: TrendQuantity) -> list[float]:
 
 
 def _compare_with_bounds(one: TrendQuantity, at: TrendPoint) -> Iterator[str]:
-    """Predictions that no run could have given, or that lack part of their interval."""
+    """Report predictions or intervals outside the bounds of the parameter."""
     lower, upper = one.bounds
     unit = format_unit(one.unit)
     limits = f"{lower:g} to {upper:g}{unit}" if upper < float("inf") else f"{lower:g}{unit} or more"

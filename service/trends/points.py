@@ -1,4 +1,4 @@
-"""From the runs of a batch to points: one for each label and quantity."""
+"""Points of a trend from the runs of a batch: one for each label and quantity."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,16 +11,16 @@ from service.trends.schemas import BatchLabelOut, SpanOut
 from sysid.trends.trend import TrendEstimate, pool_estimates
 
 DatasetChannels = Mapping[str, Mapping[str, Any]]
-"""For each dataset, its channels by name."""
+"""Channels of each dataset, by name."""
 
 QuantityKind = Literal["parameter", "onset delay"]
 DATA_FIELDS = ("/datasets", "/noise", "/channels", "/hold", "/skip", "/validation")
-"""Fields of a job that decide which data a run sees."""
+"""Fields of a job that determine which data a run uses."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrendPoint:
-    """What the runs of one label say of one quantity; `estimate` is None where none has errors."""
+    """Estimate of one quantity at one label, pooled over its runs; None without standard errors."""
 
     x: float
     runs: tuple[str, ...]
@@ -55,7 +55,7 @@ class _RunEstimate:
 
 @dataclass(slots=True)
 class _QuantityEstimates:
-    """Entries of one quantity by label; its bounds are the widest of its runs."""
+    """Estimates of one quantity by label. Its bounds are the widest of its runs."""
 
     unit: str
     kind: QuantityKind
@@ -64,13 +64,13 @@ class _QuantityEstimates:
     entries: dict[float, list[_RunEstimate]] = field(default_factory=dict)
 
     def widen_bounds(self, lower: float | None, upper: float | None) -> None:
-        """Take in the bounds of a run; None: there is none."""
+        """Include the bounds of a run; None means that there is none."""
         self.lower = min(self.lower, -inf if lower is None else lower)
         self.upper = max(self.upper, inf if upper is None else upper)
 
 
 def group_by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
-    """Runs of each label, ascending. Of runs on the same data, which tell nothing new, the best."""
+    """Group runs by label, ascending. Of runs on the same data only the best is used."""
     found: dict[float, dict[str, TrendRow]] = {}
     for row in rows:
         at = float(row.labels[x])
@@ -90,7 +90,7 @@ def _rank_rms(row: TrendRow) -> float:
 def build_quantities(
     places: Mapping[float, Sequence[TrendRow]], names: Sequence[str]
 ) -> list[TrendQuantity]:
-    """The parameters (all that are estimated, if none is named), then the onset delays."""
+    """Build the named parameters (by default all estimated ones), then the onset delays."""
     columns: dict[str, _QuantityEstimates] = {}
     for x, rows in places.items():
         for row in rows:
@@ -120,7 +120,7 @@ def _add_estimate(
 
 
 def read_onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, TrendEstimate]:
-    """The onset delays of a result that have standard errors, by the names of a trend."""
+    """Read the onset delays of a result that have standard errors, by their names in a trend."""
     known = {name: _to_estimate(entry) for name, _, entry in _average_onsets("", told)}
     return {name: one for name, one in known.items() if one is not None}
 
@@ -128,7 +128,7 @@ def read_onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, TrendEs
 def _average_onsets(
     run: str, told: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, str, _RunEstimate]]:
-    """Onset delays of a run; the mean over its experiments, and what they differ by."""
+    """Average the onset delays of a run over its experiments, with standard errors."""
     pairs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for one in told:
         pairs.setdefault((one["input"], one["output"]), []).append(one)
@@ -148,7 +148,7 @@ def _average_onsets(
 
 
 def _compute_onset_error(one: Mapping[str, Any]) -> float | None:
-    """Standard error of a median of n events that scatter by `spread`."""
+    """Compute the standard error of a median of n events that scatter by `spread`."""
     if not one["spread"] or one["events"] < 2:
         return None
     median_over_mean = 1.2533  # √(π/2), of normally distributed events
@@ -197,7 +197,7 @@ def to_label_out(
     known: DatasetChannels,
     channels: Mapping[str, str],
 ) -> BatchLabelOut:
-    """All runs of a label; `datasets` of each run, `channels` of the model's signals."""
+    """Describe all runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
         for one in row.agreement["estimation"]:

@@ -1,4 +1,4 @@
-"""How a reference was made otherwise than a batch: an estimate means little under another hold."""
+"""Differences between a reference run and a batch, such as another hold of the inputs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -24,14 +24,14 @@ _NO_VALUE = "none"
 def describe_differences(
     session: Session, run: Run, bodies: Sequence[JobBody], known: DatasetChannels
 ) -> str:
-    """What a reference run was made with that the runs of a batch were not; empty if nothing.
+    """Describe settings of a reference run that differ from those of a batch; empty if none do.
 
     Parameters
     ----------
     bodies : sequence of dict
-        Of the runs of the batch.
-    known : Channels
-        Channels of the datasets of these.
+        Requests of the runs of the batch.
+    known : DatasetChannels
+        Channels of their datasets.
     """
     body = load_run(session, run.id).body
     theirs = _collect_facts(session, body, read_channels(session, set(body["datasets"])))
@@ -45,7 +45,7 @@ def describe_differences(
 
 
 def read_channels(session: Session, datasets: set[str]) -> DatasetChannels:
-    """The channels of datasets, by name."""
+    """Read the channels of datasets, by name."""
     found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
     return {one.id: {channel["name"]: channel for channel in one.channels} for one in found}
 
@@ -53,7 +53,7 @@ def read_channels(session: Session, datasets: set[str]) -> DatasetChannels:
 def _list_distinct_facts(
     session: Session, bodies: Sequence[JobBody], known: DatasetChannels
 ) -> Iterator[RunFacts]:
-    """The facts of a batch, each set of them once."""
+    """Iterate over the distinct settings of a batch."""
     told: set[str] = set()
     for body in bodies:
         settings = {name: body[name] for name in _COMPARED_FIELDS}
@@ -83,11 +83,11 @@ _COMPARED_FIELDS = (
 
 
 def _collect_facts(session: Session, body: JobBody, known: DatasetChannels) -> RunFacts:
-    """What an estimate depends on besides the data, in words."""
+    """Describe the settings that an estimate depends on, besides the data."""
     try:
         model, _ = models.resolve_model(session, body["model"])
     except UnknownModel:
-        return {}  # the catalogue does not have it any more
+        return {}  # no longer in the catalogue
     inputs, outputs = list_signals(model)
     found = {"model": model.name}
     for signal in (*inputs, *outputs):
@@ -128,7 +128,7 @@ def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
 
 
 def _describe_fixed_parameters(model: Model, body: JobBody) -> Iterator[tuple[str, str]]:
-    """Parameters that are not sought."""
+    """Describe the parameters that are not estimated."""
     own = {one.name for one in model.parameters}
     changes = {name: one for name, one in body["parameters"].items() if name in own}
     for one in override_parameters(model.parameters, changes):

@@ -1,4 +1,4 @@
-"""What is told about the trend of a batch."""
+"""Answers about the trend of a batch."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from service.core.wire import Answer, Finite
 
 
 class SpanOut(Answer):
-    """From the least to the largest measured value of an output."""
+    """Range of the measured values of an output."""
 
     output: str
     channel: str
@@ -18,7 +18,7 @@ class SpanOut(Answer):
 
 
 class DriftOut(Answer):
-    """How far an estimate is from what a reference says."""
+    """Difference between an estimate and a reference."""
 
     kind: Literal["run", "trend"] = Field(
         description="against the reference run, or against the prediction of its job's trend"
@@ -33,9 +33,9 @@ class DriftOut(Answer):
 
 
 class PointOut(Answer):
-    """What the runs of one label say of one quantity.
+    """Estimate of one quantity at one label.
 
-    `stderr` holds what runs of one label differ by, where that is more than they state.
+    `stderr` includes the scatter between runs of one label, if that exceeds their own errors.
     """
 
     x: float
@@ -61,7 +61,7 @@ class CoefficientOut(Answer):
 
 
 class LawOut(Answer):
-    """A law that was fitted."""
+    """Fitted law."""
 
     law: Literal["line", "power"]
     formula: str
@@ -75,7 +75,7 @@ class LawOut(Answer):
 
 
 class LawPointOut(Answer):
-    """A law at one x with its 95 % interval."""
+    """Value of a law at one x with its 95 % interval."""
 
     x: float
     value: Finite
@@ -86,7 +86,7 @@ class LawPointOut(Answer):
 
 
 class QuantityOut(Answer):
-    """A parameter, or the onset delay, over x."""
+    """Trend of a parameter or an onset delay over x."""
 
     name: str
     unit: str
@@ -115,7 +115,7 @@ class BatchLabelOut(Answer):
 
 
 class TrendOut(Answer):
-    """The batch of a job over one of its labels."""
+    """Trend of a job's batch over one of its labels."""
 
     job: str
     x: str

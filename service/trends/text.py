@@ -1,6 +1,6 @@
-"""What a trend says in words, for the command line, the page and the report alike.
+"""A trend as text, for the command line, the page and the report.
 
-All work on the document of ``GET /v1/jobs/{id}/trend``.
+All functions take the document of ``GET /v1/jobs/{id}/trend``.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,11 +19,11 @@ from service.core.text import (
 QuantityDocument = dict[str, Any]
 
 USUAL_STATUSES = ("identified", "group", "measured", "not told")
-"""Statuses that need no second look."""
+"""Statuses that need no attention."""
 
 
 class Style(NamedTuple):
-    """How numbers are written; `between` joins the ends of an interval."""
+    """Number formats; `between` joins the ends of an interval."""
 
     estimate: Callable[[float, float | None], str]
     number: Callable[[float], str]
@@ -41,7 +41,7 @@ TYPESET = Style(
 
 
 class PlaceRow(NamedTuple):
-    """The runs of one label; `cells` has one text for each quantity."""
+    """Row for the runs of one label; `cells` has one text per quantity."""
 
     x_text: str
     cells: Sequence[str]
@@ -52,7 +52,7 @@ class PlaceRow(NamedTuple):
 
 
 class LawRow(NamedTuple):
-    """A law that was fitted to a quantity."""
+    """Row for a law fitted to a quantity."""
 
     quantity: str
     text: str
@@ -62,7 +62,7 @@ class LawRow(NamedTuple):
 
 
 class PredictionRow(NamedTuple):
-    """A law at one label, with its interval and what is to be said of it."""
+    """Row for the prediction of a law at one label, with its interval and a remark."""
 
     quantity: str
     x_text: str
@@ -72,7 +72,7 @@ class PredictionRow(NamedTuple):
 
 
 class TrendTables(NamedTuple):
-    """A trend as tables; `reasons` are quantities without a law, each with the reason."""
+    """Trend as tables; `reasons` lists the quantities without a law, each with the reason."""
 
     headings: Sequence[str]
     rows: Sequence[PlaceRow]
@@ -82,7 +82,7 @@ class TrendTables(NamedTuple):
 
 
 def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
-    """The tables of a trend; quantities without any value are left out."""
+    """Build the tables of a trend. Quantities without any value are left out."""
     shown: list[QuantityDocument] = [
         one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
     ]
@@ -131,7 +131,7 @@ def _prediction_row(one: QuantityDocument, at: dict[str, Any], style: Style) -> 
 
 
 def list_flags(place: dict[str, Any], quantities: list[QuantityDocument]) -> list[str]:
-    """What is to be looked at in the runs of one label."""
+    """List the findings that need attention in the runs of one label."""
     found = []
     for one in quantities:
         for point in one["points"]:
@@ -153,7 +153,7 @@ def _list_point_flags(point: dict[str, Any]) -> list[str]:
 
 
 def format_limits(quantities: list[QuantityDocument]) -> str:
-    """From how many standard errors on drift is flagged; empty where nothing is compared."""
+    """Describe the z at which drift is flagged; empty if nothing is compared."""
     found: dict[str, dict[str, None]] = {}
     for one in quantities:
         for drift in (drift for point in one["points"] for drift in point["drifts"]):
@@ -164,20 +164,20 @@ def format_limits(quantities: list[QuantityDocument]) -> str:
 
 
 def format_reference(trend: dict[str, Any]) -> str:
-    """Names and label of the reference: ``'tube' (length_m = 40)``; empty where it has none."""
+    """Format the reference: ``'tube' (length_m = 40)``; empty without names and label."""
     names = ", ".join(f"{name!r}" for name in trend["reference_names"])
     label = "" if trend["reference_x"] is None else f"{trend['x']} = {trend['reference_x']:g}"
     return " ".join(filter(None, (names, f"({label})" if label else "")))
 
 
 def format_span(one: dict[str, Any]) -> str:
-    """From where to where an output went; the channel's name where it has no unit."""
+    """Format the range of an output, with the channel's name if it has no unit."""
     unit = plain_unit(one["unit"]) or f" ({one['channel']})"
     return f"{one['lower']:.6g} to {one['upper']:.6g}{unit}"
 
 
 def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
-    """A law with its coefficients and their standard errors."""
+    """Format a law with its coefficients and their standard errors."""
     known = {
         one["name"]: f"({style.estimate(one['value'], one['stderr'])})"
         for one in law["coefficients"]
@@ -188,7 +188,7 @@ def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
 
 
 def list_notes(trend: dict[str, Any]) -> list[str]:
-    """All that the numbers need beside them."""
+    """List all notes on the numbers."""
     found = [f"{one['name']}: {text}" for one in trend["quantities"] for text in one["notes"]]
     by_text: dict[str, list[str]] = {}
     for place in trend["places"]:

@@ -1,4 +1,4 @@
-"""Use case of trends: a batch of re-identifications over one label, and against its reference."""
+"""Use case of trends: a batch of re-identifications over one label, compared with its reference."""
 
 from collections.abc import Sequence
 
@@ -37,21 +37,21 @@ MOST_RUNS = 5_000
 
 
 def has_trend(job: Job) -> bool:
-    """Whether a job asks for one."""
+    """Test whether a job requests a trend."""
     return job.spec["trend"] is not None
 
 
 def compute_trend(session: Session, job_id: str) -> TrendOut:
-    """The trend that a job asks for, from the runs that have succeeded so far.
+    """Compute the trend that a job requests, from the runs that have succeeded so far.
 
     Raises
     ------
     NotFound
         If there is no such job.
     Conflict
-        If the job asks for no trend.
+        If the job requests no trend.
     InvalidRequest
-        If it has too many runs for one.
+        If it has too many runs for a trend.
     """
     job = JobRepository(session).get(job_id)
     if not has_trend(job):
@@ -103,7 +103,7 @@ def _collect_quantities(
 
 
 def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchReference | None:
-    """The reference of a batch, and the laws of its job where that asks for the same trend."""
+    """Load the reference of a batch, with the laws of its job if that has the same trend."""
     if run_id is None:
         return None
     run = RunRepository(session).get(run_id)
@@ -121,7 +121,7 @@ def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchRefe
 
 
 def _explain_missing_trend(theirs: Job, x: str) -> str:
-    """Why there is none over the axis x to compare with; empty if there is."""
+    """Explain why the reference's job has no comparable trend over x; empty if it has one."""
     if not has_trend(theirs):
         return "its job has no trend"
     if theirs.spec["trend"]["x"] != x:
