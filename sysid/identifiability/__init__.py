@@ -1,1 +1,1 @@
-"""Which parameters the data tell apart: symmetries, null directions, active bounds."""
+"""Identifiability of parameters: symmetries, null directions, active bounds."""

@@ -1,9 +1,10 @@
-"""Bounds that hold an estimate back: which of them to widen, so that the data are followed.
+"""Active bounds: bounds that hold the estimate back, and which of them to widen.
 
-Each bound for itself would not do. Where two parameters have much the same effect both are pulled,
-and once one is free the other may well lie inside its bounds, or be wanted on the other side. So
-bounds are released one after the other, each time the one whose release removes most of the
-squared error in a linear step of all parameters together, inside bounds and what is possible.
+The bounds cannot be examined one by one. If two parameters have nearly the same effect, the data
+pull both. Once one is free, the other may lie inside its bounds, or move to the other side.
+
+So bounds are released in turn. Each step releases the bound whose release removes most of the
+squared error. The error is that of a linear step of all parameters, inside the possible bounds.
 """
 
 from typing import NamedTuple
@@ -15,20 +16,16 @@ from sysid.core.units import format_unit
 from sysid.models.parameters import Parameter
 from sysid.simulation.scaling import is_at_bounds
 
-_LEAST_SHARE = 0.05  # of the squared error that the release of this bound would remove
-_LEAST_SIGNIFICANCE = (
-    16.0  # times what a parameter without effect would seem to remove: four standard errors
-)
-_TIE_TOLERANCE = (
-    1e-9  # of the squared error: what leaves as little differs by rounding, and the first is taken
-)
-_LEAST_ROOM = 0.01  # of the interval: a bound that can be moved by less is as far out as it can be
+_LEAST_SHARE = 0.05  # of the squared error: the release of a bound must remove as much
+_LEAST_SIGNIFICANCE = 16.0  # times the gain of a parameter without effect: four standard errors
+_TIE_TOLERANCE = 1e-9  # of the squared error: smaller differences are rounding, the first wins
+_LEAST_ROOM = 0.01  # of the interval: a bound with less room is at its limit
 
 
 class ActiveBound(NamedTuple):
-    """A bound to be widened; `share` of the squared error is what it costs.
+    """A bound to be widened; it costs the `share` of the squared error.
 
-    `limit` is how far out it may be moved; None: there is no limit.
+    `limit` is the farthest value that the bound may have; None: no limit.
     """
 
     name: str
@@ -43,7 +40,7 @@ class ActiveBound(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What to do about it."""
+        """Advice in words: how to move the bound."""
         lower = self.side == "lower"
         text = f"{'lower' if lower else 'raise'} the bound of {self.name}"
         if self.limit is None:
@@ -53,14 +50,14 @@ class ActiveBound(NamedTuple):
 
 
 def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> BoolArray:
-    """Which parameters the data pull beyond their bounds, each looked at alone, (D,).
+    """Return which parameters (D,) the data pull beyond their bounds, each considered alone.
 
     Parameters
     ----------
     influence : FloatArray, shape (n,)
-        Weighted residuals, model minus data, as the loss sees them.
+        Influence of the weighted residuals (model minus data) on the loss.
     columns : FloatArray, shape (n, D)
-        Slopes of the outputs over the places.
+        Sensitivities of the outputs to the places.
     place : FloatArray, shape (D,)
         In [0, 1].
     """
@@ -82,14 +79,14 @@ def rank_active_bounds(
     columns: FloatArray,
     place: FloatArray,
 ) -> tuple[ActiveBound, ...]:
-    """Which bounds to widen together, the costliest first; arrays as in `is_active`.
+    """Rank the bounds to widen together, the costliest first; arrays as in `is_active`.
 
     Parameters
     ----------
     space : tuple of Parameter
-        The free ones, D.
+        The free parameters, D.
     reaches : tuple of (float, float)
-        For each the lowest and the highest value that its bounds may be given.
+        Lowest and highest value that the bounds of each may have.
     """
     step = _LinearStep.from_place(space, reaches, influence, columns, place)
     low, high = is_at_bounds(place)
@@ -97,34 +94,36 @@ def rank_active_bounds(
     candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _LEAST_ROOM))]
     shares: dict[int, float] = {}
     loss, total = step.solve_released(())[1], float(influence @ influence)
-    while left := [d for d in candidates if d not in shares]:
-        tried = [(step.solve_released((*shares, d))[1], d) for d in left]
-        least = min(tried)[0] + _TIE_TOLERANCE * total
-        reached, best = next(one for one in tried if one[0] <= least)
+    while remaining := [d for d in candidates if d not in shares]:
+        trials = [(step.solve_released((*shares, d))[1], d) for d in remaining]
+        least = min(trials)[0] + _TIE_TOLERANCE * total
+        reached, best = next(trial for trial in trials if trial[0] <= least)
         share = (loss - reached) / total
         if not (share > _LEAST_SHARE and share * influence.size > _LEAST_SIGNIFICANCE):
             break
         shares[best], loss = share, reached
     moved = place + step.solve_released(tuple(shares))[0]
-    found = [
+    active = [
         _make_active_bound(space[d], reaches[d], bool(low[d]), share)
         for d, share in shares.items()
         if (moved[d] < 0.0 if low[d] else moved[d] > 1.0)
     ]
-    return tuple(sorted(found, key=lambda one: -one.share))
+    return tuple(sorted(active, key=lambda trial: -trial.share))
 
 
-def _make_active_bound(one: Parameter, reach: Interval, is_low: bool, share: float) -> ActiveBound:
+def _make_active_bound(
+    parameter: Parameter, reach: Interval, is_low: bool, share: float
+) -> ActiveBound:
     limit = reach[0] if is_low else reach[1]
-    known = limit if np.isfinite(limit) else None
-    bound, side = (one.lower, "lower") if is_low else (one.upper, "upper")
-    return ActiveBound(one.name, side, bound, one.unit, share, known)
+    finite_limit = limit if np.isfinite(limit) else None
+    bound, side = (parameter.lower, "lower") if is_low else (parameter.upper, "upper")
+    return ActiveBound(parameter.name, side, bound, parameter.unit, share, finite_limit)
 
 
 class _LinearStep(NamedTuple):
     """A linear step of all parameters: abs(root · move - target)² + rest is the squared error.
 
-    `inner` and `outer` (2, D) are the moves to the bounds, and to as far as these can be moved.
+    `inner_moves` and `outer_moves` (2, D) lead to the bounds and to their limits.
     """
 
     root: FloatArray
@@ -142,29 +141,29 @@ class _LinearStep(NamedTuple):
         columns: FloatArray,
         place: FloatArray,
     ) -> "_LinearStep":
-        """The step from a place (D,)."""
+        """Set up the step from a place (D,)."""
         basis, root = np.linalg.qr(columns)
         target = -(basis.T @ influence)
         rest = float(influence @ influence - target @ target)
         ends = [
-            [_to_unit_value(one, end) for end in reach]
-            for one, reach in zip(space, reaches, strict=True)
+            [_to_unit_value(parameter, end) for end in reach]
+            for parameter, reach in zip(space, reaches, strict=True)
         ]
         return cls(root, target, rest, np.array([-place, 1.0 - place]), np.array(ends).T - place)
 
     def solve_released(self, released: tuple[int, ...]) -> tuple[FloatArray, float]:
-        """The best move (D,) with some bounds released, and the squared error it leaves."""
-        # Here, as it takes a tenth of a second to import and few results need it.
+        """Compute the best move (D,) with some bounds released, and the remaining squared error."""
+        # Imported late: it takes a tenth of a second, and few results need it.
         from scipy.optimize import lsq_linear
 
         ends = self.inner_moves.copy()
         ends[:, list(released)] = self.outer_moves[:, list(released)]
-        found = lsq_linear(self.root, self.target, (ends[0], ends[1]), method="bvls")
-        return found.x, self.rest + 2.0 * float(found.cost)
+        solution = lsq_linear(self.root, self.target, (ends[0], ends[1]), method="bvls")
+        return solution.x, self.rest + 2.0 * float(solution.cost)
 
 
 def _to_unit_value(parameter: Parameter, value: float) -> float:
-    """Where a value lies: 0 at the lower bound, 1 at the upper one."""
+    """Convert a value to the unit interval: 0 at the lower bound, 1 at the upper one."""
     if parameter.scale == "log":
         if value <= 0.0:
             return -np.inf

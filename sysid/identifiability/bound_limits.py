@@ -1,8 +1,7 @@
-"""How far a bound may be moved before it allows what is impossible.
+"""Limits of the bounds of a parameter, beyond which values are impossible.
 
-A lag reaches neither into the future nor as far back as a record lasts; what an equation divides
-by, or takes the root or the logarithm of, keeps the sign that the bounds give it, as a time
-constant does.
+A delay is neither negative nor as long as a record. Divisors and arguments of roots and logarithms
+keep the sign that the bounds imply; a time constant, for example, stays positive.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -17,47 +16,51 @@ from sysid.models.sections import get_interval
 from sysid.models.ties import collect_parameter_names
 from sysid.simulation.problem import Problem
 
-_UNLIMITED_WIDTHS = 1e6  # times the range: what is possible there has no limit
+_UNLIMITED_WIDTHS = 1e6  # times the range: a bound that may move so far has no limit
 _BISECTIONS = 80
-_ZERO_TOLERANCE = 1e-9  # of the range: a limit nearer to 0 is that
+_ZERO_TOLERANCE = 1e-9  # of the range: a limit nearer to 0 is 0
 
 
 def find_widest_bounds(problem: Problem, parameter: Parameter) -> Interval:
-    """Lowest and highest value that a free parameter's bounds may have; infinite where any may."""
-    spans = {one.name: get_interval(one) for one in problem.all_parameters}
-    own, width = spans[parameter.name], parameter.upper - parameter.lower
-    least = 0.0 if parameter.scale == "log" else -inf
-    signs = [
-        one for one in _iterate_signed(problem) if parameter.name in collect_parameter_names(one)
+    """Find the lowest and highest value that a parameter's bounds may have; infinite: no limit."""
+    spans = {item.name: get_interval(item) for item in problem.all_parameters}
+    present, width = spans[parameter.name], parameter.upper - parameter.lower
+    lowest = 0.0 if parameter.scale == "log" else -inf
+    signed = [
+        item for item in _iterate_signed(problem) if parameter.name in collect_parameter_names(item)
     ]
     pasts = [
-        one
-        for one in list_past_values(problem.model)
-        if one.delay is not None and parameter.name in collect_parameter_names(one.delay)
+        item
+        for item in list_past_values(problem.model)
+        if item.delay is not None and parameter.name in collect_parameter_names(item.delay)
     ]
-    grids = {(one.grid.integration_step, one.grid.duration) for one in problem.experiments}
+    grids = {(item.grid.integration_step, item.grid.duration) for item in problem.experiments}
 
     def is_possible(value: float) -> bool:
-        wide = {**spans, parameter.name: (min(own[0], value), max(own[1], value))}
-        kept = all(
-            _keeps_sign(bound_expression(one, spans), bound_expression(one, wide)) for one in signs
+        wide = {**spans, parameter.name: (min(present[0], value), max(present[1], value))}
+        keeps_signs = all(
+            _keeps_sign(bound_expression(item, spans), bound_expression(item, wide))
+            for item in signed
         )
-        return value >= least and kept and all(is_past(one, wide) for one in pasts)
+        return (
+            value >= lowest and keeps_signs and all(is_delay_possible(item, wide) for item in pasts)
+        )
 
-    def is_past(past: PastValue, wide: Mapping[str, Interval]) -> bool:
+    def is_delay_possible(past: PastValue, wide: Mapping[str, Interval]) -> bool:
         if past.delay is None or bound_expression(past.delay, wide)[0] < 0:
             return False
         return all(compute_longest_delay(problem.model, past, wide, h) < last for h, last in grids)
 
     ends = (
-        _bisect_limit(end, way * width, is_possible) for end, way in zip(own, (-1, 1), strict=True)
+        _bisect_limit(end, direction * width, is_possible)
+        for end, direction in zip(present, (-1, 1), strict=True)
     )
     low, high = (0.0 if abs(end) < _ZERO_TOLERANCE * width else end for end in ends)
     return low, high
 
 
 def _bisect_limit(start: float, width: float, is_possible: Callable[[float], bool]) -> float:
-    """The last possible value from `start` on; widths below 0 lead downwards."""
+    """Bisect for the last possible value from `start` on; a negative width leads downwards."""
     inside, outside = start, start + _UNLIMITED_WIDTHS * width
     if is_possible(outside):
         return inf if width > 0 else -inf
@@ -72,7 +75,7 @@ def _keeps_sign(now: Interval, then: Interval) -> bool:
 
 
 def _iterate_signed(problem: Problem) -> Iterator[Expression]:
-    """Divisors, bases of powers that need a sign, and arguments of roots and logarithms."""
+    """Iterate over divisors, bases of powers that need a sign, and arguments of roots and logs."""
     outputs = (output.expression for output in problem.model.outputs)
     for tree in (*problem.model.equations, *outputs):
         yield from _iterate_divisors(tree)
@@ -84,7 +87,7 @@ def _iterate_divisors(tree: Expression) -> Iterator[Expression]:
             case Binary("/", _, divisor):
                 yield divisor
                 if isinstance(divisor, Binary) and divisor.operator == "**":
-                    yield divisor.left  # whose square would pass 0 without a change of its sign
+                    yield divisor.left  # its square passes 0 without a change of sign
             case Binary("**", base, exponent) if not _is_whole_power(exponent):
                 yield base
             case FunctionCall("sqrt" | "log", (argument,)):
@@ -92,5 +95,5 @@ def _iterate_divisors(tree: Expression) -> Iterator[Expression]:
 
 
 def _is_whole_power(exponent: Expression) -> bool:
-    """Whether any base, of either sign and 0, has such a power."""
+    """Return whether a base of any sign, or 0, has such a power."""
     return isinstance(exponent, Number) and exponent.value >= 0 and exponent.value % 1 == 0

@@ -1,17 +1,15 @@
-"""What the data tell of parameters that they do not tell apart: groups, written out.
+"""Null and weak directions of the parameters, and the combinations that remain identifiable.
 
 The rows of `null` (m, D) span the directions along which the output does not change. They fall
-into blocks that have no parameter in common. In a block of M parameters and m directions there are
-M - m combinations that do not change along any of them. They are read off the reduced echelon form
-R of the directions with the pivots i: for every other parameter j
+into blocks that have no parameter in common. In a block of M parameters and m directions, M - m
+combinations are constant along all directions. They follow from the reduced echelon form R of the
+directions with the pivots i. For every other parameter j
 
     e_j - Σ_i R_ij e_i        is orthogonal to all directions.
 
-Taken of ln θ with rational entries this is a product of powers (``A_m*k_b/J``), taken of θ a sum
-(``T + L``); where neither is rational, or a fractional power would be of a negative estimate, it
-is the sum that holds near the estimate.
-
-Directions of which the data tell nothing or little, and what parameters they move.
+Applied to ln θ with rational entries this is a product of powers (``A_m*k_b/J``). Applied to θ it
+is a sum (``T + L``). The sum near the estimate is used if neither is rational, or if a negative
+estimate would get a fractional power.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,12 +24,12 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class IdentifiableCombination:
-    """A combination of parameters that the data tell, though not what each of them is.
+    """A combination that the data determine, though not each of its parameters.
 
     Attributes
     ----------
     members : tuple of str
-        The parameters in it.
+        The parameters of the combination.
     expression : str
         A product of powers, such as ``A_m*k_b/J``, or else a sum, such as ``T + L``.
     value : float
@@ -45,7 +43,7 @@ class IdentifiableCombination:
     stderr: float | None
 
 
-_LINK_TOLERANCE = 1e-4  # of two parameters that no direction moves together, this is rounding
+_LINK_TOLERANCE = 1e-4  # parameters with a weaker link are not moved together: it is rounding
 _PIVOT_TOLERANCE = 1e-3  # of the largest entry of its column
 _FRACTION_TOLERANCE, _LARGEST_DENOMINATOR, _LARGEST_FRACTION = 1e-3, 4, 6
 
@@ -58,7 +56,7 @@ class ParameterBlock:
     ----------
     members : IntArray, shape (M,)
     basis : FloatArray, shape (m, M)
-        The directions, over the members' places in [0, 1].
+        The directions, in the members' places in [0, 1].
     """
 
     members: IntArray
@@ -66,27 +64,27 @@ class ParameterBlock:
 
     @property
     def has_no_combination(self) -> bool:
-        """Whether no combination is left: as many directions as parameters, or one alone."""
+        """Whether no combination remains: as many directions as parameters, or one parameter."""
         return bool(self.members.size < 2 or self.basis.shape[0] >= self.members.size)
 
 
 def find_blocks(null: FloatArray, member: BoolArray) -> tuple[ParameterBlock, ...]:
-    """The blocks of some orthonormal directions (m, D) over the parameters marked in `member`."""
-    together = np.abs(null.T @ null)
-    own = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
-    linked = together > _LINK_TOLERANCE * np.outer(own, own)
-    found, left = [], list(np.flatnonzero(member))
-    while left:
-        block = [left.pop(0)]
-        for d in block:  # grows while it is walked
-            near = [other for other in left if linked[d, other]]
+    """Find the blocks of orthonormal directions (m, D) over the parameters in `member`."""
+    products = np.abs(null.T @ null)
+    lengths = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
+    linked = products > _LINK_TOLERANCE * np.outer(lengths, lengths)
+    blocks, remaining = [], list(np.flatnonzero(member))
+    while remaining:
+        block = [remaining.pop(0)]
+        for d in block:  # grows during the iteration
+            near = [other for other in remaining if linked[d, other]]
             block += near
-            left = [other for other in left if other not in near]
+            remaining = [other for other in remaining if other not in near]
         members = np.array(sorted(block), dtype=np.int64)
         _, size, rows = np.linalg.svd(null[:, members], full_matrices=False)
-        # A direction of this block lies in it whole, one of another block not at all.
-        found.append(ParameterBlock(members, rows[size > 0.5]))
-    return tuple(found)
+        # A direction lies completely in its own block, and not at all in another.
+        blocks.append(ParameterBlock(members, rows[size > 0.5]))
+    return tuple(blocks)
 
 
 def express_combinations(
@@ -96,15 +94,15 @@ def express_combinations(
     scale: FloatArray,
     covariance: FloatArray,
 ) -> tuple[IdentifiableCombination, ...]:
-    """The combinations of a block that the data tell.
+    """Express the identifiable combinations of a block.
 
     Parameters
     ----------
     names : sequence of str, length D
     theta, scale : FloatArray, shape (D,)
-        Estimate, and ∂θ/∂p of the places p.
+        Estimate, and ∂θ/∂p for the places p.
     covariance : FloatArray, shape (D, D)
-        Of θ, in its units; without what it would be along the directions.
+        Covariance of θ in its units, without the part along the directions.
     """
     if block.has_no_combination:
         return ()
@@ -119,14 +117,17 @@ def express_combinations(
     terms = _round_to_fractions(sums, small, unit)
     if powers is not None and (terms is None or powers[1] <= terms[1]):
         texts = [(e, _format_product([names[d] for d in block.members], e)) for e in powers[0]]
-        found = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
-        told = [(text, total, total * slope) for text, total, slope in found]
+        products = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
+        combinations = [(text, total, total * slope) for text, total, slope in products]
     else:
-        kept = sums if terms is None else terms[0]
-        told = [
-            (_format_sum([names[d] for d in block.members], c), float(c @ value), c) for c in kept
+        factors = sums if terms is None else terms[0]
+        combinations = [
+            (_format_sum([names[d] for d in block.members], c), float(c @ value), c)
+            for c in factors
         ]
-    return tuple(_make_combination(block, names, covariance, *one) for one in told)
+    return tuple(
+        _make_combination(block, names, covariance, *combination) for combination in combinations
+    )
 
 
 def _make_combination(
@@ -144,7 +145,7 @@ def _make_combination(
 
 
 def _iterate_orthogonal(rows: FloatArray) -> Iterator[FloatArray]:
-    """Combinations that are orthogonal to all rows, each with one parameter that is no pivot.
+    """Iterate over combinations orthogonal to all rows, each with one parameter that is no pivot.
 
     Pivots are the parameters that most directions move, in the order of the model.
     """
@@ -159,7 +160,7 @@ def _iterate_orthogonal(rows: FloatArray) -> Iterator[FloatArray]:
 
 
 def _reduce_rows(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list[int]]:
-    """Reduced echelon form, with the columns taken as pivots in the given order."""
+    """Compute the reduced echelon form, with the pivots in the order of `columns`."""
     rows = rows / np.max(np.abs(rows), axis=1, keepdims=True)
     pivots: list[int] = []
     for column in columns:
@@ -179,33 +180,34 @@ def _reduce_rows(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, 
 
 
 def _orient_combination(entry: FloatArray) -> FloatArray:
-    """The combination or its inverse, whichever has fewer negative entries."""
+    """Return the combination or its inverse, whichever has fewer negative entries."""
     large = np.abs(entry) > _PIVOT_TOLERANCE
     return -entry if np.sum(entry[large] < 0) > np.sum(entry[large] > 0) else entry
 
 
 def _find_negligible(parts: FloatArray) -> BoolArray:
-    """Which parameters have next to no part in a combination; two of them have one always.
+    """Find the parameters with almost no part in a combination; two always have one.
 
-    By how much it changes over their ranges: factors have units, and of a large parameter a small
-    one counts.
+    The measure is the change of the combination over a parameter's range. Factors alone have units,
+    and a small factor of a large parameter matters.
     """
     second = np.sort(np.abs(parts), axis=1)[:, -2:-1]
     return np.asarray(np.abs(parts) < _PIVOT_TOLERANCE * second)
 
 
 def _get_leading(sums: FloatArray) -> FloatArray:
-    """For each row its first entry that is not 0, so that sums begin with a plain name."""
+    """Get the first entry of each row that is not 0, so that sums begin with a plain name."""
     return np.take_along_axis(sums, np.argmax(sums != 0.0, axis=1)[:, None], axis=1)
 
 
 def _round_to_fractions(
     entries: FloatArray, small: BoolArray, unit: FloatArray | None = None
 ) -> tuple[FloatArray, float] | None:
-    """The entries as small fractions, and how far off they are; None where they are not.
+    """Round the entries to small fractions; return them and the error, or None if it is large.
 
-    None too where that would leave out a parameter that is not `small`. With the ranges (M,) of
-    the members they are factors of a sum that begins with 1, and off by what that makes of it.
+    None also if rounding would drop a parameter that is not `small`. With `unit`, the ranges (M,)
+    of the members, the entries are factors of a sum that begins with 1. The error is then that of
+    the sum.
     """
     nearest = np.array(
         [
@@ -215,14 +217,14 @@ def _round_to_fractions(
     )
     if np.any((nearest == 0.0) & ~small):
         return None
-    apart = np.abs(nearest - entries)
+    errors = np.abs(nearest - entries)
     if unit is not None:
         first = np.argmax(entries != 0.0, axis=1)
-        apart = apart * np.maximum(1.0, np.abs(unit / unit[first][:, None]))
-    off = float(np.max(apart))
+        errors = errors * np.maximum(1.0, np.abs(unit / unit[first][:, None]))
+    error = float(np.max(errors))
     return (
-        (nearest, off)
-        if off < _FRACTION_TOLERANCE and np.max(np.abs(nearest)) <= _LARGEST_FRACTION
+        (nearest, error)
+        if error < _FRACTION_TOLERANCE and np.max(np.abs(nearest)) <= _LARGEST_FRACTION
         else None
     )
 
@@ -230,12 +232,12 @@ def _round_to_fractions(
 def _round_powers(
     entries: FloatArray, value: FloatArray, small: BoolArray
 ) -> tuple[FloatArray, float] | None:
-    """The same for powers of `value` (M,); None too where one of them is not a real number."""
-    found = _round_to_fractions(entries, small)
-    if found is None:
+    """Round powers of `value` (M,) likewise; None also if a power is not a real number."""
+    rounded = _round_to_fractions(entries, small)
+    if rounded is None:
         return None
-    fractional = found[0] != np.rint(found[0])
-    return None if np.any(fractional & (value < 0)) else found
+    fractional = rounded[0] != np.rint(rounded[0])
+    return None if np.any(fractional & (value < 0)) else rounded
 
 
 def _format_product(names: Sequence[str], powers: FloatArray) -> str:
@@ -263,18 +265,19 @@ def _format_sum(names: Sequence[str], factors: FloatArray) -> str:
     return text
 
 
-# Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
-# about, and of one that has no effect at all, which is known to many digits.
+# Squared share from which a parameter belongs to a direction: to a weak direction, and to one
+# without any effect, which is computed to many digits.
 _WEAK_SHARE, NULL_SHARE = 0.05, 1e-5
-_VAGUE_DEVIATION = 0.5  # of the range: a standard error as large as that
+_VAGUE_DEVIATION = 0.5  # of the range: a larger standard error is vague
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SingularDirections:
-    """Singular directions (D, D) of the sensitivities, over the places.
+    """Singular directions (D, D) of the sensitivities, in the places.
 
-    `null` are those along which the output does not change, `weak` those of which the data say
-    little; `member` marks the parameters that `null` moves, `vague` those that are not told well.
+    The output does not change along the `null` directions. The data say little about the `weak`
+    ones. `is_null_member` marks the parameters that null directions move. `is_vague` marks those
+    with a large standard error.
     """
 
     rows: FloatArray
@@ -292,16 +295,16 @@ def classify_directions(
     covariance: FloatArray,
     noise: float,
 ) -> SingularDirections:
-    """What a covariance (D, D) of the places makes of the singular directions (D, D).
+    """Classify the singular directions (D, D) by a covariance (D, D) of the places.
 
     Parameters
     ----------
     singular : FloatArray, shape (D,)
     null : BoolArray, shape (D,)
     moved : BoolArray, shape (D,)
-        Parameters that are known to be moved by what has no effect, however little.
+        Parameters that a direction without effect certainly moves, however little.
     noise : float
-        Its standard deviation.
+        Standard deviation of the noise.
     """
     spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
     weak = ~null & ((spread >= _VAGUE_DEVIATION) | (noise >= _VAGUE_DEVIATION * singular))
@@ -310,14 +313,14 @@ def classify_directions(
 
 
 def find_unidentified(directions: SingularDirections) -> tuple[ParameterBlock, ...]:
-    """Parameters that have no effect of their own, then those of which the data say little."""
-    found = find_blocks(directions.rows[directions.null], directions.is_null_member)
+    """Find blocks of parameters along null directions, then blocks along weak ones."""
+    null_blocks = find_blocks(directions.rows[directions.null], directions.is_null_member)
     weak = directions.rows[directions.weak]
-    # One that has a small part in a direction of which nothing is known is not known either.
+    # A parameter with any component along a null direction is not identifiable.
     has_part = np.any(weak**2 > _WEAK_SHARE, axis=0) | directions.is_vague
     member = has_part & ~directions.is_null_member
-    beside = find_blocks(weak, member)
-    left = [one for one in beside if not one.basis.size]
-    alone = [d for one in left for d in one.members if directions.is_vague[d]]
-    nothing = tuple(ParameterBlock(np.array([d]), np.zeros((0, 1))) for d in alone)
-    return found + tuple(one for one in beside if one.basis.size) + nothing
+    weak_blocks = find_blocks(weak, member)
+    empty_blocks = [block for block in weak_blocks if not block.basis.size]
+    alone = [d for block in empty_blocks for d in block.members if directions.is_vague[d]]
+    single_blocks = tuple(ParameterBlock(np.array([d]), np.zeros((0, 1))) for d in alone)
+    return null_blocks + tuple(block for block in weak_blocks if block.basis.size) + single_blocks

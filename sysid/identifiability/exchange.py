@@ -1,15 +1,17 @@
-"""Parameters that can change places, such as two time constants in series.
+"""Exchangeable parameters (label switching), such as two time constants in series.
 
-No data tell which is the first. It need not show in the equations, whose inner states differ, so
-it is looked for as the sums of `sysid.identifiability.translations` are: parameters of one unit are
-exchanged, apart from one another, and the model is simulated, once more with all others moved: two
-gains at one bound make parallel sections alike at that estimate only. What changes nothing then
-counts. One order is given, the largest first; bounds that do not hold the other order tell which is
-which, and leave nothing to be exchanged.
+No data can tell which is the first. The equations need not show it, because the inner states
+differ. So it is tested by simulation, as in `sysid.identifiability.translations`. Parameters of the
+same unit are set apart and exchanged, and the model is simulated. If the output stays the same, the
+test is repeated with all other parameters moved. The repetition is needed because two gains at one
+bound make parallel subsystems alike at that estimate only.
 
-Parallel sections change places as a whole, gains and initial states with them. What goes with what
-is read off the equations (`sysid.identifiability.subsystems`), and tried in the same way. Of S
-states that are at most S(S - 1)/2 times five simulations.
+The estimates are reported in one order, the largest first. If the bounds exclude the other order,
+they tell which is which, and nothing is exchanged.
+
+Parallel subsystems are exchanged as a whole, with gains and initial states. The equations show
+which parameters belong together (`sysid.identifiability.subsystems`), and the same test follows.
+For S states this takes at most S(S - 1)/2 times five simulations.
 """
 
 from collections.abc import Iterator
@@ -25,139 +27,151 @@ from sysid.models.ties import collect_parameter_names
 from sysid.simulation.problem import Problem
 
 ExchangeGroup = tuple[ExchangeUnit, ...]
-"""Units of places in the problem's space, any two of which can be exchanged: (k, w)."""
+"""Exchangeable units (k, w), as indices of free parameters."""
 
 ExchangeGroups = tuple[ExchangeGroup, ...]
 
-_LEAST_DISTANCE = 0.05  # of their size: how far the two are set apart at least
-_LEAST_SIZE = 1e-3  # of the range: values nearer 0 are taken to be of that size
-_MOVE_SHARES = 0.02, 0.05  # of its size: by how much each of the others is moved
+_LEAST_DISTANCE = 0.05  # of their size: least distance of the two in the test
+_LEAST_SIZE = 1e-3  # of the range: values nearer 0 count as of this size
+_MOVE_SHARES = 0.02, 0.05  # of their size: the moves of the other parameters
 _SAME_TOLERANCE = 1e-9  # of the output's size: rounding
 _BATCH_SIZE = 8  # simulations
-_COMPARED_SAMPLES = 10_000  # samples, about, by which what cannot be is ruled out
+_COMPARED_SAMPLES = 10_000  # samples, about, that are compared to exclude pairs
 _PAIR_SIMULATIONS, _REPEAT_SIMULATIONS = 3, 2  # simulations for a pair, and with the others moved
 
 
 def find_exchanges(
     problem: Problem, theta: FloatArray, most: int | None = None
 ) -> tuple[ExchangeGroups, int]:
-    """What can be exchanged around an estimate (D,), and the simulations this took.
+    """Find exchangeable parameters around an estimate (D,), and count the simulations.
 
     Parameters
     ----------
     most : int or None
-        Simulations that may be run; pairs beyond are not looked at.
+        Limit on the simulations; pairs beyond are not tested.
     """
     groups: list[ExchangeGroup] = []
     pairs, spent = _exclude_unlikely(
         problem, theta, list(_iterate_candidates(problem, theta)), most
     )
-    single = (((one,), (other,)) for one, other in pairs)
-    together = (
+    single = (((first,), (second,)) for first, second in pairs)
+    subsystems = (
         pair
         for pair in find_equivalent_subsystems(problem)
         if _bounds_allow_exchange(problem, theta, *pair)
     )
-    for one, other in chain(single, together):
-        if _find_group(groups, one) == _find_group(groups, other):
+    for first, second in chain(single, subsystems):
+        if _find_group(groups, first) == _find_group(groups, second):
             continue
         if most is not None and spent + _PAIR_SIMULATIONS + _REPEAT_SIMULATIONS > most:
             break
-        found, count = _test_exchange(problem, theta, one, other)
+        is_exchangeable, count = _test_exchange(problem, theta, first, second)
         spent += count
-        if found:
-            groups = _merge_units(groups, one, other)
-    every = sorted(tuple(sorted(group)) for group in groups)
+        if is_exchangeable:
+            groups = _merge_units(groups, first, second)
+    sorted_groups = sorted(tuple(sorted(group)) for group in groups)
     return tuple(
-        one for one in every if _is_decreasing(order_exchangeable(problem, theta, (one,)), one)
+        group
+        for group in sorted_groups
+        if _is_decreasing(order_exchangeable(problem, theta, (group,)), group)
     ), spent
 
 
 def _is_decreasing(theta: FloatArray, group: ExchangeGroup) -> bool:
-    """Whether bounds let a group be put in order: those of some pairs do not need to be of all."""
+    """Return whether a group is in decreasing order, which bounds can prevent."""
     return bool(np.all(np.diff(theta[[unit[0] for unit in group]]) <= 0.0))
 
 
 def _bounds_allow_exchange(
-    problem: Problem, theta: FloatArray, one: ExchangeUnit, other: ExchangeUnit
+    problem: Problem, theta: FloatArray, first: ExchangeUnit, second: ExchangeUnit
 ) -> bool:
-    """Whether bounds let two units change places."""
+    """Return whether the bounds allow the exchange of two units."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
-    here, there = [*one, *other], [*other, *one]
-    return bool(np.all((lower[here] <= theta[there]) & (theta[there] <= upper[here])))
+    present, exchanged = [*first, *second], [*second, *first]
+    return bool(np.all((lower[present] <= theta[exchanged]) & (theta[exchanged] <= upper[present])))
 
 
 def _find_group(groups: list[ExchangeGroup], unit: ExchangeUnit) -> ExchangeGroup:
-    found = (one for one in groups if any(set(unit) == set(own) for own in one))
-    return next(found, (unit,))
+    matches = (group for group in groups if any(set(unit) == set(member) for member in group))
+    return next(matches, (unit,))
 
 
 def _merge_units(
     groups: list[ExchangeGroup], one: ExchangeUnit, other: ExchangeUnit
 ) -> list[ExchangeGroup]:
-    """Groups with two units in one of them, the places of all in the order of its first."""
-    first, second = _find_group(groups, one), _find_group(groups, other)
+    """Merge the groups of two units; all units follow the order of the first."""
+    first_group, second_group = _find_group(groups, one), _find_group(groups, other)
     goes_to = dict(zip(one, other, strict=True))
-    here = next(own for own in first if set(own) == set(one))
-    there = next(own for own in second if set(own) == set(other))
-    order = [there.index(goes_to[d]) for d in here]
-    beside = tuple(tuple(own[i] for i in order) for own in second)
-    return [*(group for group in groups if group not in (first, second)), first + beside]
+    first_unit = next(unit for unit in first_group if set(unit) == set(one))
+    second_unit = next(unit for unit in second_group if set(unit) == set(other))
+    order = [second_unit.index(goes_to[d]) for d in first_unit]
+    reordered = tuple(tuple(unit[i] for i in order) for unit in second_group)
+    return [
+        *(group for group in groups if group not in (first_group, second_group)),
+        first_group + reordered,
+    ]
 
 
 def order_exchangeable(problem: Problem, theta: FloatArray, groups: ExchangeGroups) -> FloatArray:
-    """Values (..., D) with those of each group falling, where the bounds hold them so."""
-    found = np.array(theta)
+    """Sort the values (..., D) of each group in decreasing order, where the bounds allow it."""
+    ordered = np.array(theta)
     for group in groups:
         units = np.array(group)
-        values = found[..., units]  # (..., k, w)
+        values = ordered[..., units]  # (..., k, w)
         order = np.argsort(-values[..., 0], axis=-1, kind="stable")
         falling = np.take_along_axis(values, order[..., None], axis=-2)
         lower, upper = problem.evaluator.lower[units], problem.evaluator.upper[units]
         fits = np.all((lower <= falling) & (falling <= upper), axis=(-2, -1), keepdims=True)
-        found[..., units] = np.where(fits, falling, values)
-    return found
+        ordered[..., units] = np.where(fits, falling, values)
+    return ordered
 
 
-def describe_exchanges(problem: Problem, groups: ExchangeGroups, told: set[str]) -> tuple[str, ...]:
-    """Notes of what can be exchanged among the names `told`: those with standard errors."""
+def describe_exchanges(
+    problem: Problem, groups: ExchangeGroups, reported: set[str]
+) -> tuple[str, ...]:
+    """Describe exchangeable groups among the `reported` names, those with standard errors."""
     return tuple(
         _describe_group(problem, group)
         for group in groups
-        if _has_reported_values(problem, group, told)
+        if _has_reported_values(problem, group, reported)
     )
 
 
-def _has_reported_values(problem: Problem, group: ExchangeGroup, told: set[str]) -> bool:
-    """Whether of each unit something is told that the others have another value of."""
+def _has_reported_values(problem: Problem, group: ExchangeGroup, reported: set[str]) -> bool:
+    """Return whether some parameter of the units is reported for each of them."""
     columns = zip(*group, strict=True)
-    return any(all(problem.free_parameters[d].name in told for d in one) for one in columns)
+    return any(
+        all(problem.free_parameters[d].name in reported for d in column) for column in columns
+    )
 
 
 def _describe_group(problem: Problem, group: ExchangeGroup) -> str:
     names = [[problem.free_parameters[d].name for d in unit] for unit in group]
     if len(names[0]) == 1:
         return (
-            f"{' and '.join(one for (one,) in names)} can be exchanged without any effect on the "
-            "output: which is which no data tell; they are given from the largest to the smallest"
+            f"{' and '.join(name for (name,) in names)} can be exchanged without any effect on the "
+            "output. No data can tell which is which. They are reported in decreasing order"
         )
     units = " and ".join(f"({', '.join(unit)})" for unit in names)
     return (
-        f"{units} can be exchanged as a whole without any effect on the output: which is which no "
-        f"data tell; they are given from the largest {names[0][0]} to the smallest"
+        f"{units} can be exchanged as a whole without any effect on the output. No data can tell "
+        f"which is which. They are reported in decreasing order of {names[0][0]}"
     )
 
 
 def _iterate_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[int, int]]:
-    """Pairs of one unit, both of them in lags or neither, whose bounds hold both orders.
+    """Iterate over pairs of the same unit, both delays or neither, whose bounds allow both orders.
 
-    Factors of a product that alone is known can do more than change places.
+    Factors of which only the product is identifiable are excluded: they can do more than swap.
     """
     if problem.model.form == "polynomial":
-        return  # each coefficient has a term of its own
-    own = {one.name for one in problem.model.parameters}
+        return  # each coefficient has its own term
+    model_names = {parameter.name for parameter in problem.model.parameters}
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
-    units = [one.unit if one.name in own else None for one in problem.free_parameters]
+    units = [
+        parameter.unit if parameter.name in model_names else None
+        for parameter in problem.free_parameters
+    ]
     alike = [
         (i, j)
         for i, j in combinations(range(theta.size), 2)
@@ -168,36 +182,37 @@ def _iterate_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[i
     ]
     if not alike:
         return
-    lagged = set().union(
+    delay_names = set().union(
         *(collect_parameter_names(p.delay) for p in list_past_values(problem.model) if p.delay),
         set(),
     )
     scaled = np.any(find_scalings(problem.model, problem.all_parameters) != 0.0, axis=0)
     for i, j in alike:
-        in_lags = [problem.free_parameters[d].name in lagged for d in (i, j)]
-        if in_lags[0] == in_lags[1] and not (scaled[i] or scaled[j]):
+        in_delays = [problem.free_parameters[d].name in delay_names for d in (i, j)]
+        if in_delays[0] == in_delays[1] and not (scaled[i] or scaled[j]):
             yield i, j
 
 
-def _merge_members(groups: list[set[int]], one: int, other: int) -> list[set[int]]:
-    """Groups with two members in one of them."""
-    near = [group for group in groups if group & {one, other}]
-    far = [group for group in groups if not group & {one, other}]
-    return [*far, set().union({one, other}, *near)]
+def _merge_members(groups: list[set[int]], first: int, second: int) -> list[set[int]]:
+    """Merge the groups of two members."""
+    near = [group for group in groups if group & {first, second}]
+    far = [group for group in groups if not group & {first, second}]
+    return [*far, set().union({first, second}, *near)]
 
 
 def _exclude_unlikely(
     problem: Problem, theta: FloatArray, pairs: list[tuple[int, int]], most: int | None
 ) -> tuple[list[tuple[int, int]], int]:
-    """Pairs without those that a simulation for each parameter rules out, and how many it took.
+    """Exclude pairs by one simulation for each parameter; return the rest and the simulations.
 
-    For each pair it would be several: of 24 gains hundreds. Where all have one value a little more
-    of either of two that can be exchanged has the same effect.
+    A full test of each pair takes several simulations, so hundreds for 24 gains. Here all
+    parameters get one value. A small increase of either of two exchangeable ones then has the same
+    effect.
     """
     groups: list[set[int]] = []
     for pair in pairs:
         groups = _merge_members(groups, *pair)
-    kept, spent = list(pairs), 0
+    remaining, spent = list(pairs), 0
     for group in groups:
         members = sorted(group)
         low = float(np.max(problem.evaluator.lower[members]))
@@ -210,76 +225,76 @@ def _exclude_unlikely(
             continue
         spent += len(members)
         answers = _simulate_perturbed(problem, theta, members, low, high)
-        kept = [
+        remaining = [
             (i, j)
-            for i, j in kept
+            for i, j in remaining
             if i not in group
             or not np.isfinite([answers[i], answers[j]]).all()
             or _is_same_output(answers[i], answers[j])
         ]
-    return kept, spent
+    return remaining, spent
 
 
 def _simulate_perturbed(
     problem: Problem, theta: FloatArray, members: list[int], low: float, high: float
 ) -> dict[int, FloatArray]:
-    """For each of some parameters the output, in part, with all at one value and it a bit above."""
+    """Simulate, for each member, all members at one value and this one slightly above."""
     value = float(np.median(theta[members]))
-    more = _LEAST_DISTANCE * float(_scale_values(np.array(value), high - low))
-    value = min(max(value, low), high - more)
-    found: dict[int, FloatArray] = {}
-    for first in range(0, len(members), _BATCH_SIZE):  # of a long record there is no room for all
-        some = members[first : first + _BATCH_SIZE]
-        tried = np.repeat(theta[None], len(some), axis=0)
-        tried[:, members] = value
-        tried[np.arange(len(some)), some] += more
-        outputs = problem.predict(tried)
+    increase = _LEAST_DISTANCE * float(_scale_values(np.array(value), high - low))
+    value = min(max(value, low), high - increase)
+    perturbed: dict[int, FloatArray] = {}
+    for first in range(0, len(members), _BATCH_SIZE):  # a long record leaves no room for all
+        batch = members[first : first + _BATCH_SIZE]
+        individuals = np.repeat(theta[None], len(batch), axis=0)
+        individuals[:, members] = value
+        individuals[np.arange(len(batch)), batch] += increase
+        outputs = problem.predict(individuals)
         step = max(1, outputs.shape[1] // _COMPARED_SAMPLES)
-        found |= dict(zip(some, outputs[:, ::step].copy(), strict=True))
-    return found
+        perturbed |= dict(zip(batch, outputs[:, ::step].copy(), strict=True))
+    return perturbed
 
 
 def _test_exchange(
-    problem: Problem, theta: FloatArray, one: ExchangeUnit, other: ExchangeUnit
+    problem: Problem, theta: FloatArray, first: ExchangeUnit, second: ExchangeUnit
 ) -> tuple[bool, int]:
-    """Whether two units that are exchanged leave the output as it is, and their mean does not.
+    """Test whether the exchange of two units keeps the output and their mean changes it.
 
-    And the simulations this took.
+    Returns the result and the number of simulations.
     """
-    evaluator, pair = problem.evaluator, np.array([one, other])
+    evaluator, pair = problem.evaluator, np.array([first, second])
     low, high = evaluator.lower[pair].max(axis=0), evaluator.upper[pair].min(axis=0)
-    least = 0.5 * _LEAST_DISTANCE * _scale_values(theta[pair], high - low).max(axis=0)
+    least_half = 0.5 * _LEAST_DISTANCE * _scale_values(theta[pair], high - low).max(axis=0)
     half = np.minimum(
-        np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least), 0.5 * (high - low)
+        np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least_half), 0.5 * (high - low)
     )
     middle = np.minimum(np.maximum(0.5 * theta[pair].sum(axis=0), low + half), high - half)
-    # Each to the side on which it is, so that sections stay what they are.
+    # Each stays on its side, so that subsystems stay the same.
     half = np.where(theta[pair[0]] < theta[pair[1]], -half, half)
-    tried = np.repeat(theta[None], _PAIR_SIMULATIONS, axis=0)
-    tried[:, pair[0]] = middle + half, middle - half, middle
-    tried[:, pair[1]] = middle - half, middle + half, middle
-    here, there, equal = problem.predict(tried)
-    if not _is_same_output(here, there) or _is_same_output(here, equal):
+    individuals = np.repeat(theta[None], _PAIR_SIMULATIONS, axis=0)
+    individuals[:, pair[0]] = middle + half, middle - half, middle
+    individuals[:, pair[1]] = middle - half, middle + half, middle
+    original, exchanged, averaged = problem.predict(individuals)
+    if not _is_same_output(original, exchanged) or _is_same_output(original, averaged):
         return False, _PAIR_SIMULATIONS
     others = np.delete(np.arange(theta.size), pair.ravel())
-    tried[:, others] = _move_inward(problem, theta)[others]
+    individuals[:, others] = _move_inward(problem, theta)[others]
     return _is_same_output(
-        *problem.predict(tried[:_REPEAT_SIMULATIONS])
+        *problem.predict(individuals[:_REPEAT_SIMULATIONS])
     ), _PAIR_SIMULATIONS + _REPEAT_SIMULATIONS
 
 
-def _is_same_output(here: FloatArray, there: FloatArray) -> bool:
+def _is_same_output(first: FloatArray, second: FloatArray) -> bool:
     with np.errstate(invalid="ignore"):
-        return bool(np.max(np.abs(there - here)) <= _SAME_TOLERANCE * np.max(np.abs(here)))
+        return bool(np.max(np.abs(second - first)) <= _SAME_TOLERANCE * np.max(np.abs(first)))
 
 
 def _scale_values(values: FloatArray, span: FloatArray | float) -> FloatArray:
-    """Of values: their own, or where they are small beside the range a small part of that."""
+    """Compute the size of values: their own, or a small part of the range if that is larger."""
     return np.asarray(np.minimum(np.maximum(np.abs(values), _LEAST_SIZE * span), span))
 
 
 def _move_inward(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Values a little off, away from the nearer bound, and no two of them by as much."""
+    """Move values away from the nearer bound, each by a different share of its size."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     inward = np.where(theta - lower < upper - theta, 1.0, -1.0)
     return np.asarray(

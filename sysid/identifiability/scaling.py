@@ -1,15 +1,14 @@
-"""Scalings of the parameters that leave a model's outputs as they are, whatever the data.
+"""Scaling symmetries: scalings of the parameters that keep a model's outputs, for any data.
 
-If every parameter is multiplied by r to some power, and every state too, and each equation and
-each output holds as before, then no experiment can tell the parameters apart: only products of
-powers that stay the same are identifiable. For J·dω/dt = A·P - B·ω that is (J, A, B)·r, which
-leaves A/J and B/J.
+Multiply every parameter and every state by some power of r. If all equations and outputs still
+hold, no experiment can tell the parameters apart. Only products of powers that stay the same are
+identifiable. For J·dω/dt = A·P - B·ω the symmetry is (J, A, B)·r, which leaves A/J and B/J.
 
-The powers are found as in dimensional analysis. Every expression gets a weight, the power of r by
-which it is multiplied; the terms of a sum must have equal weights, what a function such as sin is
-taken of has weight 0, and so have inputs, outputs, time, lags, and both sides of a power whose
-exponent is to be estimated. These are linear equations with rational coefficients, and they are
-solved exactly; the exponent of a power is a number such as 2, 1/3 or a fixed parameter.
+The powers are computed as in dimensional analysis. Every expression has a weight, the power of r by
+which it is multiplied. The terms of a sum have equal weights. Inputs, outputs, time, delays and
+arguments of functions such as sin have weight 0. So have base and exponent of a power whose
+exponent is estimated. Any other exponent is a number such as 2 or 1/3, or a fixed parameter. The
+weights satisfy linear equations with rational coefficients, which are solved exactly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,19 +44,19 @@ ScalingWeight = Mapping[str, Fraction]
 
 
 def find_scalings(model: Model, parameters: Sequence[Parameter]) -> FloatArray:
-    """Exponents of the free parameters under every scaling symmetry.
+    """Find the exponents of the free parameters under every scaling symmetry.
 
     Parameters
     ----------
     model : Model
-        Its ties resolved.
+        With its ties resolved.
     parameters : sequence of Parameter
-        All of a problem's, initial states too.
+        All parameters of a problem, with initial states.
 
     Returns
     -------
     FloatArray, shape (k, D)
-        A basis in reduced echelon form; k = 0 where there is no such symmetry.
+        A basis in reduced echelon form; k = 0: there is no such symmetry.
     """
     states = tuple(state.name for state in model.states)
     outputs = tuple(output.expression for output in model.outputs)
@@ -72,9 +71,9 @@ def _find_cached_scalings(
     initial: tuple[InitialState, ...],
     parameters: tuple[Parameter, ...],
 ) -> FloatArray:
-    """The same, kept for the many runs of one model; not to be written to."""
+    """Find the scalings, cached for the runs of one model; the result is read-only."""
     free = [p.name for p in parameters if p.is_free]
-    walk = _WeightEquations(
+    weights = _WeightEquations(
         {
             p.name: nan if p.fixed is None else p.fixed
             for p in parameters
@@ -83,42 +82,44 @@ def _find_cached_scalings(
         {p.name for p in parameters if p.fixed == 0.0},
     )
     for state, equation in zip(states, equations, strict=True):
-        walk.require_equal({state: Fraction(1)}, walk.weigh_expression(equation))
+        weights.require_equal({state: Fraction(1)}, weights.weigh_expression(equation))
     for output in outputs:
-        walk.require_equal({}, walk.weigh_expression(output))
-    _add_initial_conditions(walk, states, initial, {p.name for p in parameters})
-    null = _solve_null_space(walk.equations, [*states, *free])
-    kept = [[row.get(name, Fraction(0)) for name in free] for row in null]
-    found = _reduce_to_echelon(kept, len(free))
-    found.flags.writeable = False
-    return found
+        weights.require_equal({}, weights.weigh_expression(output))
+    _add_initial_conditions(weights, states, initial, {p.name for p in parameters})
+    null = _solve_null_space(weights.equations, [*states, *free])
+    free_rows = [[row.get(name, Fraction(0)) for name in free] for row in null]
+    exponents = _reduce_to_echelon(free_rows, len(free))
+    exponents.flags.writeable = False
+    return exponents
 
 
 def _add_initial_conditions(
-    walk: "_WeightEquations",
+    weights: "_WeightEquations",
     states: Sequence[str],
     initial: Sequence[InitialState],
-    known: set[str],
+    names: set[str],
 ) -> None:
-    """A state that starts at a known value other than 0 cannot be scaled."""
+    """Add the initial conditions: a state that starts at a fixed value ≠ 0 has weight 0."""
     for state, start in zip(states, initial, strict=True):
-        own = {state: Fraction(1)}
+        weight = {state: Fraction(1)}
         match start:
             case FixedInitial(value) if value != 0.0:
-                walk.require_equal({}, own)
+                weights.require_equal({}, weight)
             case MeasuredInitial():
-                walk.require_equal({}, own)
+                weights.require_equal({}, weight)
             case EstimatedInitial():
                 experiment = 0
-                while (name := name_initial_state(state, experiment)) in known:
-                    walk.require_equal(own, walk.weigh_expression(Symbol(name, "parameter")))
+                while (name := name_initial_state(state, experiment)) in names:
+                    weights.require_equal(
+                        weight, weights.weigh_expression(Symbol(name, "parameter"))
+                    )
                     experiment += 1
 
 
 class _WeightEquations:
-    """Weights of expressions, and the equations between weights that were met on the way.
+    """Weights of expressions, and the equations between weights that they imply.
 
-    The weight of what is 0 is None: it has every weight.
+    The weight of an expression that is 0 is None, because every weight fits.
     """
 
     def __init__(self, known: Mapping[str, float], zero: set[str]) -> None:
@@ -128,7 +129,7 @@ class _WeightEquations:
     def require_equal(
         self, a: ScalingWeight | None, b: ScalingWeight | None
     ) -> ScalingWeight | None:
-        """Note that two weights are equal; gives the one that says something."""
+        """Require that two weights are equal; return the one that is not None."""
         if a is None or b is None:
             return b if a is None else a
         difference = _add_weights(a, b, -1)
@@ -137,15 +138,15 @@ class _WeightEquations:
         return a
 
     def weigh_expression(self, tree: Expression) -> ScalingWeight | None:
-        """Weight of an expression."""
+        """Compute the weight of an expression."""
         match tree:
             case Number(value):
                 return None if value == 0.0 else {}
             case Symbol(name, "parameter"):
                 return self._weigh_parameter(name)
-            case PastValue(name, kind, _, lag):
-                if lag is not None:
-                    self.require_equal({}, self.weigh_expression(lag))
+            case PastValue(name, kind, _, delay):
+                if delay is not None:
+                    self.require_equal({}, self.weigh_expression(delay))
                 return {} if kind == "input" else {name: Fraction(1)}
             case Unary(_, operand):
                 return self.weigh_expression(operand)
@@ -174,13 +175,13 @@ class _WeightEquations:
                 return self._weigh_power(a, tree.right, b)
             case "and" | "or":
                 return {}
-        self.require_equal(a, b)  # a comparison holds as before if both sides are scaled alike
+        self.require_equal(a, b)  # a comparison stays the same if both sides are scaled alike
         return {}
 
     def _weigh_power(
         self, base: ScalingWeight | None, exponent: Expression, weight: ScalingWeight | None
     ) -> ScalingWeight | None:
-        """Of a power; one whose exponent is not known pins the base and the exponent."""
+        """Compute the weight of a power; an unknown exponent gives it and the base weight 0."""
         power = _evaluate_fraction(exponent, self._known)
         if power is None:
             self.require_equal({}, weight)
@@ -190,7 +191,7 @@ class _WeightEquations:
         return {name: power * share for name, share in base.items() if power}
 
     def _weigh_call(self, tree: FunctionCall) -> ScalingWeight | None:
-        weights = [self.weigh_expression(one) for one in tree.arguments]
+        weights = [self.weigh_expression(argument) for argument in tree.arguments]
         match tree.function:
             case "abs":
                 return weights[0]
@@ -208,7 +209,7 @@ class _WeightEquations:
 
 
 def _evaluate_fraction(tree: Expression, known: Mapping[str, float]) -> Fraction | None:
-    """What an expression of numbers and fixed parameters is worth; None if it is no number."""
+    """Evaluate an expression of numbers and fixed parameters; None if it is no number."""
     match tree:
         case Number(value):
             return _to_fraction(value)
@@ -227,7 +228,7 @@ def _evaluate_fraction(tree: Expression, known: Mapping[str, float]) -> Fraction
 
 
 def _to_fraction(value: float) -> Fraction:
-    """A number as it was meant: 0.1 and 0.3333333333333333 as 1/10 and 1/3, others as they are."""
+    """Convert a number to the intended fraction: 0.1 to 1/10, 0.3333333333333333 to 1/3."""
     near = Fraction(value).limit_denominator(_LARGEST_DENOMINATOR)
     return near if abs(float(near) - value) <= _FRACTION_TOLERANCE * abs(value) else Fraction(value)
 
@@ -246,33 +247,33 @@ def _scale_weight(a: ScalingWeight, factor: Fraction) -> ScalingWeight:
 def _solve_null_space(
     equations: Sequence[ScalingWeight], names: Sequence[str]
 ) -> list[ScalingWeight]:
-    """A basis of the powers that satisfy every equation."""
+    """Solve the equations: a basis of the powers that satisfy all of them."""
     solved: dict[str, ScalingWeight] = {}  # a power in terms of powers that are not in `solved`
     for equation in equations:
-        left: ScalingWeight = {}
+        reduced: ScalingWeight = {}
         for name, share in equation.items():
-            left = _add_weights(
-                left, _scale_weight(solved.get(name, {name: Fraction(1)}), share), 1
+            reduced = _add_weights(
+                reduced, _scale_weight(solved.get(name, {name: Fraction(1)}), share), 1
             )
-        if not left:
+        if not reduced:
             continue
-        chosen = next(name for name in names if name in left)
-        rest = {name: -share / left[chosen] for name, share in left.items() if name != chosen}
+        chosen = next(name for name in names if name in reduced)
+        rest = {name: -share / reduced[chosen] for name, share in reduced.items() if name != chosen}
         for name, form in solved.items():
             if chosen in form:
-                kept = {other: share for other, share in form.items() if other != chosen}
-                solved[name] = _add_weights(kept, _scale_weight(rest, form[chosen]), 1)
+                others = {other: share for other, share in form.items() if other != chosen}
+                solved[name] = _add_weights(others, _scale_weight(rest, form[chosen]), 1)
         solved[chosen] = rest
     basis: list[ScalingWeight] = []
     for name in (name for name in names if name not in solved):
-        own = {other: form[name] for other, form in solved.items() if name in form}
-        basis.append({name: Fraction(1), **own})
+        dependent = {other: form[name] for other, form in solved.items() if name in form}
+        basis.append({name: Fraction(1), **dependent})
     return basis
 
 
 def _reduce_to_echelon(rows: list[list[Fraction]], columns: int) -> FloatArray:
-    """Reduced echelon form without rows of zeros, as numbers."""
-    done: list[list[Fraction]] = []
+    """Reduce rows to echelon form without rows of zeros, as floats."""
+    reduced: list[list[Fraction]] = []
     for column in range(columns):
         pivot = next((row for row in rows if row[column]), None)
         if pivot is None:
@@ -280,8 +281,8 @@ def _reduce_to_echelon(rows: list[list[Fraction]], columns: int) -> FloatArray:
         rows = [row for row in rows if row is not pivot]
         pivot = [value / pivot[column] for value in pivot]
         rows = [_eliminate_column(row, pivot, column) for row in rows]
-        done = [_eliminate_column(row, pivot, column) for row in done] + [pivot]
-    return np.array(done, dtype=np.float64).reshape(len(done), columns)
+        reduced = [_eliminate_column(row, pivot, column) for row in reduced] + [pivot]
+    return np.array(reduced, dtype=np.float64).reshape(len(reduced), columns)
 
 
 def _eliminate_column(row: list[Fraction], pivot: list[Fraction], column: int) -> list[Fraction]:

@@ -1,10 +1,9 @@
-"""Sections of a model that are alike: what has to change places for one to become the other.
+"""Equivalent subsystems of a model: the parameters to exchange so that one becomes the other.
 
-Two first orders side by side can be exchanged only together with their gains and their initial
-states. Which parameter goes with which, the equations say: that of one state becomes that of the
-other, where names are replaced in pairs. Whether the output is the same then is not asked here
-(`sysid.identifiability.exchange` simulates it), so candidates may be wrong, and sums are not
-sorted.
+Two parallel first-order subsystems can be exchanged only with their gains and initial states. The
+equations show which parameters belong together: replacing names in pairs turns the equation of one
+state into that of the other. Whether the output stays the same is not tested here, but by
+simulation in `sysid.identifiability.exchange`. So candidates may be wrong, and sums are not sorted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,41 +21,44 @@ from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
 
 ExchangeUnit = tuple[int, ...]
-"""Places in the problem's space that move together."""
+"""Indices of free parameters that move together."""
 
 _COMMUTATIVE = ("binary", "+"), ("binary", "*")
 
-_Renaming = Mapping[str, str]  # each name and what it is replaced by, both ways
+_Renaming = Mapping[str, str]  # each name and its replacement, both ways
 
 _MOST_NODES = 4000
-"""Nodes that are looked at for two states. Sections are told by some hundreds; where nothing fits,
-the ways to read sums of names either way double with each of them."""
+"""Limit on the nodes examined for two states.
+
+Subsystems need some hundreds. If nothing fits, each sum of names doubles the number of orders."""
 
 
 def find_equivalent_subsystems(problem: Problem) -> Iterator[tuple[ExchangeUnit, ExchangeUnit]]:
-    """Pairs of units, the place in one beside that in the other; units of several places only."""
+    """Iterate over pairs of equivalent units with several parameters, in matching order."""
     if problem.model.form == "polynomial":
         return  # each state is a past value
     model = problem.model
-    for first, second in combinations([one.name for one in model.states], 2):
+    for first, second in combinations([state.name for state in model.states], 2):
         names = _match_states(model, first, second)
-        found = None if names is None else _locate_exchange(problem, names)
-        if found is not None and len(found[0]) > 1:
-            yield found
+        units = None if names is None else _locate_exchange(problem, names)
+        if units is not None and len(units[0]) > 1:
+            yield units
 
 
 def _match_states(model: Model, first: str, second: str) -> _Renaming | None:
-    """What one state's equation, and those of the states that it reads, replace for the other."""
-    equations = dict(zip((one.name for one in model.states), model.equations, strict=True))
+    """Match the equations of two states, and of the states they read, by a renaming."""
+    equations = dict(zip((state.name for state in model.states), model.equations, strict=True))
     names: _Renaming = {first: second, second: first}
     waiting, seen = [(first, second)], {first, second}
-    left = iter(range(_MOST_NODES))
+    nodes_left = iter(range(_MOST_NODES))
     while waiting:
-        one, other = waiting.pop()
-        found = next(_match_expressions(equations[one], equations[other], names, left), None)
-        if found is None:
+        state, counterpart = waiting.pop()
+        renaming = next(
+            _match_expressions(equations[state], equations[counterpart], names, nodes_left), None
+        )
+        if renaming is None:
             return None
-        names = found
+        names = renaming
         new = [(a, b) for a, b in names.items() if a in equations and a != b and a not in seen]
         for a, b in new:
             if a not in seen:
@@ -66,32 +68,35 @@ def _match_states(model: Model, first: str, second: str) -> _Renaming | None:
 
 
 def _match_expressions(
-    one: Expression, other: Expression, names: _Renaming, left: Iterator[int]
+    tree: Expression, other_tree: Expression, names: _Renaming, nodes_left: Iterator[int]
 ) -> Iterator[_Renaming]:
-    """The ways to replace more names so that one tree becomes the other.
+    """Iterate over extensions of a renaming that turn one tree into the other.
 
-    `left` gives a number for each node that may still be looked at.
+    `nodes_left` yields once for each node that may still be examined.
     """
-    if next(left, None) is None:
+    if next(nodes_left, None) is None:
         return
-    (kind, name, parts), (also, by, others) = _split_expression(one), _split_expression(other)
-    if kind != also:
+    (kind, name, parts), (other_kind, other_name, other_parts) = (
+        _split_expression(tree),
+        _split_expression(other_tree),
+    )
+    if kind != other_kind:
         return
-    orders = [others, others[::-1]] if kind in _COMMUTATIVE else [others]
-    for known in _extend_renaming(name, by, names):
+    orders = [other_parts, other_parts[::-1]] if kind in _COMMUTATIVE else [other_parts]
+    for renaming in _extend_renaming(name, other_name, names):
         for order in orders:
-            yield from _match_operands(parts, order, known, left)
+            yield from _match_operands(parts, order, renaming, nodes_left)
 
 
 def _split_expression(tree: Expression) -> tuple[tuple[object, ...], str, tuple[Expression, ...]]:
-    """What cannot be replaced, the name that can (or none), and what it is made of."""
+    """Split an expression into its fixed part, its replaceable name (or none) and operands."""
     match tree:
         case Symbol(name, "parameter"):
             return ("parameter",), name, ()
-        case PastValue(name, "state", offset, lag):
-            return ("state", offset, lag is None), name, _list_delay_operands(lag)
-        case PastValue(name, _, offset, lag):
-            return ("input", name, offset, lag is None), "", _list_delay_operands(lag)
+        case PastValue(name, "state", offset, delay):
+            return ("state", offset, delay is None), name, _list_delay_operands(delay)
+        case PastValue(name, _, offset, delay):
+            return ("input", name, offset, delay is None), "", _list_delay_operands(delay)
         case Unary(operator, operand):
             return ("unary", operator), "", (operand,)
         case Binary(operator, left, right):
@@ -102,70 +107,70 @@ def _split_expression(tree: Expression) -> tuple[tuple[object, ...], str, tuple[
             return ("given", tree), "", ()
 
 
-def _list_delay_operands(lag: Expression | None) -> tuple[Expression, ...]:
-    return () if lag is None else (lag,)
+def _list_delay_operands(delay: Expression | None) -> tuple[Expression, ...]:
+    return () if delay is None else (delay,)
 
 
 def _match_operands(
-    ones: tuple[Expression, ...],
-    others: tuple[Expression, ...],
+    operands: tuple[Expression, ...],
+    other_operands: tuple[Expression, ...],
     names: _Renaming,
-    left: Iterator[int],
+    nodes_left: Iterator[int],
 ) -> Iterator[_Renaming]:
-    if not ones:
+    if not operands:
         yield names
         return
-    for found in _match_expressions(ones[0], others[0], names, left):
-        yield from _match_operands(ones[1:], others[1:], found, left)
+    for renaming in _match_expressions(operands[0], other_operands[0], names, nodes_left):
+        yield from _match_operands(operands[1:], other_operands[1:], renaming, nodes_left)
 
 
-def _extend_renaming(one: str, other: str, names: _Renaming) -> list[_Renaming]:
-    if not one:
+def _extend_renaming(name: str, replacement: str, names: _Renaming) -> list[_Renaming]:
+    if not name:
         return [names]
-    if one in names or other in names:
-        return [names] * (names.get(one) == other)
-    return [{**names, one: other, other: one}]
+    if name in names or replacement in names:
+        return [names] * (names.get(name) == replacement)
+    return [{**names, name: replacement, replacement: name}]
 
 
 def _locate_exchange(
     problem: Problem, names: _Renaming
 ) -> tuple[ExchangeUnit, ExchangeUnit] | None:
-    """The places that are exchanged; None where one is given, or begins, unlike the other."""
-    states = [one.name for one in problem.model.states]
+    """Locate the exchanged free parameters; None if fixed values or initial states differ."""
+    states = [item.name for item in problem.model.states]
     initial = dict(zip(states, problem.model.initial, strict=True))
-    told: list[tuple[str, str]] = []
+    pairs_by_name: list[tuple[str, str]] = []
     for a, b in _iterate_pairs(names):
         if a not in initial:
-            told.append((a, b))
+            pairs_by_name.append((a, b))
         elif not _have_same_start(initial[a], initial[b]):
             return None
         elif isinstance(initial[a], EstimatedInitial):
             every = range(len(problem.records))
-            told += [(name_initial_state(a, e), name_initial_state(b, e)) for e in every]
-    known = {one.name: one for one in problem.all_parameters}
-    if not all(_are_interchangeable(known[a], known[b]) for a, b in told):
+            pairs_by_name += [(name_initial_state(a, e), name_initial_state(b, e)) for e in every]
+    parameters = {item.name: item for item in problem.all_parameters}
+    if not all(_are_interchangeable(parameters[a], parameters[b]) for a, b in pairs_by_name):
         return None
-    free = {one.name: d for d, one in enumerate(problem.free_parameters)}
-    pairs = sorted((free[a], free[b]) for a, b in told if a in free)
+    free = {item.name: d for d, item in enumerate(problem.free_parameters)}
+    pairs = sorted((free[a], free[b]) for a, b in pairs_by_name if a in free)
     return tuple(a for a, _ in pairs), tuple(b for _, b in pairs)
 
 
-def _have_same_start(one: InitialState, other: InitialState) -> bool:
-    if isinstance(one, EstimatedInitial):
-        return isinstance(other, EstimatedInitial)
-    return isinstance(one, FixedInitial) and one == other
+def _have_same_start(first: InitialState, second: InitialState) -> bool:
+    if isinstance(first, EstimatedInitial):
+        return isinstance(second, EstimatedInitial)
+    return isinstance(first, FixedInitial) and first == second
 
 
-def _are_interchangeable(one: Parameter, other: Parameter) -> bool:
-    if one.unit != other.unit or one.is_free != other.is_free:
+def _are_interchangeable(first: Parameter, second: Parameter) -> bool:
+    if first.unit != second.unit or first.is_free != second.is_free:
         return False
-    return one.is_free or (one.fixed is not None and one.fixed == other.fixed)
+    return first.is_free or (first.fixed is not None and first.fixed == second.fixed)
 
 
 def _iterate_pairs(names: _Renaming) -> Iterator[tuple[str, str]]:
-    """Each pair of names that differ, once, in the order in which they were found."""
-    told: set[str] = set()
+    """Iterate over the pairs of different names, each once, in order."""
+    seen: set[str] = set()
     for a, b in names.items():
-        if a != b and a not in told:
-            told |= {a, b}
+        if a != b and a not in seen:
+            seen |= {a, b}
             yield a, b

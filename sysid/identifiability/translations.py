@@ -1,10 +1,11 @@
-"""Sums of parameters that can move along a line without any change of the output.
+"""Translations: lines along which parameters can move without any change of the output.
 
-An offset beside a friction that differs with the direction is such a case: with o + Fp and o - Fn
-as they are, every simulation is the same. Small differences do not always show it: where a carriage
-sticks and breaks away the output answers to the last digit, and the singular value is far from
-nil. So the least certain directions are rounded to simple ratios, and the model is simulated a good
-way off along them. Only what changes nothing there counts.
+An example is an offset together with direction-dependent friction. All parameters with the same
+o + Fp and o - Fn give the same simulation. Small differences do not always show it. If a carriage
+sticks and breaks away, the output reacts to the last digit, and the singular value is not near 0.
+
+So the least certain directions are rounded to simple ratios. The model is then simulated at some
+distance along them. A direction counts only if the output stays the same there.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from sysid.core.types import FloatArray
 from sysid.simulation.problem import Problem
 
 _LEAST_SHARE = 0.02  # of a direction (squared) from which a parameter may belong to it
-_UNCERTAIN_RATIO = 0.1  # of the largest singular value: directions above are known well enough
+_UNCERTAIN_RATIO = 0.1  # of the largest singular value: directions above are certain enough
 _RATIO_DENOMINATOR = 2  # ratios are rounded to halves
 _MOVE_SHARE = 0.02  # of the range, for the parameter that moves most
 _SAME_TOLERANCE = 1e-10  # of the output's size: rounding
@@ -26,26 +27,26 @@ def find_translations(
     scale: FloatArray,
     most: int | None = None,
 ) -> tuple[FloatArray, int]:
-    """Directions along which the output stays, and the simulations this took.
+    """Find directions along which the output is constant, and count the simulations.
 
     Parameters
     ----------
     theta : FloatArray, shape (D,)
         The estimate.
     columns : FloatArray, shape (n, D)
-        Sensitivities over the places in [0, 1].
+        Sensitivities to the places in [0, 1].
     scale : FloatArray, shape (D,)
-        ∂θ/∂p of the places p.
+        ∂θ/∂p for the places p.
     most : int or None
-        Simulations that may be run; directions beyond are not looked at.
+        Limit on the simulations; directions beyond are not tested.
 
     Returns
     -------
     FloatArray, shape (k, D)
-        In the parameters' units; k = 0 where there is none.
+        In the parameters' units; k = 0: there is none.
     """
     singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
-    found = []
+    directions = []
     evaluations = 0
     for row in rows[singular < _UNCERTAIN_RATIO * singular[0]]:
         direction = _round_direction(row, scale)
@@ -55,12 +56,12 @@ def find_translations(
             continue
         evaluations += 2
         if _is_invariant(problem, theta, direction, scale):
-            found.append(direction)
-    return np.array(found).reshape(len(found), theta.size), evaluations
+            directions.append(direction)
+    return np.array(directions).reshape(len(directions), theta.size), evaluations
 
 
 def _round_direction(row: FloatArray, scale: FloatArray) -> FloatArray:
-    """The direction in the parameters' units, its largest entry 1 and the others simple ratios."""
+    """Round a direction in the parameters' units: largest entry 1, the others simple ratios."""
     physical = np.where(row**2 > _LEAST_SHARE, row * scale, 0.0)
     largest = np.argmax(np.abs(physical))
     return np.asarray(
@@ -69,7 +70,7 @@ def _round_direction(row: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def _has_common_unit(problem: Problem, direction: FloatArray) -> bool:
-    """Whether it moves several parameters, and all are of one unit."""
+    """Return whether a direction moves several parameters of the same unit."""
     moved = np.flatnonzero(direction)
     return moved.size > 1 and len({problem.free_parameters[i].unit for i in moved}) == 1
 
@@ -77,7 +78,7 @@ def _has_common_unit(problem: Problem, direction: FloatArray) -> bool:
 def _is_invariant(
     problem: Problem, theta: FloatArray, direction: FloatArray, scale: FloatArray
 ) -> bool:
-    """Whether the output is the same a good way off, on the side that lies inside the bounds."""
+    """Return whether the output stays the same at a distance, on the side inside the bounds."""
     step = _MOVE_SHARE / np.max(np.abs(direction / scale)) * direction
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     room = [
@@ -88,6 +89,8 @@ def _is_invariant(
     moved = theta + min(1.0, room[side]) * (step if side == 0 else -step)
     if min(1.0, room[side]) < 0.1:
         return False
-    here, there = problem.predict(np.vstack([theta, moved]))
+    original, translated = problem.predict(np.vstack([theta, moved]))
     with np.errstate(invalid="ignore"):
-        return bool(np.max(np.abs(there - here)) <= _SAME_TOLERANCE * np.max(np.abs(here)))
+        return bool(
+            np.max(np.abs(translated - original)) <= _SAME_TOLERANCE * np.max(np.abs(original))
+        )
