@@ -1,1 +1,1 @@
-"""Tests and colour of residuals: Ljung–Box, AR(1), HAC covariance, onset delay, feedback."""
+"""Residual tests and colour: Ljung–Box, AR(1), HAC covariance, onset delay, feedback."""

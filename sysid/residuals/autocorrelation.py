@@ -1,4 +1,4 @@
-"""Residuals laid out evenly, and their sums with lagged inputs, with the covariance of those."""
+"""Evenly spaced residuals, their autocorrelation, and their sums with lagged inputs."""
 
 from functools import lru_cache
 from math import ceil
@@ -12,17 +12,17 @@ from sysid.data.records import Channel, Hold, measure_sampling
 
 MAX_LAG = 25
 FEWEST_SAMPLES = 20
-"""Samples: below, no test says anything."""
+"""Least number of samples for a test."""
 
 ROUNDING_SHARE = 1e-9
-"""Part of a signal below which what is left of it is rounding."""
+"""Share of a signal below which a remainder is rounding."""
 
-_GRID_TOLERANCE = 0.05  # of a period: so far from its place a sample may lie
-_LEAST_FILLED = 0.5  # of the places of a grid are filled at least, else it is none
+_GRID_TOLERANCE = 0.05  # of a period: largest distance of a sample from its grid point
+_LEAST_FILLED = 0.5  # of the points of a grid must be filled
 
 
 class SpacedResiduals(NamedTuple):
-    """Residuals one beside the other, zero where one is missing, with their times."""
+    """Evenly spaced residuals with their times; zero where a sample is missing."""
 
     times: FloatArray
     values: FloatArray
@@ -32,12 +32,12 @@ class SpacedResiduals(NamedTuple):
 
     @property
     def n_lags(self) -> int:
-        """How many lags are looked at: 25, fewer of a short record."""
+        """Number of lags to test: 25, fewer for a short record."""
         return min(MAX_LAG, int(np.count_nonzero(self.present)) // 4)
 
 
 class _TimeGrid(NamedTuple):
-    """Places a period apart: their times (N,), and which of them (n,) the samples have."""
+    """Grid points one period apart: times (N,), and the point of each of n samples."""
 
     times: FloatArray
     places: IntArray
@@ -45,12 +45,12 @@ class _TimeGrid(NamedTuple):
 
 
 def space_residuals(times: FloatArray, values: FloatArray) -> SpacedResiduals:
-    """Residuals (N,) in places a period apart, those between missing; irregular ones in order."""
+    """Space residuals (N,) one period apart with gaps; irregular ones stay in order."""
     grid = _find_time_grid(np.asarray(times, dtype=np.float64).tobytes())
     if grid is not None:
-        filled, present = np.zeros(grid.times.size), np.zeros(grid.times.size, dtype=np.bool_)
-        filled[grid.places], present[grid.places] = values, True
-        return SpacedResiduals(grid.times, filled, present, grid.period, is_regular=True)
+        spaced, present = np.zeros(grid.times.size), np.zeros(grid.times.size, dtype=np.bool_)
+        spaced[grid.places], present[grid.places] = values, True
+        return SpacedResiduals(grid.times, spaced, present, grid.period, is_regular=True)
     distinct = max(np.unique(times).size - 1, 1)
     spacing = float(times[-1] - times[0]) / distinct
     return SpacedResiduals(
@@ -59,55 +59,57 @@ def space_residuals(times: FloatArray, values: FloatArray) -> SpacedResiduals:
 
 
 @lru_cache(maxsize=2)
-def _find_time_grid(written: bytes) -> _TimeGrid | None:
-    """The grid of some times (n,), given as their bytes; None if they lie on none.
+def _find_time_grid(time_bytes: bytes) -> _TimeGrid | None:
+    """Find the grid of times (n,), passed as bytes; None if they are on no grid.
 
-    Kept for the runs of a sweep, whose residuals alone differ.
+    The cache serves the runs of a sweep, which differ in their residuals only.
     """
-    times = np.frombuffer(written)
+    times = np.frombuffer(time_bytes)
     steps = np.diff(times)
     period = float(np.median(steps)) if steps.size else 0.0
     if not period > 0:
         return None
     rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
-    period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
+    period = float((times[-1] - times[0]) / rounded[-1])  # without the rounding error of one step
     exact = np.concatenate([[0.0], steps / period])
     places = np.concatenate([[0.0], rounded])
-    far = np.abs(exact - np.rint(exact))
-    is_regular = bool(np.all(far <= _GRID_TOLERANCE) and np.all(np.rint(exact[1:]) >= 1))
+    distance = np.abs(exact - np.rint(exact))
+    is_regular = bool(np.all(distance <= _GRID_TOLERANCE) and np.all(np.rint(exact[1:]) >= 1))
     n = int(places[-1]) + 1
     if not (is_regular and times.size >= _LEAST_FILLED * n):
         return None
-    taken = places.astype(np.intp)
-    laid = times[0] + period * np.arange(n)
-    laid[taken] = times
-    for array in (laid, taken):
+    indices = places.astype(np.intp)
+    grid_times = times[0] + period * np.arange(n)
+    grid_times[indices] = times
+    for array in (grid_times, indices):
         array.flags.writeable = False
-    return _TimeGrid(laid, taken, period)
+    return _TimeGrid(grid_times, indices, period)
 
 
 class Whiteness(NamedTuple):
-    """Autocorrelation at the lags from 1, its standard deviation if white, Ljung and Box's Q."""
+    """Autocorrelation from lag 1, its standard deviation for white residuals, Ljung–Box Q."""
 
     values: FloatArray
     deviation: FloatArray
     statistic: float
 
 
-def compute_whiteness(laid: SpacedResiduals) -> Whiteness:
-    """How alike neighbouring residuals are, over `SpacedResiduals.n_lags` lags; missing ones leave pairs out."""
-    n = np.count_nonzero(laid.present)
-    values = _sum_lagged_products(laid.values, laid.n_lags) / float(laid.values @ laid.values)
-    if n == laid.present.size:
-        pairs = n - np.arange(1.0, laid.n_lags + 1)
+def compute_whiteness(spaced: SpacedResiduals) -> Whiteness:
+    """Compute the autocorrelation over `SpacedResiduals.n_lags` lags, without missing samples."""
+    n = np.count_nonzero(spaced.present)
+    values = _sum_lagged_products(spaced.values, spaced.n_lags) / float(
+        spaced.values @ spaced.values
+    )
+    if n == spaced.present.size:
+        pairs = n - np.arange(1.0, spaced.n_lags + 1)
     else:
-        pairs = _sum_lagged_products(laid.present.astype(np.float64), laid.n_lags)
+        pairs = _sum_lagged_products(spaced.present.astype(np.float64), spaced.n_lags)
     deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
     return Whiteness(values, deviation, float(np.sum(np.square(values / deviation))))
 
 
 def _sum_lagged_products(values: FloatArray, lags: int) -> FloatArray:
-    """Σ v(t) v(t + k) for k = 1 … lags."""
+    """Compute Σ v(t) v(t + k) for k = 1 … lags."""
     return np.correlate(np.concatenate([values[1:], np.zeros(lags)]), values, "valid")
 
 
@@ -122,26 +124,26 @@ class LaggedSums(NamedTuple):
 
 
 def compute_lagged_sums(
-    laid: SpacedResiduals,
+    spaced: SpacedResiduals,
     residual: FloatArray,
     colour: FloatArray,
     channel: Channel,
     lags: FloatArray,
 ) -> LaggedSums | str:
-    """The sums over these lags, or why there are none."""
-    floats = (laid.times, channel.times, channel.values, lags)
+    """Compute the sums over some lags, or the reason why there are none."""
+    floats = (spaced.times, channel.times, channel.values, lags)
     shifted = _build_lagged_inputs(
-        laid.present.tobytes(),
-        laid.period,
+        spaced.present.tobytes(),
+        spaced.period,
         channel.hold,
-        *(np.asarray(one, dtype=np.float64).tobytes() for one in floats),
+        *(np.asarray(array, dtype=np.float64).tobytes() for array in floats),
     )
     if isinstance(shifted, str):
         return shifted
-    columns, sizes, known = shifted
-    seen = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
-    covariance = seen @ seen.T  # real part of the product with the conjugate
-    norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
+    columns, sizes, is_used = shifted
+    weighted = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
+    covariance = weighted @ weighted.T  # real part of the product with the conjugate
+    norm = sizes * np.sqrt(float(residual[is_used] @ residual[is_used]))
     tiny = np.finfo(float).tiny
     deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
     return LaggedSums(lags, columns @ residual, np.maximum(norm, tiny), covariance, deviation)
@@ -153,57 +155,59 @@ def _build_lagged_inputs(
     period: float,
     hold: Hold,
     times: bytes,
-    moments: bytes,
+    input_times: bytes,
     values: bytes,
     lags: bytes,
 ) -> tuple[FloatArray, FloatArray, BoolArray] | str:
-    """The lagged input without its mean (n, N), the lengths (n,), and which samples are known.
+    """Build the lagged inputs without mean (n, N), their norms (n,), and the known samples (N,).
 
-    Or why there is none. Kept for the runs of a sweep, whose residuals alone differ. The bytes are
-    of arrays: `Laid.times` and `Laid.present`, times and values of the input, lags in periods.
+    Returns a reason if there are none. The cache serves the runs of a sweep, which differ in their
+    residuals only. The bytes are those of arrays: `SpacedResiduals.times` and
+    `SpacedResiduals.present`, times and values of the input, lags in periods.
     """
-    there = np.frombuffer(present, dtype=np.bool_)
-    laid = SpacedResiduals(np.frombuffer(times), np.zeros(0), there, period, is_regular=True)
-    channel = Channel("", np.frombuffer(moments), np.frombuffer(values), hold=hold)
-    shifted = _shift_input(laid, channel, np.frombuffer(lags) * period)
-    # Of every lag the same samples, so that no lag is judged by more than another.
-    known = there & np.isfinite(shifted.sum(axis=0))
-    if np.count_nonzero(known) < FEWEST_SAMPLES:
+    is_present = np.frombuffer(present, dtype=np.bool_)
+    spaced = SpacedResiduals(np.frombuffer(times), np.zeros(0), is_present, period, is_regular=True)
+    channel = Channel("", np.frombuffer(input_times), np.frombuffer(values), hold=hold)
+    shifted = _shift_input(spaced, channel, np.frombuffer(lags) * period)
+    # All lags use the same samples, so that none has more than another.
+    is_used = is_present & np.isfinite(shifted.sum(axis=0))
+    if np.count_nonzero(is_used) < FEWEST_SAMPLES:
         return "it overlaps the output too little"
-    columns = np.where(known, shifted, 0.0)
-    columns -= np.outer(columns.sum(axis=1) / np.count_nonzero(known), known)
+    columns = np.where(is_used, shifted, 0.0)
+    columns -= np.outer(columns.sum(axis=1) / np.count_nonzero(is_used), is_used)
     sizes = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     if not np.min(sizes) > ROUNDING_SHARE * np.max(np.abs(channel.values)):
         return "the input is constant there"
-    for array in (columns, sizes, known):
+    for array in (columns, sizes, is_used):
         array.flags.writeable = False
-    return columns, sizes, known
+    return columns, sizes, is_used
 
 
-def _shift_input(laid: SpacedResiduals, channel: Channel, lags: FloatArray) -> FloatArray:
-    """The input at the residuals' times less each lag (s), (n, N); nan where not recorded."""
-    # A jump and the sample it is seen at may be a rounding apart: nearer than this, they are one.
-    slack = 1e-6 * laid.period
-    wanted = laid.times - lags[:, None]
+def _shift_input(spaced: SpacedResiduals, channel: Channel, lags: FloatArray) -> FloatArray:
+    """Read the input at the residuals' times minus each lag (s), (n, N); nan: not recorded."""
+    # A jump and its sample can differ by rounding. Nearer than this, they coincide.
+    slack = 1e-6 * spaced.period
+    read_times = spaced.times - lags[:, None]
     first, last = channel.times[0] - slack, channel.times[-1] + slack
     if channel.hold == "zero":
-        place = np.searchsorted(channel.times, wanted + slack, side="right") - 1
-        values = channel.values[np.clip(place, 0, channel.times.size - 1)]
+        index = np.searchsorted(channel.times, read_times + slack, side="right") - 1
+        values = channel.values[np.clip(index, 0, channel.times.size - 1)]
         period = measure_sampling(channel.times).period
         last += period if np.isfinite(period) else 0.0  # the last value holds for a period
     else:
-        values = np.interp(wanted, channel.times, channel.values)
-    return np.asarray(np.where((wanted >= first) & (wanted <= last), values, np.nan))
+        values = np.interp(read_times, channel.times, channel.values)
+    return np.asarray(np.where((read_times >= first) & (read_times <= last), values, np.nan))
 
 
 def smooth_spectrum_root(
     residual: FloatArray, present: BoolArray, room: int | None = None
 ) -> FloatArray:
-    """Root of the smoothed spectrum of residuals (N,), one value for each frequency of a transform.
+    """Compute the root of the smoothed spectrum of residuals (N,) at the frequencies of an FFT.
 
-    The covariance of Σ e(i) a(i) and Σ e(i) b(i) over the noise e is the product of the transforms
-    of a and b, each times this. The transform is `room` samples longer than the record, or as many
-    as the window reaches: beyond, the record's beginning would be neighbour to its end.
+    Multiply the transforms of a and b by this root. Their product is then the covariance of
+    Σ e(i) a(i) and Σ e(i) b(i) for noise e. The transform is `room` samples longer than the record,
+    at least as many as the window reaches. Otherwise the end of the record would wrap around to
+    its beginning.
     """
     n = residual.size
     width = _choose_window_width(residual, present)
@@ -223,23 +227,25 @@ def smooth_spectrum_root(
 
 
 def _autocorrelate(values: FloatArray, length: int) -> FloatArray:
-    """Σ v(t) v(t + k) for k from 0 on; right as long as the transform has room for k."""
-    seen = rfft(values, length)
-    return irfft(np.square(seen.real) + np.square(seen.imag), length)
+    """Compute Σ v(t) v(t + k) from k = 0; correct while the transform has room for k."""
+    transform = rfft(values, length)
+    return irfft(np.square(transform.real) + np.square(transform.imag), length)
 
 
 def pad_length(least: int) -> int:
-    """The next even length that a fast transform likes: a power of two times 1, 3, 5, 9 or 15."""
-    return min(one << max(1, (-(-least // one) - 1).bit_length()) for one in (1, 3, 5, 9, 15))
+    """Return the next even length for a fast transform: a power of 2 times 1, 3, 5, 9 or 15."""
+    return min(
+        factor << max(1, (-(-least // factor) - 1).bit_length()) for factor in (1, 3, 5, 9, 15)
+    )
 
 
 def _choose_window_width(residual: FloatArray, present: BoolArray) -> float:
-    """Width of a Parzen window, by the rule of Andrews (1991) for first-order colour."""
+    """Choose the width of a Parzen window by the AR(1) rule of Andrews (1991)."""
     n = residual.size
     pairs = max(int(np.count_nonzero(present[1:] & present[:-1])), 1)
-    alike = float(residual[1:] @ residual[:-1]) * (n - 1) / pairs
+    product = float(residual[1:] @ residual[:-1]) * (n - 1) / pairs
     power = max(float(residual @ residual), np.finfo(float).tiny) * n / np.count_nonzero(present)
-    rho = min(max(alike / power, -0.99), 0.99)
+    rho = min(max(product / power, -0.99), 0.99)
     curvature = 4.0 * rho**2 / (1.0 - rho) ** 4
     return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
 

@@ -1,23 +1,25 @@
-"""Covariance of estimates where residuals are not those of one white noise.
+"""Sandwich (HAC) covariance of estimates with coloured residuals or unequal noise variances.
 
-s²(SᵀS)⁻¹ takes the residuals for white. Those of measured records seldom are, and then it is too
-small by as much as they are alike over the time in which the sensitivities change. Where they are
-clearly not white, the middle of the sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ becomes Ω = SᵀRS with the
-autocovariance R of each series of residuals (output errors: Ljung 1999, sec. 9.3), from a Parzen
-window as wide as their colour asks for, or in short records from a model of it
-(`sysid.residuals.restricted_likelihood`), after they are prewhitened by a recursion (Andrews and
-Monahan 1992). It is of first order, or of as many as Akaike's criterion takes (Burg's method; den
-Haan and Levin 1997): slow noise beside white has a correlation of neighbours that says too little.
-For free runs only: one step ahead the sensitivities are made of measured outputs and of the noise.
+s²(SᵀS)⁻¹ assumes white residuals. Residuals of measured records are seldom white, and then it is
+too small. If they are clearly coloured, the sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ replaces it. Its middle is
+Ω = SᵀRS with the autocovariance R of each residual series (output errors: Ljung 1999, sec. 9.3).
 
-Coloured samples say less than as many white ones: of first-order noise with pole a > 0 those of a
-mean count for n(1 - a)/(1 + a) (Bayley and Hammersley 1946). So many are taken for the degrees of
-freedom. Where a is too near 1 the record is short beside its drift, and the errors are a lower
-bound. Different outputs are taken for independent here; see `sysid.residuals.correlated_outputs`.
+R comes from a Parzen window whose width follows the colour, after prewhitening by an autoregression
+(Andrews and Monahan 1992). Short records use a noise model instead
+(`sysid.residuals.restricted_likelihood`). The autoregression is of first order, or of the order of
+Akaike's criterion (Burg's method; den Haan and Levin 1997). A higher order is needed because for
+slow noise plus white noise, the correlation of neighbours says too little. All this applies to free
+runs only. One step ahead the sensitivities depend on measured outputs, and so on the noise.
 
-Nor is s² that of every output of every experiment. Where they are clearly noisy by unequal amounts
-in the weighted residuals (Bartlett 1937), Ω has of each its own variance, and an interval has the
-degrees of freedom of those series that tell it.
+Coloured samples carry less information than white ones. With first-order noise of pole a > 0, n
+samples of a mean count as n(1 - a)/(1 + a) (Bayley and Hammersley 1946). This number sets the
+degrees of freedom. If a is too near 1, the record is short compared with its drift, and the errors
+are a lower bound. Different outputs are assumed independent here; see
+`sysid.residuals.correlated_outputs`.
+
+The noise variance can also differ between outputs and experiments. If it clearly does in the
+weighted residuals (Bartlett 1937), Ω has one variance for each series. An interval then has the
+degrees of freedom of the series that determine it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,32 +45,31 @@ from sysid.residuals.restricted_likelihood import LARGEST_POLE, NoiseColourModel
 from sysid.simulation.problem import Problem
 
 _SIGNIFICANCE = 1e-3
-"""That white residuals look as little white: below, they are taken for coloured.
+"""Level of the tests for coloured residuals and for unequal variances.
 
-And that those of one variance look as uneven. It is that of χ²: of 25 lags of a short record the
-statistic varies more, and white ones are taken for coloured in 1 % of those of 50 to 100 samples
-(decision 19)."""
+It is that of χ². With 25 lags of a short record the statistic varies more. So white residuals of 50
+to 100 samples are taken for coloured in 1 % of the cases (decision 19)."""
 
 CHI_SQUARE_95 = 3.841458820694124
-"""95 % of χ² with one degree of freedom."""
+"""95 % quantile of χ² with one degree of freedom."""
 
 _SHORT_RECORD = 400
-"""Samples: fewer tell their colour by a model of it, where one holds, and more by its window."""
+"""Samples: shorter records use a noise model if it fits, longer ones the window."""
 
-_LONGEST_RECURSION = 25  # of the recursion: past values
+_LONGEST_RECURSION = 25  # past values of the autoregression
 
-_LEAST_WIDENING = 1e-3  # of the variance under white residuals: below is rounding
+_LEAST_WIDENING = 1e-3  # of the variance with white residuals: less is rounding
 
 _EVEN_TOLERANCE = 1e-3  # of a period: steps that differ by less are equal
 
 
 class ColouredCovariance(NamedTuple):
-    """Ω (D, D) of the sandwich, and how many white samples would say as much.
+    """Ω (D, D) of the sandwich, and the equivalent number of white samples.
 
-    `drifts` where that number is not known: the residuals wander over the whole record. `is_white`
-    where they are of unequal size only. `series` has of each series its part of Ω and the degrees
-    of freedom that it tells that by; empty: all are of one. `models` has for each what tells the
-    degrees of freedom of one whose colour is modelled, else None.
+    `is_drifting`: the number is unknown, because the residuals wander over the whole record.
+    `is_white`: the residuals are white, but of unequal variances. `series` has for each series its
+    part of Ω and its degrees of freedom; empty: there is one series. `models` has the noise model
+    of each series, or None.
     """
 
     middle: FloatArray
@@ -80,37 +81,39 @@ class ColouredCovariance(NamedTuple):
 
     @property
     def degrees(self) -> float:
-        """Degrees of freedom of the t distribution: those of white samples, one at least."""
+        """Degrees of freedom of the t distribution, at least one."""
         return max(self.equivalent_samples - len(self.middle), 1.0)
 
     def compute_degrees(self, direction: FloatArray) -> float:
-        """Those of the variance of one combination (D,) of Sᵀe (Satterthwaite 1946)."""
-        each = np.array([direction @ middle @ direction for middle, _ in self.series])
-        if not np.sum(each) > 0:
+        """Compute the degrees of freedom for one combination (D,) of Sᵀe (Satterthwaite 1946)."""
+        variances = np.array([direction @ middle @ direction for middle, _ in self.series])
+        if not np.sum(variances) > 0:
             return self.degrees
-        degrees = np.array([one for _, one in self.series])
-        for i, known in enumerate(self.models):
-            if known is not None:
-                degrees[i] = 2.0 / known.compute_variation(direction)
-        return max(float(np.sum(each) ** 2 / np.sum(each**2 / degrees)), 1.0)
+        degrees = np.array([degree for _, degree in self.series])
+        for i, model in enumerate(self.models):
+            if model is not None:
+                degrees[i] = 2.0 / model.compute_variation(direction)
+        return max(float(np.sum(variances) ** 2 / np.sum(variances**2 / degrees)), 1.0)
 
     def compute_widening(self, direction: FloatArray, power: float, norm: float) -> float:
-        """Square of how much wider than of white residuals an interval of one parameter is.
+        """Compute the squared factor by which an interval is wider than for white residuals.
 
         Parameters
         ----------
         direction : FloatArray, shape (D,)
-            Combination of the sensitivities that the other parameters cannot make up for.
+            Combination of the sensitivities that other parameters cannot compensate.
         power, norm : float
             Mean square of the residuals; sum of squares of that combination.
         """
-        told = max(float(direction @ self.middle @ direction) / (power * norm), _LEAST_WIDENING)
-        reach = float(stdtrit(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
-        return float(told * reach * self.equivalent_samples / self.degrees)
+        variance_ratio = max(
+            float(direction @ self.middle @ direction) / (power * norm), _LEAST_WIDENING
+        )
+        quantile_ratio = float(stdtrit(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
+        return float(variance_ratio * quantile_ratio * self.equivalent_samples / self.degrees)
 
 
 class ResidualPart(NamedTuple):
-    """One output of one experiment: its scored samples among all of them, with their times."""
+    """Scored samples of one output of one experiment: their rows among all, and times."""
 
     output: str
     rows: slice
@@ -119,100 +122,110 @@ class ResidualPart(NamedTuple):
 
 
 def estimate_coloured_covariance(
-    problem: Problem, seen: FloatArray, columns: FloatArray, *, by_model: bool = True
+    problem: Problem, influence: FloatArray, columns: FloatArray, *, by_model: bool = True
 ) -> ColouredCovariance | None:
-    """The middle of the sandwich; None where the residuals may as well be one white noise.
+    """Estimate the middle of the sandwich; None if the residuals are consistent with white noise.
 
     Parameters
     ----------
     seen : FloatArray, shape (n,)
-        Weighted residuals of the scored samples as the loss sees them.
+        Influence of the weighted residuals of the scored samples on the loss.
     columns : FloatArray, shape (n, D)
-        Their sensitivities.
+        Sensitivities of these samples.
     by_model : bool
-        Whether short series may tell their colour by a model of it.
+        Whether short series may use a noise model.
     """
-    found = [(part, _order_residuals(part, seen[part.rows])) for part in iterate_parts(problem)]
+    parts = [
+        (part, _order_residuals(part, influence[part.rows])) for part in iterate_parts(problem)
+    ]
     is_free = problem.prediction == "simulation" or not reads_outputs(problem.model)
-    told = [is_free and _are_spaced_coloured(laid, part.largest_value) for part, laid in found]
-    if not any(told) and not _have_unequal_variances([seen[part.rows] for part, _ in found]):
+    are_coloured = [
+        is_free and _are_spaced_coloured(spaced, part.largest_value) for part, spaced in parts
+    ]
+    if not any(are_coloured) and not _have_unequal_variances(
+        [influence[part.rows] for part, _ in parts]
+    ):
         return None
-    each = []
-    for (part, _), has_colour in zip(found, told, strict=True):
-        own, values = columns[part.rows], seen[part.rows]
+    series = []
+    for (part, _), has_colour in zip(parts, are_coloured, strict=True):
+        part_columns, values = columns[part.rows], influence[part.rows]
         if has_colour:
-            each.append(
-                _estimate_series_covariance(space_residuals(part.times, values), own, by_model)
+            series.append(
+                _estimate_series_covariance(
+                    space_residuals(part.times, values), part_columns, by_model
+                )
             )
         else:
             mean = float(np.mean(np.square(values)))
-            each.append(
-                ColouredCovariance(mean * (own.T @ own), float(values.size), is_drifting=False)
+            series.append(
+                ColouredCovariance(
+                    mean * (part_columns.T @ part_columns), float(values.size), is_drifting=False
+                )
             )
-    used = _count_used_degrees([columns[part.rows] for part, _ in found])
-    return _combine_series(each, used)._replace(is_white=not any(told))
+    used = _count_used_degrees([columns[part.rows] for part, _ in parts])
+    return _combine_series(series, used)._replace(is_white=not any(are_coloured))
 
 
 def _count_used_degrees(columns: Sequence[FloatArray]) -> FloatArray:
-    """How many of the degrees of freedom estimates of the parameters (D) take from each series."""
-    own = [one.T @ one for one in columns]
-    inverse = np.linalg.pinv(np.sum(own, axis=0), rcond=RANK_TOLERANCE**2, hermitian=True)
-    used = np.array([np.sum(inverse * one) for one in own])
+    """Compute the degrees of freedom that the D parameters take from each series."""
+    products = [block.T @ block for block in columns]
+    inverse = np.linalg.pinv(np.sum(products, axis=0), rcond=RANK_TOLERANCE**2, hermitian=True)
+    used = np.array([np.sum(inverse * block) for block in products])
     total = float(np.sum(used))  # 0 where nothing has an effect
     return np.asarray(used * (len(inverse) / total if total > 0 else 0.0))
 
 
-def _combine_series(each: Sequence[ColouredCovariance], used: FloatArray) -> ColouredCovariance:
-    """Ω of several series.
+def _combine_series(series: Sequence[ColouredCovariance], used: FloatArray) -> ColouredCovariance:
+    """Combine Ω of several series.
 
-    Residuals of a series are smaller than its noise by the degrees of freedom that were taken from
-    it; a model allows for that. What all have lost on average is not allowed for here.
+    The degrees of freedom taken from a series make its residuals smaller than its noise. A noise
+    model allows for that. The average loss over all series is not corrected here.
     """
-    size, samples = len(each[0].middle), np.array([one.equivalent_samples for one in each])
+    size, samples = len(series[0].middle), np.array([part.equivalent_samples for part in series])
     degrees = np.maximum(samples - used, 1.0)
     total = float(np.sum(samples))
-    models = tuple(model for one in each for model in one.models or (None,))
-    lost = np.where([one is None for one in models], samples / degrees, 1.0)
-    grown = lost * (max(total - size, 1.0) / total)
-    middles = [by * one.middle for one, by in zip(each, grown.tolist(), strict=True)]
+    models = tuple(model for part in series for model in part.models or (None,))
+    corrections = np.where([part is None for part in models], samples / degrees, 1.0)
+    factors = corrections * (max(total - size, 1.0) / total)
+    middles = [factor * part.middle for part, factor in zip(series, factors.tolist(), strict=True)]
     return ColouredCovariance(
         np.sum(middles, axis=0),
         total,
-        any(one.is_drifting for one in each),
+        any(part.is_drifting for part in series),
         series=tuple(zip(middles, degrees.tolist(), strict=True)),
         models=models,
     )
 
 
 def _have_unequal_variances(series: Sequence[FloatArray]) -> bool:
-    """Whether residuals are clearly of unequal variance, by the test of Bartlett."""
-    long = [one for one in series if one.size >= FEWEST_SAMPLES]
-    variances = np.array([np.mean(np.square(one)) for one in long])
-    if len(long) < 2 or not np.min(variances) > 0:
+    """Return whether residual series clearly have unequal variances (Bartlett's test)."""
+    long_series = [values for values in series if values.size >= FEWEST_SAMPLES]
+    variances = np.array([np.mean(np.square(values)) for values in long_series])
+    if len(long_series) < 2 or not np.min(variances) > 0:
         return False
-    counts = np.array([one.size for one in long])
+    counts = np.array([values.size for values in long_series])
     total = float(np.sum(counts))
     pooled = float(counts @ variances) / total
     statistic = total * np.log(pooled) - counts @ np.log(variances)
-    others = len(long) - 1
-    correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * others)
-    return float(chdtrc(others, statistic / correction)) < _SIGNIFICANCE
+    degrees = len(long_series) - 1
+    correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * degrees)
+    return float(chdtrc(degrees, statistic / correction)) < _SIGNIFICANCE
 
 
 def is_coloured(part: ResidualPart, values: FloatArray) -> bool:
-    """Whether the residuals (n,) of a part are clearly not white."""
+    """Return whether the residuals (n,) of a part are clearly not white."""
     return _are_spaced_coloured(_order_residuals(part, values), part.largest_value)
 
 
 def iterate_parts(problem: Problem) -> Iterator[ResidualPart]:
-    """The series of a problem's scored samples, in their order."""
+    """Iterate over the series of a problem's scored samples, in their order."""
     measured = problem.split_by_output(problem.evaluator.weight * problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
     first = 0
     for record, weight, sizes in zip(problem.records, weights, measured, strict=True):
         times = {channel.name: channel.times for channel in record.outputs}
-        for output, one in weight.items():
-            scored = one > 0
+        for output, output_weight in weight.items():
+            scored = output_weight > 0
             n = int(np.count_nonzero(scored))
             if n:
                 size = float(np.max(np.abs(sizes[output][scored])))
@@ -221,7 +234,7 @@ def iterate_parts(problem: Problem) -> Iterator[ResidualPart]:
 
 
 def _order_residuals(part: ResidualPart, values: FloatArray) -> SpacedResiduals:
-    """The residuals one after the other; laid out anew only where samples are missing."""
+    """Put residuals in order; space them on a grid only if samples are missing."""
     steps = np.diff(part.times)
     if steps.size and np.ptp(steps) > _EVEN_TOLERANCE * steps[0]:
         return space_residuals(part.times, values)
@@ -230,99 +243,116 @@ def _order_residuals(part: ResidualPart, values: FloatArray) -> SpacedResiduals:
     )
 
 
-def _are_spaced_coloured(laid: SpacedResiduals, size: float) -> bool:
-    n = np.count_nonzero(laid.present)
-    if n < FEWEST_SAMPLES or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING_SHARE * size:
+def _are_spaced_coloured(spaced: SpacedResiduals, size: float) -> bool:
+    n = np.count_nonzero(spaced.present)
+    if (
+        n < FEWEST_SAMPLES
+        or float(np.sqrt(spaced.values @ spaced.values / n)) <= ROUNDING_SHARE * size
+    ):
         return False
-    found = compute_whiteness(laid)
-    chance = float(chdtrc(laid.n_lags, found.statistic))
-    if n < _SHORT_RECORD and found.values[0] > 0:  # there many lags hide what the first one says
-        chance = min(chance, float(chdtrc(1, (found.values[0] / found.deviation[0]) ** 2)))
+    whiteness = compute_whiteness(spaced)
+    chance = float(chdtrc(spaced.n_lags, whiteness.statistic))
+    if (
+        n < _SHORT_RECORD and whiteness.values[0] > 0
+    ):  # in short records many lags hide the first one
+        chance = min(chance, float(chdtrc(1, (whiteness.values[0] / whiteness.deviation[0]) ** 2)))
     return chance < _SIGNIFICANCE
 
 
 def _estimate_series_covariance(
-    laid: SpacedResiduals, columns: FloatArray, by_model: bool
+    spaced: SpacedResiduals, columns: FloatArray, by_model: bool
 ) -> ColouredCovariance:
-    """Of one series SᵀRS."""
-    root, pole = estimate_spectrum_root(laid)
-    is_short = np.count_nonzero(laid.present) < _SHORT_RECORD
-    known = (
-        fit_noise_colour(laid, columns) if by_model and is_short and pole <= LARGEST_POLE else None
+    """Estimate SᵀRS of one series."""
+    root, pole = estimate_spectrum_root(spaced)
+    is_short = np.count_nonzero(spaced.present) < _SHORT_RECORD
+    colour = (
+        fit_noise_colour(spaced, columns)
+        if by_model and is_short and pole <= LARGEST_POLE
+        else None
     )
-    if known is not None:
-        samples = laid.present.sum() * known.sample_share
-        return ColouredCovariance(known.middle, float(samples), is_drifting=False, models=(known,))
-    moved = transform_sensitivities(laid, columns, root)
-    slow = min(max(pole, 0.0), LARGEST_POLE)
-    share = (1.0 - slow) / (1.0 + slow)
-    n = np.count_nonzero(laid.present)
-    # The same of any colour: the mean of its spectrum over what it is at frequency 0.
-    lowest = float(root[0] ** 2) * 2 * (root.size - 1)
-    if lowest > 0:
-        share = min(share, float(laid.values @ laid.values) / n / lowest)
+    if colour is not None:
+        samples = spaced.present.sum() * colour.sample_share
+        return ColouredCovariance(
+            colour.middle, float(samples), is_drifting=False, models=(colour,)
+        )
+    transformed = transform_sensitivities(spaced, columns, root)
+    positive_pole = min(max(pole, 0.0), LARGEST_POLE)
+    share = (1.0 - positive_pole) / (1.0 + positive_pole)
+    n = np.count_nonzero(spaced.present)
+    # For any colour the share is the mean of the spectrum over its value at frequency 0.
+    power_at_zero = float(root[0] ** 2) * 2 * (root.size - 1)
+    if power_at_zero > 0:
+        share = min(share, float(spaced.values @ spaced.values) / n / power_at_zero)
     return ColouredCovariance(
-        np.asarray((moved @ moved.conj().T).real), n * share, pole > LARGEST_POLE
+        np.asarray((transformed @ transformed.conj().T).real), n * share, pole > LARGEST_POLE
     )
 
 
-def estimate_spectrum_root(laid: SpacedResiduals) -> tuple[FloatArray, float]:
-    """Root (F,) of the spectrum of a series as `smooth_spectrum_root` has it, and the pole of first order.
+def estimate_spectrum_root(spaced: SpacedResiduals) -> tuple[FloatArray, float]:
+    """Estimate the root (F,) of the spectrum of a series, and its first-order pole.
 
-    Of what a recursion leaves, coloured again by it.
+    The spectrum is that of the prewhitened series (`smooth_spectrum_root`), recoloured by the
+    autoregression.
     """
-    both = laid.present[1:] & laid.present[:-1]
-    before, after = laid.values[:-1][both], laid.values[1:][both]
-    found = float(before @ after / (before @ before))
-    weights = np.array([min(max(found, -LARGEST_POLE), LARGEST_POLE)])
-    if laid.present.all() and found <= LARGEST_POLE:  # a longer one takes a drift for oscillations
-        longer = _fit_recursion(laid.values)
-        weights = weights if longer.size < 2 else longer
+    are_neighbours = spaced.present[1:] & spaced.present[:-1]
+    before, after = spaced.values[:-1][are_neighbours], spaced.values[1:][are_neighbours]
+    pole = float(before @ after / (before @ before))
+    weights = np.array([min(max(pole, -LARGEST_POLE), LARGEST_POLE)])
+    if (
+        spaced.present.all() and pole <= LARGEST_POLE
+    ):  # a higher order would take a drift for oscillations
+        higher_order = _fit_recursion(spaced.values)
+        weights = weights if higher_order.size < 2 else higher_order
     kernel = np.concatenate([[1.0], -weights])
-    filtered = np.convolve(laid.values, kernel)
-    left = np.where(both, filtered[1 : laid.values.size], 0.0)
-    root = smooth_spectrum_root(left, both, room=2 * left.size)  # the recursion rings on
+    filtered = np.convolve(spaced.values, kernel)
+    innovations = np.where(are_neighbours, filtered[1 : spaced.values.size], 0.0)
+    root = smooth_spectrum_root(
+        innovations, are_neighbours, room=2 * innovations.size
+    )  # the autoregression rings on
     root /= np.abs(rfft(kernel, 2 * (root.size - 1)))
-    return root, found
+    return root, pole
 
 
 def _fit_recursion(values: FloatArray) -> FloatArray:
-    """Weights (p,) of the past values in a recursion, by Burg; p by Akaike's criterion."""
-    ahead, behind, weights = values[1:], values[:-1], np.zeros(0)
+    """Fit an autoregression (p,) by Burg's method; the order p by Akaike's criterion."""
+    forward, backward, weights = values[1:], values[:-1], np.zeros(0)
     power, best = float(np.mean(np.square(values))), np.zeros(0)
     least = values.size * np.log(power)
     for order in range(1, min(_LONGEST_RECURSION, round(values.size ** (1 / 3))) + 1):
-        both = float(ahead @ ahead + behind @ behind)
-        if not both > 0:
+        power_sum = float(forward @ forward + backward @ backward)
+        if not power_sum > 0:
             break
-        reflected = 2.0 * float(ahead @ behind) / both
+        reflected = 2.0 * float(forward @ backward) / power_sum
         weights = np.append(weights - reflected * weights[::-1], reflected)
         power *= 1.0 - reflected**2
-        ahead, behind = (ahead - reflected * behind)[1:], (behind - reflected * ahead)[:-1]
+        forward, backward = (
+            (forward - reflected * backward)[1:],
+            (backward - reflected * forward)[:-1],
+        )
         if not power > 0:
             break
-        told = values.size * np.log(power) + 2.0 * order
-        if told < least:
-            least, best = told, weights
+        criterion = values.size * np.log(power) + 2.0 * order
+        if criterion < least:
+            least, best = criterion, weights
     steepest = float(np.max(np.abs(np.roots(np.append(1.0, -best))), initial=0.0))
     return best * min(1.0, LARGEST_POLE / max(steepest, LARGEST_POLE)) ** np.arange(
         1, best.size + 1
     )
 
 
-def make_white_root(laid: SpacedResiduals) -> FloatArray:
-    """The same of a series taken for white: (F,), as many as `estimate_spectrum_root` has of its size."""
-    size = pad_length(3 * (laid.values.size - 1)) // 2 + 1
-    mean = float(laid.values @ laid.values) / np.count_nonzero(laid.present)
+def make_white_root(spaced: SpacedResiduals) -> FloatArray:
+    """Make the spectrum root (F,) of a white series, as long as that of a coloured one."""
+    size = pad_length(3 * (spaced.values.size - 1)) // 2 + 1
+    mean = float(spaced.values @ spaced.values) / np.count_nonzero(spaced.present)
     both_signs = np.full(size, 2.0)  # each frequency stands for its negative too
     both_signs[[0, -1]] = 1.0
     return np.asarray(np.sqrt(mean * both_signs / (2 * (size - 1))))
 
 
 def transform_sensitivities(
-    laid: SpacedResiduals, columns: FloatArray, root: FloatArray
+    spaced: SpacedResiduals, columns: FloatArray, root: FloatArray
 ) -> NDArray[np.complex128]:
-    """Transforms (D, F) of the sensitivities (n, D) of a series, times a root (F,)."""
-    spread = np.zeros((columns.shape[1], laid.values.size))
-    spread[:, laid.present] = columns.T
-    return np.asarray(rfft(spread, 2 * (root.size - 1), axis=1) * root)
+    """Transform the sensitivities (n, D) of a series and multiply by a root (F,): (D, F)."""
+    spaced_columns = np.zeros((columns.shape[1], spaced.values.size))
+    spaced_columns[:, spaced.present] = columns.T
+    return np.asarray(rfft(spaced_columns, 2 * (root.size - 1), axis=1) * root)

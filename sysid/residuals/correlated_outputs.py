@@ -1,14 +1,13 @@
-"""Noise that several outputs have in common: the sandwich's middle with their covariance in it.
+"""Noise correlated over outputs: the middle of the sandwich with their covariance.
 
-What shakes two sensors at once shows in both residuals, and is told twice. Where outputs of an
-experiment are clearly correlated at the same times, Ω = E[Sᵀe eᵀS] gets the terms of both,
-Cov(eᵢ, eⱼ) (SᵢᵀSⱼ + SⱼᵀSᵢ) (Zellner 1962; the estimate stays that of the weights). Of coloured
-residuals their coherence is taken to be the same at all frequencies, beside the spectra that
-`sysid.residuals.coloured` has of each: so the variance of what the noise leaves of a difference is
-never below 0.
+A disturbance of two sensors appears in both residuals and would count twice. Suppose that outputs
+of an experiment are clearly correlated at the same times. Then Ω = E[Sᵀe eᵀS] gets the cross terms
+Cov(eᵢ, eⱼ) (SᵢᵀSⱼ + SⱼᵀSᵢ) (Zellner 1962; the estimate keeps its weights). For coloured residuals
+the coherence is assumed equal at all frequencies, with the spectra of `sysid.residuals.coloured`.
+So the variance of a difference of outputs is never negative.
 
-Residuals alike count once. So Σe² varies as that of fewer independent ones (Satterthwaite 1946):
-of n that n²/Σ r², over all pairs of them; of two outputs with the same noise that is one's.
+Equal residuals count once. So Σe² varies like that of fewer independent ones (Satterthwaite 1946):
+n²/Σ r² of n, with the sum over all pairs. Two outputs with the same noise count as one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,7 +32,7 @@ from sysid.residuals.coloured import (
 from sysid.simulation.problem import Problem
 
 _SIGNIFICANCE = 1e-3
-"""That residuals without anything in common look as correlated: below, they are taken to have."""
+"""Level of the test for correlation between outputs."""
 
 
 class _SharedPart(NamedTuple):
@@ -44,7 +43,7 @@ class _SharedPart(NamedTuple):
 
 
 class _CorrelatedPair(NamedTuple):
-    """Two series at the same times, their correlation, and its chance if it were none."""
+    """Two series at the same times, their correlation, and its p-value."""
 
     first: _SharedPart
     second: _SharedPart
@@ -53,104 +52,116 @@ class _CorrelatedPair(NamedTuple):
 
 
 def estimate_joint_covariance(
-    problem: Problem, seen: FloatArray, columns: FloatArray
+    problem: Problem, influence: FloatArray, columns: FloatArray
 ) -> ColouredCovariance | None:
-    """What `estimate_coloured_covariance` gives, with the covariance of outputs; None: one white noise.
+    """Estimate the coloured covariance with cross terms of outputs; None: one white noise.
+
+    The series themselves are those of `estimate_coloured_covariance`.
 
     Parameters
     ----------
     seen : FloatArray, shape (n,)
-        Weighted residuals of the scored samples as the loss sees them.
+        Influence of the weighted residuals of the scored samples on the loss.
     columns : FloatArray, shape (n, D)
-        Their sensitivities.
+        Sensitivities of these samples.
     """
-    pairs = list(_find_correlated_pairs(problem, seen)) if len(problem.model.outputs) > 1 else []
+    pairs = (
+        list(_find_correlated_pairs(problem, influence)) if len(problem.model.outputs) > 1 else []
+    )
     whole = estimate_coloured_covariance(
-        problem, seen, columns, by_model=not pairs
-    )  # of all by the same means
+        problem, influence, columns, by_model=not pairs
+    )  # the same method for all series
     if not pairs:
         return whole
     if whole is None:
-        alone = float(np.mean(np.square(seen))) * (columns.T @ columns)
-        whole = ColouredCovariance(alone, float(seen.size), is_drifting=False, is_white=True)
-    middle, twice = whole.middle, 0.0
+        white_middle = float(np.mean(np.square(influence))) * (columns.T @ columns)
+        whole = ColouredCovariance(
+            white_middle, float(influence.size), is_drifting=False, is_white=True
+        )
+    middle, double_counted = whole.middle, 0.0
     for pair in pairs:
-        term = _compute_cross_term(pair, seen, columns, whole.is_white)
+        term = _compute_cross_term(pair, influence, columns, whole.is_white)
         middle = middle + term + term.T
-        twice += 2.0 * pair.first.rows.size * pair.correlation**2
+        double_counted += 2.0 * pair.first.rows.size * pair.correlation**2
     size, vectors = np.linalg.eigh(middle)
-    if size[0] < 0.0:  # where outputs that are not measured all the time nearly cancel out
+    if size[0] < 0.0:  # if outputs with missing samples nearly cancel
         middle = (vectors * np.maximum(size, 0.0)) @ vectors.T
-    counted = 1.0 / (1.0 + twice / seen.size)
+    share = 1.0 / (1.0 + double_counted / influence.size)
     return whole._replace(
         middle=middle,
-        equivalent_samples=whole.equivalent_samples * counted,
-        series=tuple((one, max(counted * degrees, 1.0)) for one, degrees in whole.series),
+        equivalent_samples=whole.equivalent_samples * share,
+        series=tuple(
+            (series_middle, max(share * degrees, 1.0)) for series_middle, degrees in whole.series
+        ),
     )
 
 
-def _find_correlated_pairs(problem: Problem, seen: FloatArray) -> Iterator[_CorrelatedPair]:
-    """The pairs of outputs of those experiments that have a noise in common.
+def _find_correlated_pairs(problem: Problem, influence: FloatArray) -> Iterator[_CorrelatedPair]:
+    """Find the pairs of outputs in experiments with common noise.
 
-    All of them: some alone might have correlations that no noise has.
+    All pairs of such an experiment count: a part of them might form an impossible covariance.
     """
     for group in _group_by_experiment(problem):
-        found = [_correlate_parts(one, other, seen) for one, other in combinations(group, 2)]
-        known = [pair for pair in found if pair is not None]
-        if any(pair.chance < _SIGNIFICANCE / len(known) for pair in known):
-            yield from known
+        correlated = [
+            _correlate_parts(first, second, influence) for first, second in combinations(group, 2)
+        ]
+        pairs = [pair for pair in correlated if pair is not None]
+        if any(pair.chance < _SIGNIFICANCE / len(pairs) for pair in pairs):
+            yield from pairs
 
 
 def _correlate_parts(
-    one: ResidualPart, other: ResidualPart, seen: FloatArray
+    part_a: ResidualPart, part_b: ResidualPart, influence: FloatArray
 ) -> _CorrelatedPair | None:
-    times, i, j = np.intersect1d(one.times, other.times, return_indices=True)
+    times, i, j = np.intersect1d(part_a.times, part_b.times, return_indices=True)
     if times.size < FEWEST_SAMPLES:
         return None
     first, second = (
-        _SharedPart(part._replace(times=times), part.rows.start + at)
-        for part, at in ((one, i), (other, j))
+        _SharedPart(part._replace(times=times), part.rows.start + indices)
+        for part, indices in ((part_a, i), (part_b, j))
     )
-    found = _compute_correlation(seen[first.rows], seen[second.rows])
-    return None if found is None else _CorrelatedPair(first, second, *found)
+    correlation = _compute_correlation(influence[first.rows], influence[second.rows])
+    return None if correlation is None else _CorrelatedPair(first, second, *correlation)
 
 
 def _group_by_experiment(problem: Problem) -> Iterator[Sequence[ResidualPart]]:
-    every = iterate_parts(problem)
+    parts = iterate_parts(problem)
     for weight in problem.split_by_output(problem.evaluator.weight):
-        yield tuple(islice(every, sum(bool(np.any(one > 0)) for one in weight.values())))
+        yield tuple(
+            islice(parts, sum(bool(np.any(output_weight > 0)) for output_weight in weight.values()))
+        )
 
 
 def _compute_correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | None:
-    """The correlation of two series (n,), and the chance that it is by chance; None: one is 0.
+    """Compute the correlation of two series (n,) and its p-value; None if a series is 0.
 
-    Of series with poles p and q its variance is (1 + pq)/(1 - pq)/n (Bartlett 1935).
+    For series with poles p and q its variance is (1 + pq)/(1 - pq)/n (Bartlett 1935).
     """
     size = float(np.sqrt((a @ a) * (b @ b)))
     if not size > 0:
         return None
-    found = float(a @ b) / size
+    correlation = float(a @ b) / size
     poles = float((a[1:] @ a[:-1]) * (b[1:] @ b[:-1]) / size**2)
     widening = (1.0 + max(poles, 0.0)) / (1.0 - max(poles, 0.0))
-    return found, float(chdtrc(1, found**2 * a.size / widening))
+    return correlation, float(chdtrc(1, correlation**2 * a.size / widening))
 
 
 def _compute_cross_term(
-    pair: _CorrelatedPair, seen: FloatArray, columns: FloatArray, is_white: bool
+    pair: _CorrelatedPair, influence: FloatArray, columns: FloatArray, is_white: bool
 ) -> FloatArray:
-    """SᵢᵀE[eᵢeⱼᵀ]Sⱼ (D, D)."""
-    both = pair.first, pair.second
-    errors, slopes = ([of[one.rows] for one in both] for of in (seen, columns))
+    """Compute SᵢᵀE[eᵢeⱼᵀ]Sⱼ (D, D)."""
+    parts = pair.first, pair.second
+    errors, slopes = ([array[shared.rows] for shared in parts] for array in (influence, columns))
     have_colour = [
-        not is_white and is_coloured(one.part, error)
-        for one, error in zip(both, errors, strict=True)
+        not is_white and is_coloured(shared.part, error)
+        for shared, error in zip(parts, errors, strict=True)
     ]
     if not any(have_colour):
         common = float(errors[0] @ errors[1]) / errors[0].size
         return np.asarray(common * (slopes[0].T @ slopes[1]))
-    moved = []
+    transformed = []
     for error, slope, has_colour in zip(errors, slopes, have_colour, strict=True):
-        laid = space_residuals(pair.first.part.times, error)
-        root = estimate_spectrum_root(laid)[0] if has_colour else make_white_root(laid)
-        moved.append(transform_sensitivities(laid, slope, root))
-    return np.asarray(pair.correlation * (moved[0] @ moved[1].conj().T).real)
+        spaced = space_residuals(pair.first.part.times, error)
+        root = estimate_spectrum_root(spaced)[0] if has_colour else make_white_root(spaced)
+        transformed.append(transform_sensitivities(spaced, slope, root))
+    return np.asarray(pair.correlation * (transformed[0] @ transformed[1].conj().T).real)

@@ -1,8 +1,9 @@
-"""How many estimated coefficients stand before past outputs, when a model predicts one step ahead.
+"""Number of estimated coefficients of past outputs in predictions one step ahead.
 
-Such a prediction reads measured outputs, which hold earlier residuals, so the estimate makes the
-residuals' correlations at small lags smaller than those of white noise: Box and Pierce (1970) take
-one degree of freedom from the test for each such coefficient. A free run reads no measured output.
+Such a prediction reads measured outputs, which contain earlier residuals. So the estimate makes the
+residual correlations at small lags smaller than those of white noise. Box and Pierce (1970)
+subtract one degree of freedom from the test for each such coefficient. A free run reads no measured
+output.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ from sysid.models.ties import apply_ties, resolve_ties
 
 
 class _StateFactors(NamedTuple):
-    """Of an expression: its parameters, those that multiply a state, and whether it has states."""
+    """Parameters of an expression, those that multiply a state, and whether it has states."""
 
     names: frozenset[str] = frozenset()
     multiply: frozenset[str] = frozenset()
@@ -32,42 +33,46 @@ class _StateFactors(NamedTuple):
 
 
 def reads_outputs(model: Model) -> bool:
-    """Whether a prediction one step ahead is other than the free run: some output is a state."""
+    """Return whether some output is a state, so that one-step predictions differ from free runs."""
     return any(match_plain_state(output.expression) for output in model.outputs)
 
 
 def count_past_output_coefficients(model: Model, parameters: Sequence[Parameter]) -> dict[str, int]:
-    """Of each output, how many free parameters multiply a state in the equations behind it.
+    """Count for each output the free parameters that multiply a state in its equations.
 
     Parameters
     ----------
     model : Model
     parameters : sequence of Parameter
-        All of a problem's. A lag is no coefficient, whether it is free or not.
+        All parameters of a problem. A delay is no coefficient, free or not.
     """
     model = apply_ties(model, resolve_ties(model, parameters))
-    free = {one.name for one in parameters if one.is_free}
-    equations = dict(zip((one.name for one in model.states), model.equations, strict=True))
-    found = {}
+    free = {item.name for item in parameters if item.is_free}
+    equations = dict(zip((item.name for item in model.states), model.equations, strict=True))
+    counts = {}
     for output in model.outputs:
-        behind = [
+        equation_factors = [
             _analyse_expression(equations[state])
             for state in _list_dependencies(output.expression, equations)
         ]
-        found[output.name] = len(free & frozenset().union(*(one.multiply for one in behind)))
-    return found
+        counts[output.name] = len(
+            free & frozenset().union(*(item.multiply for item in equation_factors))
+        )
+    return counts
 
 
 def _list_dependencies(tree: Expression, equations: Mapping[str, Expression]) -> list[str]:
-    """The states that an expression depends on, and those that these depend on."""
-    found = _list_states(tree)
-    for state in found:  # grows while it is walked
-        found += [one for one in _list_states(equations[state]) if one not in found]
-    return found
+    """List the states that an expression depends on, directly or through other states."""
+    states = _list_states(tree)
+    for state in states:  # grows during the iteration
+        states += [name for name in _list_states(equations[state]) if name not in states]
+    return states
 
 
 def _list_states(tree: Expression) -> list[str]:
-    return list(dict.fromkeys(one.name for one in collect_past_values(tree) if one.kind == "state"))
+    return list(
+        dict.fromkeys(past.name for past in collect_past_values(tree) if past.kind == "state")
+    )
 
 
 def _analyse_expression(tree: Expression) -> _StateFactors:
@@ -85,7 +90,9 @@ def _analyse_expression(tree: Expression) -> _StateFactors:
             )
         case FunctionCall(_, arguments):
             return _combine_factors(
-                [_analyse_expression(one) for one in arguments], is_sum=False, is_product=False
+                [_analyse_expression(argument) for argument in arguments],
+                is_sum=False,
+                is_product=False,
             )
         case _:
             return _StateFactors()
@@ -94,13 +101,13 @@ def _analyse_expression(tree: Expression) -> _StateFactors:
 def _combine_factors(
     parts: Sequence[_StateFactors], *, is_sum: bool, is_product: bool = True
 ) -> _StateFactors:
-    """Of a sum, a product, or else a function, in which every parameter acts on every state."""
-    names = frozenset().union(*(one.names for one in parts))
-    multiply = frozenset().union(*(one.multiply for one in parts))
-    has_state = any(one.has_state for one in parts)
+    """Combine the factors of a sum, a product, or a function of parameters and states."""
+    names = frozenset().union(*(part.names for part in parts))
+    multiply = frozenset().union(*(part.multiply for part in parts))
+    has_state = any(part.has_state for part in parts)
     if has_state and not is_sum:
-        for i, one in enumerate(parts):
+        for i, part in enumerate(parts):
             others = any(other.has_state for j, other in enumerate(parts) if j != i)
-            if others or (one.has_state and not is_product):
-                multiply |= one.names
+            if others or (part.has_state and not is_product):
+                multiply |= part.names
     return _StateFactors(names, multiply, has_state)

@@ -1,9 +1,9 @@
-"""First-order noise taken out of residuals, by what each sample owes to the one before.
+"""AR(1) prewhitening of residuals with the coefficient of each sample.
 
-Noise with the autocorrelation exp(-Δ/τ) over a time Δ, in continuous time an Ornstein-Uhlenbeck
-process, at even samples an AR(1): given the sample before, no earlier one says more. So with
-a = exp(-Δ/τ) the values (e(k) - a e(k-1))/√(1 - a²), and the first one as it is, are white and have
-the variance of the noise. Samples that are missing or uneven only make some Δ longer.
+The noise has the autocorrelation exp(-Δ/τ) over a time Δ. In continuous time this is an
+Ornstein–Uhlenbeck process, at even samples an AR(1). Given the previous sample, earlier ones add no
+information. So with a = exp(-Δ/τ) the values (e(k) - a e(k-1))/√(1 - a²) are white, with the
+variance of the noise. The first value stays. Missing or uneven samples only make some Δ longer.
 """
 
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from sysid.core.types import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """What each of n samples owes to the one before it, series after series.
+    """AR(1) coefficient of each of n samples, series after series.
 
     Attributes
     ----------
-    owed : FloatArray, shape (n,)
+    ar1_coefficient : FloatArray, shape (n,)
         a; 0 where a series begins.
-    n_times : int
-        Correlation times that were estimated for it.
+    n_correlation_times : int
+        Number of correlation times that were estimated.
     """
 
     ar1_coefficient: FloatArray
     n_correlation_times: int = 0
 
     def whiten(self, values: FloatArray) -> FloatArray:
-        """Values (..., n) of samples without what they owe."""
+        """Whiten values (..., n) of the samples."""
         white = np.array(values)
         white[..., 1:] -= self.ar1_coefficient[1:] * values[..., :-1]
         return white / self._innovation_deviation
@@ -41,23 +41,23 @@ class Whitening:
 
     @property
     def equivalent_samples(self) -> float:
-        """How many white samples would say as much of a mean (Bayley and Hammersley 1946)."""
+        """Equivalent number of white samples for a mean (Bayley and Hammersley 1946)."""
         return float(np.sum((1.0 - self.ar1_coefficient) / (1.0 + self.ar1_coefficient)))
 
     @property
     def _innovation_deviation(self) -> FloatArray:
-        """Standard deviation of what is not owed, of that of the noise."""
+        """Standard deviation of the innovations, relative to that of the noise."""
         return np.sqrt(1.0 - np.square(self.ar1_coefficient))
 
 
 def compute_ar1_coefficient(times: FloatArray, correlation_time: float) -> FloatArray:
-    """What samples (n,) at some times (s) owe to the one before, 0 for a `correlation_time` of 0.
+    """Compute the AR(1) coefficient of samples (n,) at some times (s); 0 without correlation time.
 
-    Samples at one time owe no more than those a thousandth of the mean step apart.
+    Samples at the same time count as a thousandth of the mean step apart.
     """
-    found = np.zeros(times.size)
+    coefficient = np.zeros(times.size)
     if correlation_time > 0 and times.size > 1:
         steps = np.diff(times)
         least = 1e-3 * float(times[-1] - times[0]) / steps.size
-        found[1:] = np.exp(-np.maximum(steps, least) / correlation_time)
-    return found
+        coefficient[1:] = np.exp(-np.maximum(steps, least) / correlation_time)
+    return coefficient

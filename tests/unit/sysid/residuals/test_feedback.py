@@ -117,7 +117,7 @@ def test_a_regulated_record_without_reference_is_warned_of() -> None:
         return note
 
     note = told()
-    assert note.startswith("input 'u' follows the residuals of y: they tell")
+    assert note.startswith("input 'u' follows the residuals of y: they explain")
     assert "use loss: {noise_model: ar1}" in note
     assert "noise_model" not in told(loss=Loss(noise_model="ar1"))
     assert describe_feedback([]) == []
@@ -132,5 +132,5 @@ def test_what_a_model_misses_of_an_input_read_as_straight_is_told_as_another_cau
         describe_feedback([series(y)._replace(inputs=(Channel("u", TIMES, u, hold=hold),))])
         for hold in ("first", "zero")
     )
-    assert "misses some of how the output answers within a sample" in straight[0]
+    assert "misses part of the response within a sample" in straight[0]
     assert not any("within a sample" in one for one in stepped)
