@@ -1,4 +1,4 @@
-"""From the end of a search to its result: refinement, uncertainty, validation, warnings."""
+"""Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -54,13 +54,12 @@ def conclude_run(
     validation: Problem | None = None,
     clock: Clock = perf_counter,
 ) -> Identification:
-    """The identification that a run has led to.
+    """Conclude a run: refine, analyse and validate its estimate.
 
-    With ``refine_candidates`` the champions of an ``improved`` search are polished by least
-    squares. Those of the paper's two methods are reported as found, so that a comparison is one of
-    the methods. Of a run whose time is limited all of that ends near the limit, and warnings tell
-    what was left out; standard errors, tests and validation are made in any case. `clock` gives
-    seconds.
+    With ``refine`` the champions of an ``improved`` search are refined by least squares. Those of
+    the paper's two methods are reported unchanged, so that a comparison is one of the methods. If
+    the time of the run is limited, refinement ends near the limit and warnings list what was left
+    out. Standard errors, tests and validation are always computed. `clock` returns seconds.
 
     Raises
     ------
@@ -146,7 +145,7 @@ def _build_identification(
 
 
 def _compute_input_history(problem: Problem) -> tuple[float, ...]:
-    """For how long (s) the inputs are known before what is scored of each experiment."""
+    """Compute the recorded input time (s) before the scored part of each experiment."""
     scored_from = problem.settings.scored_from or tuple(record.start for record in problem.records)
     return tuple(
         record.history_duration + max(start - record.start, 0.0)
@@ -155,7 +154,7 @@ def _compute_input_history(problem: Problem) -> tuple[float, ...]:
 
 
 def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
-    """Whether a controller made an input; past white residuals it does the estimates no harm."""
+    """Describe feedback from outputs to inputs; with white residuals it does no harm."""
     uncertainty = analysis.uncertainty
     if uncertainty is not None and uncertainty.noise_colour == "white":
         return []
@@ -171,7 +170,7 @@ def _refine_and_analyse(
     GeneralisedEstimate,
     Analysis,
 ]:
-    """What refinement made of the islands' champions, where each ended, and the best's analysis."""
+    """Refine the islands' champions and analyse the best of them."""
     champions = [_get_champion(problem, island.history) for island in state.islands]
     refined = _refine_champions(problem, algorithm, state, champions, deadline)
     ends = [
@@ -225,7 +224,7 @@ def _refine_champions(
 
 
 def _should_refine(algorithm: GeneticAlgorithm, islands: int) -> bool:
-    """Whether least squares goes on from where the search has ended."""
+    """Whether least squares continues from the end of the search."""
     methods = {get_island_settings(algorithm, i).method for i in range(islands)}
     return algorithm.refine and "improved" in methods
 
@@ -239,9 +238,9 @@ def _search_local_minima(
     analysis: Analysis,
     deadline: Deadline,
 ) -> tuple[RefinedCandidate, Analysis]:
-    """The best of the minima beside an estimate, with intervals that allow for the others.
+    """Search the minima near an estimate; return the best, with intervals that cover the others.
 
-    The evaluations of it are those of all the islands' ends in its place, and of the search here.
+    Its evaluations are those of the candidate that it replaces, and of this search.
     """
     theta, rms = end
     previous = next(
@@ -277,7 +276,7 @@ def _search_local_minima(
 
 
 def _widen_intervals(problem: Problem, analysis: Analysis, minima: LocalMinima) -> Analysis:
-    """The analysis with intervals that hold those of all minima found."""
+    """Widen the intervals of an analysis so that they contain those of all minima."""
     if analysis.linear_model is None:
         return analysis
     share = analysis.linear_model.variance_ratio
@@ -297,9 +296,10 @@ def _apply_noise_model(
     analysis: Analysis,
     deadline: Deadline,
 ) -> tuple[GeneralisedEstimate, Analysis]:
-    """The estimates under the noise model that was asked for or chosen, and their analysis.
+    """Estimate and analyse under the noise model that was requested or selected.
 
-    Those of the paper's methods stay as found; so do all where residuals may as well be white.
+    Estimates of the paper's methods stay unchanged. So do all if the residuals are consistent with
+    white noise.
     """
     requested = problem.loss.noise_model
     if requested == "white" or not _should_refine(algorithm, len(state.islands)):
@@ -340,7 +340,7 @@ def _apply_noise_model(
 def _count_budget_left(
     algorithm: GeneticAlgorithm, state: RunState, refined: tuple[RefinedCandidate | None, ...]
 ) -> int | None:
-    """What search and refinement have left of the budget of simulations; None: there is none."""
+    """Count the simulations that search and refinement left of the budget; None: no budget."""
     limit = algorithm.stop.evaluations
     return (
         None
@@ -378,7 +378,7 @@ def _summarise_islands(
 def _extend_histories(
     state: RunState, refined: tuple[RefinedCandidate | None, ...]
 ) -> tuple[tuple[Improvement, ...], ...]:
-    """The islands' histories, with what the refinement gained."""
+    """Extend the islands' histories by the gain of the refinement."""
     histories = []
     for island, end in zip(state.islands, refined, strict=True):
         history = island.history
@@ -408,11 +408,11 @@ def _validate_estimates(
     estimates: tuple[Estimate, ...],
     correlation_times: Mapping[str, float],
 ) -> _ValidationResult:
-    """Agreement and simulation on data that were not used.
+    """Simulate data that were not used for the estimate, and measure the agreement.
 
-    The model's parameters are those of the estimate, and so are the weights, so that both RMS
-    are in the same measure. An initial state belongs to its record: where the last part of the
-    same records is judged it is the estimated one, on other records it is found on them, alone.
+    Parameters and output weights are those of the estimate, so both RMS use the same measure. An
+    initial state belongs to its record. If the last part of the same records is validated, it is
+    the estimated one. On other records only the initial state is estimated.
     """
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
@@ -436,7 +436,7 @@ def _validate_estimates(
 
 
 def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:
-    """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
+    """Fix a parameter at its estimate; that of a tie may lie outside the bounds."""
     value = estimate.value
     bounds = {"lower": min(estimate.lower, value), "upper": max(estimate.upper, value)}
     return {"fixed": value, "scale": "linear", **bounds}
@@ -445,7 +445,7 @@ def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:
 def _select_scored_part(
     problem: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> tuple[tuple[FloatArray, ...], ...]:
-    """The part from the time on at which the records are scored, at its measured times."""
+    """Select the simulated samples from the time on at which the records are scored."""
     scored_from = problem.settings.scored_from
     if scored_from is None:
         return simulated

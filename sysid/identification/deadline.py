@@ -1,27 +1,28 @@
-"""When the time that a run may take is over, for what follows its search."""
+"""Time limit of a run, for the steps that follow its search."""
 
 from collections.abc import Callable
 from time import perf_counter
 
 Clock = Callable[[], float]
-"""Seconds from any moment on."""
+"""Seconds since an arbitrary moment."""
 
 _GRACE_SHARE, _MIN_GRACE_SECONDS, _MAX_GRACE_SECONDS = 0.1, 0.2, 10.0  # of the limit; s
 _STEPS_AFTER_DEADLINE = 20_000_000
-"""Steps of integration or recursion that may follow where the time is over: about 0.2 s."""
-_MIN_MEASURED_SECONDS = 1e-3  # s: a search that took less says nothing of what a simulation takes
+"""Steps of integration or recursion that are allowed after the time limit: about 0.2 s."""
+_MIN_MEASURED_SECONDS = 1e-3  # s: a shorter search does not measure the cost of a simulation
 
 
 class Deadline:
-    """The end of a run's time, and a grace behind it, within which least squares may end.
+    """End of a run's time, and a grace period after it in which least squares may end.
 
     Parameters
     ----------
     limit : float or None
-        Seconds that the run may take; None: it has no limit.
+        Time limit of the run in s; None: no limit.
     used : float
-        Seconds of it that its search has taken.
+        Seconds that its search has taken.
     clock : callable
+        Returns seconds.
     """
 
     def __init__(self, limit: float | None, used: float, clock: Clock = perf_counter) -> None:
@@ -33,7 +34,7 @@ class Deadline:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until the end, 0 or more."""
+        """Seconds left until the end, 0 or more."""
         return max(0.0, self._end - self._clock())
 
     def is_over(self) -> bool:
@@ -41,13 +42,14 @@ class Deadline:
         return self._clock() >= self._end
 
     def is_past_grace(self) -> bool:
-        """Whether the grace is over as well."""
+        """Whether the grace period is over as well."""
         return self._clock() >= self._end + self._grace
 
     def count_simulations_left(self, seconds: float, evaluations: int, steps: int) -> int | None:
-        """Simulations of some steps that are left, by what those of a search took; None: no limit.
+        """Count the simulations that the time limit still allows; None: no limit.
 
-        As many as are over at once are there always.
+        Their cost is measured by the search: `evaluations` simulations in `seconds`. A small
+        number of short simulations is always allowed.
         """
         if not self._is_limited:
             return None

@@ -1,4 +1,4 @@
-"""Which program computes: results are the same bits as long as it does not change."""
+"""Fingerprint of the program: equal fingerprints give results equal bit for bit."""
 
 import hashlib
 from functools import cache
@@ -13,10 +13,10 @@ _LIBRARIES = ("numpy", "scipy", "numba")
 
 @cache
 def compute_fingerprint(*packages: Path) -> str:
-    """Digest of all that a result depends on besides its specification.
+    """Compute a digest of all that a result depends on in addition to its specification.
 
-    The sources of this package and of those given as folders, the versions of the libraries, and
-    what kernels depend on in the machine.
+    It covers the sources of this package and of the folders `packages`, the versions of the
+    libraries, and the properties of the machine that kernels depend on.
     """
     parts = [describe_machine(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     for folder in (Path(__file__).parents[1], *packages):

@@ -1,4 +1,4 @@
-"""From the records of a fit to its problem, and to that of its validation data."""
+"""Build the problem of a fit and that of its validation data from the records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,13 +23,13 @@ class FitRecords(NamedTuple):
     Attributes
     ----------
     estimation : tuple of Record
-        The model is fitted to them; with noise if some is added.
+        Records that the model is fitted to, including added noise.
     validation : tuple of Record or None
-        They are not used for the estimate.
+        Records that are not used for the estimate.
     validation_runs : tuple of Record or None
-        What is simulated to validate: whole records, where `validation` is their last part.
+        Records simulated for validation: whole ones where `validation` is their last part.
     scored_from : tuple of float or None
-        For each of these runs the time (s) at which validation begins. None: they count as a whole.
+        Time (s) at which validation begins in each of these. None: they count as a whole.
     """
 
     estimation: tuple[Record, ...]
@@ -44,7 +44,7 @@ def prepare_records(
     fraction: float | None = None,
     noise: Noise | None = None,
 ) -> FitRecords:
-    """Split validation data off the records, and add noise to those for the estimate.
+    """Split validation data off the records, and add noise to the estimation data.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ def prepare_records(
 
 
 def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> ProblemPair:
-    """The problem of a fit and that of its validation data, on the terms that are selected.
+    """Build the problems of estimation and validation, after selection of polynomial terms.
 
-    Both have the weights that the records for the estimate give.
+    Both use the output weights of the estimation data.
 
     Raises
     ------

@@ -1,25 +1,25 @@
 """Generalised least squares: estimates under first-order noise.
 
-Least squares takes every residual for news. Where the noise changes slowly, neighbouring residuals
-tell the same thing twice, and a slow disturbance outweighs what the fast part of the record says.
-So residuals are whitened by a first-order noise (`sysid.residuals.whitening`), the parameters
-estimated from what is left, and the noise from the new residuals, until it stays (feasible
-generalised least squares; Cochrane and Orcutt, J. Am. Stat. Assoc. 44 (1949) 32).
+Least squares treats residuals as independent. If the noise changes slowly, neighbouring residuals
+repeat the same information, and a slow disturbance outweighs the fast part of the record. So the
+residuals are whitened by a first-order noise model (`sysid.residuals.whitening`). The parameters
+are estimated from the whitened residuals, and the noise from the new residuals, until both stay
+(feasible generalised least squares; Cochrane and Orcutt, J. Am. Stat. Assoc. 44 (1949) 32).
 
-What is estimated of the noise is its *correlation time* τ, at which the residuals' autocorrelation
-has fallen to 1/e. Of first-order noise it says as much as the correlation of neighbours does. Of
-smooth disturbances, whose neighbours are equal to many digits, that one leads to a model of
-differences, in which rounding and sensor noise outweigh all else; τ does not. The first-order
-noise is a working correlation: where it is not the true one the estimates keep their meaning and
-lose some efficiency, and the covariance is that of what the whitening leaves, by a sandwich where
-that is coloured (Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.coloured`).
+The noise is described by its *correlation time* τ, at which the residuals' autocorrelation has
+fallen to 1/e. For first-order noise τ is equivalent to the correlation of neighbours. For smooth
+disturbances, neighbours are equal to many digits. Their correlation then leads to a model of
+differences, in which rounding and sensor noise outweigh all else; τ does not. The first-order noise
+is a working correlation: if it is not the true one, the estimates stay valid but lose some
+efficiency. The covariance is that of the whitened residuals, by a sandwich if these are coloured
+(Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.coloured`).
 
-Where switches make the loss rough, the minimum beside that of least squares need not be the lowest:
-of places drawn along the covariance of least squares, those that lie lowest are starts as well.
+If switches make the loss rough, the minimum near that of least squares need not be the lowest. So
+points are drawn along the covariance of least squares, and the lowest of them are starts as well.
 
-Estimated parameters take a part of the noise with them. At last it is put back, as the covariance
-of the fitted outputs, S C Sᵀ, added to the autocovariance of the residuals. Once only: repeated,
-noise with a white part drifted away, and its offset with it.
+Estimated parameters absorb a part of the noise. At the end it is added again: the covariance of the
+fitted outputs, S C Sᵀ, is added to the autocovariance of the residuals. This is done only once.
+Repeated, noise with a white part drifted away, and its offset with it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,11 +49,11 @@ from sysid.uncertainty.linear_model import factor_covariance, make_move_generato
 _MAX_ROUNDS = 12
 _TIME_TOLERANCE = 1e-3  # relative: correlation times that differ by less
 _MAX_STEPS = 40  # of least squares in a round
-_START_DEVIATIONS = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
+_START_DEVIATIONS = np.array([0.3, 1.0, 2.0])  # standard errors from the estimate to drawn points
 _N_DRAWN, _MAX_STARTS = 96, 6
-_MAX_WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
+_MAX_WORK = 50_000_000  # steps of integration or recursion: no points are drawn on longer records
 _DECAY_LEVEL = float(np.exp(-1.0))
-_MIN_CORRELATION = 0.1  # correlation of neighbours: below, it is not worth a model
+_MIN_CORRELATION = 0.1  # correlation of neighbours: smaller ones need no model
 
 
 class GeneralisedEstimate(NamedTuple):
@@ -63,19 +63,19 @@ class GeneralisedEstimate(NamedTuple):
     ----------
     theta : FloatArray, shape (D,)
     correlation_times : mapping of str to float
-        Of each output's noise, s; 0 where its residuals may as well be white.
+        Of each output's noise, s; 0 if its residuals are consistent with white noise.
     evaluations : int
     is_complete : bool
-        False where the simulations that were left did not suffice.
+        False if the budget of simulations did not suffice.
     minima : FloatArray, shape (m, D)
-        Where least squares ended from all starts, the estimate among them.
+        Ends of least squares from all starts, including the estimate.
     rms : FloatArray, shape (m,)
-        Of the whitened residuals there.
-    instead_of : FloatArray, shape (D,), or None
-        Estimates of squares, where nobody asked for a noise model
+        RMS of the whitened residuals there.
+    least_squares_theta : FloatArray, shape (D,), or None
+        Estimates of least squares, if the noise model was selected by ``auto``
         (`sysid.identification.noise_model_choice`).
-    too_slow : mapping of str to float
-        Correlation times (s) for which the record is too short, so that squares stayed there.
+    unresolved_times : mapping of str to float
+        Correlation times (s) for which the record is too short, so least squares is used.
     """
 
     theta: FloatArray
@@ -89,7 +89,7 @@ class GeneralisedEstimate(NamedTuple):
 
 
 def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
-    """The whitening of a problem's scored samples."""
+    """Make the whitening of a problem's scored samples."""
     coefficients = [
         compute_ar1_coefficient(part.times, correlation_times.get(part.output, 0.0))
         for part in iterate_parts(problem)
@@ -107,17 +107,17 @@ def fit_generalised_least_squares(
     seed: int,
     max_simulations: int | None = None,
 ) -> GeneralisedEstimate:
-    """Estimates under first-order noise, from those of least squares (D,).
+    """Estimate under first-order noise, from the estimates of least squares (D,).
 
-    With no more than `most` simulations. Where all residuals may as well be white the estimates
-    stay as they are.
+    At most `max_simulations` simulations are used. If all residuals are consistent with white
+    noise, the estimates stay unchanged.
 
     Parameters
     ----------
     covariance : FloatArray, shape (D, D)
         Of the estimates of least squares.
     seed : int
-        Of the places that are drawn along it.
+        Seed of the points drawn along it.
     """
     search = _WhitenedLeastSquares(problem, 2**62 if max_simulations is None else max_simulations)
     if search.simulations_left < 1:
@@ -149,7 +149,7 @@ def fit_generalised_least_squares(
 
 
 def find_coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
-    """Outputs whose residuals at theta (D,) are clearly not white."""
+    """Find outputs whose residuals at theta (D,) are clearly not white."""
     place = to_unit(problem.evaluator, theta[None])
     return _select_coloured_outputs(
         problem, _WhitenedLeastSquares(problem, 1).compute_residuals(place)[0]
@@ -168,7 +168,7 @@ def _to_estimate(
     search: "_WhitenedLeastSquares",
     is_complete: bool,
 ) -> GeneralisedEstimate:
-    """The estimates at a place, those there were where no correlation was found."""
+    """Make the estimate at a point; without any correlation, that of least squares."""
     if any(times.values()):
         theta = from_unit(problem.evaluator, place[None])[0]
     minima = from_unit(problem.evaluator, search.ends)
@@ -182,7 +182,7 @@ def _draw_starts(
     covariance: FloatArray,
     random: np.random.Generator,
 ) -> list[FloatArray]:
-    """Places around one (D,), those that lie lowest of some that are drawn."""
+    """Draw points around one (D,) and return those of lowest loss."""
     count = _N_DRAWN + _MAX_STARTS * search.round_simulations
     if search.simulations_left < count or count * search.problem.n_steps > _MAX_WORK:
         return []
@@ -204,7 +204,7 @@ def _have_converged(times: Mapping[str, float], previous: Mapping[str, float]) -
 def _factor_output_covariance(
     columns: FloatArray, error: FloatArray, whitening: Whitening
 ) -> FloatArray:
-    """L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
+    """Compute L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
     whitened, residuals = whitening.whiten(columns.T).T, whitening.whiten(error)
     _, singular, rows, retained = truncated_svd(whitened)
     deviation = np.sqrt(float(residuals @ residuals) / max(error.size - columns.shape[1], 1))
@@ -214,7 +214,7 @@ def _factor_output_covariance(
 def _estimate_correlation_times(
     problem: Problem, coloured: set[str], error: FloatArray, spread: FloatArray | None
 ) -> dict[str, float]:
-    """Of each output in s: the mean over its series, by their samples."""
+    """Estimate each output's correlation time in s: the mean over its series, by samples."""
     times: dict[str, list[tuple[float, int]]] = {}
     for part in iterate_parts(problem):
         if part.output in coloured:
@@ -230,7 +230,7 @@ def _estimate_correlation_times(
 def _estimate_correlation_time(
     part: ResidualPart, error: FloatArray, spread: FloatArray | None
 ) -> float:
-    """Time (s) at which the autocorrelation of one series has fallen to 1/e, half of it at most."""
+    """Time (s) at which the autocorrelation has fallen to 1/e; at most half of the series."""
     series = space_residuals(part.times, error)
     present = series.present.astype(np.float64)
     covariance = _autocorrelate(series.values)
@@ -247,30 +247,30 @@ def _estimate_correlation_time(
 
 
 def _autocorrelate(values: FloatArray) -> FloatArray:
-    """Σ v(t) v(t + k) for k from 0 up to half the values' number."""
+    """Compute Σ v(t) v(t + k) for k from 0 up to half the number of values."""
     n = values.size
     length = 1 << (2 * n - 1).bit_length()
     return np.asarray(irfft(np.square(np.abs(rfft(values, length))), length)[: n // 2])
 
 
 def _find_decay_lag(correlation: FloatArray) -> float:
-    """Lag at which a correlation function has fallen to 1/e, by a line between two lags."""
+    """Find the lag at which a correlation function has fallen to 1/e, by linear interpolation."""
     below = np.flatnonzero(correlation <= _DECAY_LEVEL)
     if not below.size:
         return float(correlation.size)
     k = int(below[0])
-    if k == 1:  # faster than the samples: what is left of the first-order noise after one of them
+    if k == 1:  # faster than the samples: from the correlation after one sample
         return -1.0 / float(np.log(correlation[1])) if correlation[1] > _MIN_CORRELATION else 0.0
     before, after = correlation[k - 1], correlation[k]
     return k - 1 + float((before - _DECAY_LEVEL) / (before - after))
 
 
 class _WhitenedLeastSquares:
-    """Least squares of whitened residuals over places in [0, 1], counting simulations."""
+    """Least squares of whitened residuals over unit coordinates, counting simulations."""
 
     def __init__(self, problem: Problem, budget: int) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
-        self.is_cut = False  # whether a minimum was left before its end for want of simulations
+        self.is_cut = False  # whether a search ended early because the budget was spent
         self.ends, self.rms = (
             np.zeros((0, len(problem.free_parameters))),
             np.zeros(0),
@@ -278,7 +278,7 @@ class _WhitenedLeastSquares:
         rows = problem.scored_rows
         self._scored = ScoredSamples(problem.evaluator, rows, problem.evaluator.weight[rows])
         self._step_simulations = len(problem.free_parameters) + N_TRIED
-        # Simulations without which no round begins: the slopes, a step, residuals at both ends.
+        # Least simulations of a round: the slopes, a step, residuals at both ends.
         self.round_simulations = len(problem.free_parameters) + self._step_simulations + 2
 
     @property
@@ -287,7 +287,7 @@ class _WhitenedLeastSquares:
         return self._budget - self.evaluations
 
     def compute_residuals(self, places: FloatArray) -> FloatArray:
-        """Weighted residuals (P, n) of places (P, D)."""
+        """Compute weighted residuals (P, n) at points (P, D)."""
         self.evaluations += places.shape[0]
         predicted = self.problem.predict(from_unit(self.problem.evaluator, places))
         scored = self._scored
@@ -295,14 +295,14 @@ class _WhitenedLeastSquares:
         return np.asarray(scored.weight * (predicted[:, scored.rows] - measured))
 
     def compute_slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
-        """Slopes (n, D) of the residuals."""
+        """Compute the slopes (n, D) of the residuals."""
         columns = np.empty((place.size, error.size))
         fill_jacobian(self._scored, place, error, columns)
         self.evaluations += place.size
         return columns.T
 
     def find_lowest_minimum(self, starts: Sequence[FloatArray], whitening: Whitening) -> FloatArray:
-        """The lowest minimum from places (D,), of which the first is sure to be searched from."""
+        """Find the lowest minimum from starts (D,); the first start is always searched."""
         solutions = []
         for start in starts:
             steps = min(_MAX_STEPS, (self.simulations_left - 2) // self._step_simulations)
@@ -325,7 +325,7 @@ class _WhitenedLeastSquares:
 
 
 def _sum_squares(errors: FloatArray) -> FloatArray:
-    """Sums of squares (P,) of residuals (P, n); inf where one is not finite."""
+    """Sum the squares (P,) of residuals (P, n); inf where one is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         totals = np.einsum("pn,pn->p", errors, errors)
     return np.where(np.isfinite(totals), totals, np.inf)

@@ -1,4 +1,4 @@
-"""The library call: from a model and records to an identification, in this process."""
+"""Identify a model from records, in this process."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -36,9 +36,9 @@ def identify(
     warm: Mapping[str, float] | None = None,
     progress: Callable[[RunState], None] | None = None,
 ) -> Identification:
-    """Find the free parameters of a model, its unknown lags among them.
+    """Estimate the free parameters of a model, including its unknown time lags.
 
-    A polynomial whose terms are to be selected first has them selected on the records.
+    If the terms of a polynomial are to be selected, they are selected on the records first.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ def identify(
     validation : Record or sequence of Record
         Data that are not used for the estimate.
     validation_fraction : float
-        Instead of `validation`: the last part of each record, simulated with all before it.
+        Instead of `validation`: the last part of each record. Simulation covers the whole record.
     noise : Noise
         Added to the outputs of `records` before fitting.
     warm : mapping of str to float
-        Values that a part of the population begins with.
+        Values that a part of the population starts from.
     progress : callable
-        Told the run's state several times a second.
+        Receives the run's state several times a second.
 
     Raises
     ------

@@ -1,12 +1,13 @@
-"""Whether the step of the integration is short enough for the estimate that it has led to.
+"""Test whether the integration step is short enough for the estimate.
 
-A time constant of less than about one step is estimated as what makes up for the error of the
-integration, and residuals do not tell. So an estimate of a differential model is simulated once
-more with half the step. A move d of the outputs moves no parameter by more than |d|/s of its
-standard errors. Where that may be one it is fitted anew; where d is small beside the
-output, the estimates move by -(SᵀS)⁻¹Sᵀd. A move of little of a value is told, too, where it is
-much of the standard error; but not where the record fits far better with the step as it is, as one
-that was simulated with it does.
+A time constant shorter than about one step compensates for the integration error, and the
+residuals do not show it. So the estimate of a differential model is simulated again with half the
+step. A change d of the outputs moves no parameter by more than |d|/s of its standard errors. If
+that may be one standard error, the model is fitted again. If d is small compared to the output,
+the estimates move by -(SᵀS)⁻¹Sᵀd.
+
+A small relative move is reported too if it is large compared to the standard error. It is not
+reported if the record fits far better with the original step, as data simulated with it do.
 """
 
 from collections.abc import Callable
@@ -26,12 +27,12 @@ from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
 _SUBSTEP_FACTOR = 2
-_NOTABLE_ERROR = 1e-3  # of the output's size: smaller errors of the integration are let pass
-_NOTABLE_SHARE = 0.01  # of a value: so is a smaller move where the record fits better with the step
+_NOTABLE_ERROR = 1e-3  # of the output's size: smaller integration errors are accepted
+_NOTABLE_SHARE = 0.01  # of a value: smaller moves are accepted if the original step fits far better
 _TINY = float(np.finfo(float).tiny)
 _LIKELIHOOD_GAIN = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_STEPS = 2_000_000
-"""Steps that the finer simulation may take; of a longer one nothing is told."""
+"""Most steps of the finer simulation; a longer one is not tested."""
 
 
 def warn_integration_step(
@@ -41,7 +42,7 @@ def warn_integration_step(
     simulated: FloatArray,
     is_late: Callable[[], bool] | None = None,
 ) -> list[str]:
-    """Estimates (D,) that would be others with half the integration step; simulated (M,)."""
+    """Warn about estimates (D,) that change with half the integration step; simulated (M,)."""
     plain = problem.loss.noise_model != "ar1"
     if is_difference(problem.model) or not plain or _SUBSTEP_FACTOR * problem.n_steps > _MAX_STEPS:
         return []
@@ -57,7 +58,7 @@ def warn_integration_step(
     if is_late is not None and is_late():
         return [
             "half the integration step changes the output enough to move an estimate by its "
-            "standard error. The time limit left no new fit with that step."
+            "standard error. The time limit left no time for a new fit."
         ]
     error = error[weight > 0]
     end = (
@@ -88,7 +89,7 @@ class _FineEstimate(NamedTuple):
 def _refit_estimate(
     fine: Problem, theta: FloatArray, is_late: Callable[[], bool] | None
 ) -> _FineEstimate:
-    """Where least squares ends with the finer step."""
+    """Fit the model by least squares with the finer step."""
     (end,) = refine_candidates(fine, [theta], None, is_late)
     return (
         _FineEstimate(theta, 0.0)
@@ -104,7 +105,7 @@ def _predict_estimate(
     move: FloatArray,
     error: FloatArray,
 ) -> _FineEstimate:
-    """Where it would end if outputs that move by so little (n,) are linear."""
+    """Predict that fit from the change (n,) of the outputs, if they are linear."""
     at_bound = {estimate.name for estimate in estimates if estimate.status == "at bound"}
     sensitivities = compute_sensitivities(problem, theta)
     sloping = (sensitivities.plateau_width == 0.0) & ~sensitivities.one_sided
@@ -122,7 +123,7 @@ def _describe_shifts(
     end: FloatArray,
     share: float,
 ) -> list[str]:
-    """Estimates that move by much of their standard error, and by that share of themselves."""
+    """Describe estimates that move by more than a standard error and this share of their value."""
     shift_by_name = dict(zip(problem.free_names, (end - theta).tolist(), strict=True))
     messages = []
     for estimate in estimates:
@@ -139,7 +140,7 @@ def _describe_shifts(
 
 
 def _halve_step(problem: Problem) -> Problem:
-    """The problem with shorter steps of integration."""
+    """Make the same problem with half the integration step."""
     model = problem.untied_model
     solver = replace(model.solver, substeps=_SUBSTEP_FACTOR * model.solver.substeps)
     return problem.rebuild(model=replace(model, solver=solver))

@@ -1,24 +1,24 @@
-"""Minima beside an estimate: where the loss is rough, least squares ends at one of many.
+"""Search for minima near an estimate: on a rough loss, least squares ends at one of many.
 
-Switches such as dry friction make the loss jump, so that minima lie side by side inside the
-statistical ellipsoid, with losses that the noise hardly tells apart. Places are drawn along
-s²(SᵀS)⁻¹, in which the likelihood ratio of squares is measured whatever the residuals' colour; if
-the loss there is what the linear model says, nothing more is done. Else least squares goes on
-from those that lie lowest under the linear model's loss, and again from around a better minimum
+Switches such as dry friction make the loss jump. Minima then lie side by side inside the
+statistical ellipsoid, with losses that the noise hardly distinguishes. Points are drawn along
+s²(SᵀS)⁻¹, in which the likelihood ratio of squares is measured for residuals of any colour. If the
+loss there agrees with the linear model, the search ends. Otherwise least squares continues from
+the points that are lowest compared to the linear model. It is repeated around a better minimum
 (basin hopping, Wales and Doye, J. Phys. Chem. A 101 (1997) 5111).
 
-Such a minimum often lies on the edge of a jump, along which no slope leads. So at last an evolution
-strategy follows it: the best of a batch of places around the best one takes its place, their
-spread grows by a gain and shrinks by none (Rechenberg, Evolutionsstrategie, 1973).
+Such a minimum often lies on the edge of a jump, where no slope leads along the edge. So at last an
+evolution strategy follows it. The best of a batch of points around the best one replaces it. Their
+spread grows after a gain and shrinks otherwise (Rechenberg, Evolutionsstrategie, 1973).
 
 A minimum whose likelihood ratio n ln(Σe²/Σe²₀) is below the square of the interval's quantile is
 inside the profile likelihood region (Venzon and Moolgavkar, Appl. Statist. 37 (1988) 87). With the
-curvature of the best, each such minimum holds the values within √(q² − ratio) standard errors, and
-the interval is from the least of all these to the largest. Of coloured residuals the ratio is too
-large by as much as the variance by s²(SᵀS)⁻¹ is too small.
+curvature of the best minimum, each one covers the values within √(q² − ratio) standard errors. The
+interval extends from the least to the largest of all these. With coloured residuals the likelihood
+ratio is inflated by the factor by which s²(SᵀS)⁻¹ underestimates the variance.
 
-A lag that is rounded to samples stays where it is: its standard error is from plateau to plateau,
-and where on one a search ends says nothing.
+A time lag that is rounded to samples is not moved. Its standard error is from plateau to plateau,
+and the position on a plateau where a search ends has no meaning.
 """
 
 from dataclasses import dataclass, replace
@@ -32,15 +32,15 @@ from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
-_ROUGHNESS_PLACES = 24  # places that tell whether the loss is rough
-_PLACES_PER_ROUND = 192  # places in a round
-_STARTS_PER_ROUND = 8  # of these: the lowest under the linear model
+_ROUGHNESS_PLACES = 24  # points that show whether the loss is rough
+_PLACES_PER_ROUND = 192  # points in a round
+_STARTS_PER_ROUND = 8  # of these: the lowest compared to the linear model
 _MAX_ROUNDS = 2
-_MAX_STEPS = 12  # of least squares from each place
+_MAX_STEPS = 12  # of least squares from each point
 _ROUGHNESS_TOLERANCE = (
-    0.5  # of the linear model's likelihood ratio: deviations that are no roughness
+    0.5  # of the linear model's likelihood ratio: smaller deviations are no roughness
 )
-_BATCH_SIZE = 32  # places around the best one
+_BATCH_SIZE = 32  # points around the best one
 _FIRST_SPREAD, _LAST_SPREAD = (
     0.5,
     1e-3,
@@ -54,14 +54,14 @@ _GAIN_TOLERANCE = 1e-9  # relative
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMinima:
-    """What was found beside an estimate.
+    """Minima near an estimate.
 
     Attributes
     ----------
-    best : Refined or None
-        A better minimum; None where the estimate is the best.
+    best : RefinedCandidate or None
+        A better minimum; None if the estimate is the best.
     values : FloatArray, shape (m, D)
-        All minima, the estimate first; no others where the loss is as the linear model says.
+        All minima, the estimate first; only the estimate if the loss agrees with the linear model.
     rms : FloatArray, shape (m,)
     evaluations : int
     """
@@ -73,9 +73,9 @@ class LocalMinima:
 
 
 def count_affordable_simulations(problem: Problem, is_late: bool) -> int:
-    """Simulations that may be spent beside an estimate, fewer the longer one takes.
+    """Count the simulations affordable near an estimate: fewer, the longer one takes.
 
-    By the steps of a simulation, not by the clock, so that the same run has the same result.
+    The cost is measured in integration steps, not by the clock, so equal runs give equal results.
     """
     steps = sum(
         experiment.grid.points * experiment.grid.substeps for experiment in problem.experiments
@@ -92,7 +92,7 @@ def find_local_minima(
     seed: int,
     max_simulations: int | None = None,
 ) -> LocalMinima:
-    """Look for minima around an estimate (D,) with a linear model, in at most `left` runs."""
+    """Search for minima around an estimate (D,) with at most `max_simulations` simulations."""
     search = _LocalSearch(
         problem, linear, seed, 2**62 if max_simulations is None else max_simulations
     )
@@ -104,7 +104,7 @@ def find_local_minima(
             minima += ends
             reached = min((best, *ends), key=lambda candidate: candidate.rms)
             gains = reached.rms < best.rms * (1.0 - _GAIN_TOLERANCE)
-            best = reached  # also where it is lower by rounding only: what follows ends the lowest
+            best = reached  # also if lower by rounding only: the last minimum is the lowest
             if not gains or best.rms == 0:
                 break
         minima.append(search.run_evolution_strategy(best) if best.rms > 0 else best)
@@ -119,7 +119,7 @@ def find_local_minima(
 
 
 class _LocalSearch:
-    """Places drawn around an estimate and what is found from there, counting simulations."""
+    """Search from points drawn around an estimate, counting simulations."""
 
     def __init__(self, problem: Problem, linear: LinearOutputModel, seed: int, budget: int) -> None:
         self._problem, self._budget, self.evaluations = problem, budget, 0
@@ -128,14 +128,14 @@ class _LocalSearch:
         self.root = factor_covariance(linear.covariance)
 
     def is_rough(self, centre: RefinedCandidate) -> bool:
-        """Whether losses around differ from those of the linear model; no, if none can be had."""
+        """Whether losses around differ from the linear model; no, if the budget is spent."""
         if self._budget - self.evaluations < _ROUGHNESS_PLACES:
             return False
         _, _, expected, beyond = self._draw_places(centre, _ROUGHNESS_PLACES)
         return bool(np.any(~(np.abs(beyond) <= _ROUGHNESS_TOLERANCE * np.maximum(expected, 1.0))))
 
     def refine_starts(self, centre: RefinedCandidate) -> list[RefinedCandidate]:
-        """What least squares makes of the most promising places around."""
+        """Refine the most promising points around by least squares."""
         count = min(_PLACES_PER_ROUND, (self._budget - self.evaluations) // 2)
         if count < _ROUGHNESS_PLACES:
             return []
@@ -151,7 +151,7 @@ class _LocalSearch:
         return ends
 
     def run_evolution_strategy(self, centre: RefinedCandidate) -> RefinedCandidate:
-        """The best that batches of places around the best one lead to."""
+        """Follow the best point by batches of points around it."""
         theta, rms, size = centre.theta, centre.rms, _FIRST_SPREAD
         while size > _LAST_SPREAD and self._budget - self.evaluations >= _BATCH_SIZE:
             sizes = size * np.exp(self._random.uniform(-1.5, 0.5, _BATCH_SIZE))
@@ -166,7 +166,7 @@ class _LocalSearch:
     def _draw_places(
         self, centre: RefinedCandidate, count: int
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Places, their RMS, the likelihood ratio expected there, and by how much it is more."""
+        """Draw points; return them, their RMS, the expected likelihood ratio and its excess."""
         starts, values = self._simulate_moves(
             centre.theta, _DRAW_DEVIATIONS[np.arange(count) % _DRAW_DEVIATIONS.size]
         )
@@ -179,7 +179,7 @@ class _LocalSearch:
     def _simulate_moves(
         self, theta: FloatArray, sizes: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Places that many standard errors away, inside the bounds, and their RMS."""
+        """Simulate points that many standard errors away, inside the bounds; with their RMS."""
         moves = sizes[:, None] * self._random.standard_normal((sizes.size, theta.size))
         evaluator = self._problem.evaluator
         starts = np.maximum(theta + moves @ self.root.T, evaluator.lower)
@@ -195,9 +195,9 @@ def widen_intervals(
     minima: LocalMinima,
     variance_ratio: FloatArray,
 ) -> tuple[Estimate, ...]:
-    """Estimates whose intervals hold those of all minima that the data do not rule out.
+    """Widen intervals so that they contain those of all minima that the data do not rule out.
 
-    `share` (D,) is that of `LinearOutputModel`, of the parameters of these names.
+    `variance_ratio` (D,) is that of `LinearOutputModel`, for the parameters `names`.
     """
     least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,28 +1,24 @@
-"""Whether a model forgets where it began.
+"""Choose the noise model for ``auto``: least squares, or generalised least squares (ar1).
 
-The outputs of a lag of some time constant, or of a damped oscillator, do not depend on states of
-long ago. Those of an integrator do for ever: a drive's position, a tank's level, whatever has a
-pole at 0. In these a disturbance of a moment stays in all later outputs, and the error of a free
-run drifts by its nature.
+Coloured residuals are noise or missing dynamics, and the residuals alone do not show which. The
+choice depends on whether the model integrates, that is, whether initial errors persist.
 
-It is looked at where the model is: the start of one state after the other is moved a little, and
-the free run made again. A model remembers where all through the last quarter of a record more than
-a twentieth is left of the largest change, with one sign: a first-order lag with a time constant of
-more than a third of the record, too. Of several experiments all have to say so: a lag of seconds is
-forgotten, though one of them may end before. The phase of an oscillation that sustains itself, and
-chaos, are not forgotten either, but that is no drift.
+The outputs of a first-order lag or a damped oscillator do not depend on states of long ago. Those
+of an integrator do for ever: a drive's position, a tank's level, any system with a pole at 0. A
+short disturbance stays in all later outputs, so the residuals of a free run drift even if the
+dynamics are right. Least squares weighs this drift, so generalised least squares is better there.
+In a model that does not integrate, least squares is the better criterion for a free run: whitened
+residuals shift missing dynamics to low frequencies. Simulated plants of 17 kinds confirm this
+(decision 26, as amended).
 
-The noise model ``auto``: squares or generalised least squares, by whether the model forgets.
+The test perturbs the start of one state after the other and simulates again. An output integrates
+if more than a twentieth of the largest change is left throughout the last quarter of the record,
+with one sign. A first-order lag passes too if its time constant exceeds a third of the record. All
+experiments must agree, because one of them may be too short to forget a lag of seconds. The phase
+of a self-sustained oscillation, and chaos, persist as well, but that is no drift.
 
-Coloured residuals are noise or dynamics that the model lacks, and they do not tell which. In a
-model that forgets (`sysid.identification.noise_model_choice`) squares are the better criterion for
-a free run: whitened ones shift what is missing to low frequencies. In one that does not, whatever
-disturbs the states stays in all later outputs, so that residuals drift also where the dynamics are
-right, and squares weigh the drift. Simulated plants of 17 kinds bear it out (decision 26, as
-amended).
-
-The correlation time has to be known, too: where a record is not five times as long, generalised
-least squares was no better than squares.
+The correlation time must be resolved as well. Where a record is not five times as long,
+generalised least squares was no better than least squares.
 """
 
 from collections.abc import Callable
@@ -45,17 +41,17 @@ from sysid.simulation.evaluator import predict_population
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
-_CHANGE_SIZE = 1e-3  # of the outputs' size: the change that is looked at
-_CHANGE_TOLERANCE = 3.0  # factor by which it may be another
+_CHANGE_SIZE = 1e-3  # of the outputs' size: change that a perturbation should cause
+_CHANGE_TOLERANCE = 3.0  # factor by which it may differ
 MAX_TRIES = 8
-"""Simulations for each state, at most."""
-_MOVE_FACTOR = 1e4  # where a move shows nothing: states have units of their own
+"""Most simulations for each state."""
+_MOVE_FACTOR = 1e4  # growth of a perturbation without effect: states have different units
 _LASTING_SHARE = 0.05  # of the largest change
-_LATE_PART = 0.75  # of a record: behind it the change is looked for
+_LATE_PART = 0.75  # of a record: the change is measured after it
 
 
 def find_integrating_outputs(problem: Problem, theta: FloatArray) -> set[str]:
-    """Outputs in which a shift by the start of some state lasts up to the end of a record.
+    """Find outputs in which a shifted start of some state persists to the end of the record.
 
     Parameters
     ----------
@@ -73,11 +69,11 @@ def find_integrating_outputs(problem: Problem, theta: FloatArray) -> set[str]:
 def _perturb_state(
     problem: Problem, theta: FloatArray, before: FloatArray, state: int
 ) -> FloatArray | None:
-    """What a move of a state's start makes of the weighted outputs (M,); None: nothing."""
+    """Change of the weighted outputs (M,) by a shifted start of a state; None: no change."""
     size = problem.output_scale
     move, weight = _CHANGE_SIZE * size, problem.evaluator.weight
     for _ in range(MAX_TRIES):
-        with np.errstate(all="ignore"):  # what diverges from where it is moved to
+        with np.errstate(all="ignore"):  # a shifted start may diverge
             change = weight * (_simulate_shifted_start(problem, theta, state, move) - before)
             largest = float(np.max(np.abs(change)))
         if not np.isfinite(largest):
@@ -98,7 +94,7 @@ def _perturb_state(
 def _simulate_shifted_start(
     problem: Problem, theta: FloatArray, state: int, move: float
 ) -> FloatArray:
-    """Outputs (M,) where a state starts elsewhere, in every experiment."""
+    """Simulate outputs (M,) with the start of a state shifted in every experiment."""
     evaluator, layout = problem.evaluator, ExperimentLayout.from_model(problem.model)
     floats, template, values = evaluator.floats.copy(), evaluator.template.copy(), theta.copy()
     for experiment, (ints, first, _) in zip(
@@ -117,7 +113,7 @@ def _simulate_shifted_start(
 
 
 def _find_lasting_changes(problem: Problem, change: FloatArray) -> set[str]:
-    """Outputs shifted one way at the end of every experiment, beside its largest change of all."""
+    """Find outputs with one sign of change at the end of every experiment."""
     lasts: dict[str, bool] = {}
     weights = problem.split_by_output(problem.evaluator.weight)
     for changes, weight in zip(problem.split_by_output(change), weights, strict=True):
@@ -131,7 +127,7 @@ def _find_lasting_changes(problem: Problem, change: FloatArray) -> set[str]:
     return {name for name, is_left in lasts.items() if is_left}
 
 
-_MIN_RECORD_TIMES = 5.0  # correlation times that a record lasts at least
+_MIN_RECORD_TIMES = 5.0  # least length of a record, in correlation times
 
 
 def is_ar1_indicated(
@@ -141,11 +137,11 @@ def is_ar1_indicated(
     is_late: Callable[[], bool] | None = None,
     max_simulations: int | None = None,
 ) -> bool:
-    """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
+    """Whether least-squares residuals at theta (D,) are coloured and the model integrates.
 
-    The analysis of those estimates tells the colour: no more is looked at where it is white. What
-    comes of too long a step of the integration is no noise. `most` are the simulations that the
-    time leaves: where the look may take more there is none.
+    The analysis of the estimates gives the colour; white residuals end the test. Errors of too
+    long an integration step are not noise. If the test may need more than `max_simulations`, the
+    answer is no.
     """
     uncertainty = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
@@ -163,7 +159,7 @@ def is_ar1_indicated(
 def confirm_noise_model(
     problem: Problem, theta: FloatArray, estimate: GeneralisedEstimate
 ) -> GeneralisedEstimate:
-    """What was found under first-order noise, or squares again where it is not known well."""
+    """Return the estimate under first-order noise, or least squares if it is not resolved."""
     longest: dict[str, float] = {}
     for part in iterate_parts(problem):
         span = float(part.times[-1] - part.times[0])
@@ -181,7 +177,7 @@ def confirm_noise_model(
 
 
 def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem:
-    """The problem with the noise model that its estimates are of, in place of ``auto``."""
+    """Replace the noise model ``auto`` of a problem by the one that was selected."""
     if problem.loss.noise_model != "auto":
         return problem
     noise_model: NoiseModel = "ar1" if any(noise.correlation_times.values()) else "white"
@@ -190,7 +186,7 @@ def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem
 
 
 def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> tuple[str, ...]:
-    """Why there is a noise model that nobody asked for, and what squares gave; or why not."""
+    """Explain why ``auto`` selected a noise model and what least squares gave; or why not."""
     if noise.unresolved_times:
         times = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
         return (

@@ -1,4 +1,4 @@
-"""What an identification gives: estimates with their uncertainty, and the evidence."""
+"""Result of an identification: estimates with their uncertainty, and the evidence."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,17 +18,30 @@ from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 class Identification:
     """The result of one identification.
 
-    `rms` is J of Eq. 10 over all scored samples, in the output's unit when there is one output
-    (else in units of the outputs' standard deviations). `history` has one tuple of improvements
-    per island. `simulated` has per experiment, per output, the model's output at the measured
-    times. `fit_percent_validation` and `rms_validation` are None without validation data.
-    `agreement` and `agreement_validation` tell each output of each experiment on its own.
-    `selection` has the terms that were selected, if the model asked for it. `correlation_times`
-    (s) are those of each output's noise, where the noise model found any. `holds` tells what the
-    inputs of the first experiment did between their samples, `sample_time` (s) how all outputs
-    were sampled; None where that was not regular, or not the same. `known_before` and
-    `known_before_validation` tell of every experiment for how long (s) before its start the inputs
-    are known; further back their first value is taken to have stood.
+    Attributes
+    ----------
+    rms : float
+        J of Eq. 10 over all scored samples. In the output's unit if there is one output, else in
+        units of the outputs' standard deviations.
+    rms_validation, fit_percent_validation : float or None
+        None without validation data.
+    history : tuple
+        One tuple of improvements per island.
+    simulated, simulated_validation : tuple
+        Model output at the measured times, per experiment and output.
+    agreement, agreement_validation : tuple of ChannelMetrics
+        Metrics of each output of each experiment.
+    selection : tuple of SelectedTerm
+        Selected terms, if the model requests a selection.
+    correlation_times : mapping of str to float
+        Correlation time (s) of each output's noise, where the noise model has one.
+    holds : mapping of str to Hold
+        Behaviour of the inputs of the first experiment between their samples.
+    sample_time : float or None
+        Sampling period (s) of all outputs; None if irregular or not the same for all.
+    known_before, known_before_validation : tuple of float
+        Time (s) before the start of each experiment for which the inputs are recorded. Before
+        that, the first value is assumed.
     """
 
     estimates: tuple[Estimate, ...]
@@ -60,5 +73,5 @@ class Identification:
 
     @property
     def noise_model(self) -> Literal["white", "ar1"]:
-        """The noise model that the estimates are of."""
+        """Noise model under which the estimates were made."""
         return "ar1" if any(self.correlation_times.values()) else "white"

@@ -1,9 +1,9 @@
-"""One run as a value that goes on from wherever it was cut: begin, advance, conclude.
+"""One run as a value that can continue from any cut: begin, advance, conclude.
 
-The result does not depend on where a run is cut, nor on which process evolves which island:
-islands evolve alone up to the next *border*, and only there do they exchange migrants and is it
-decided whether the run has ended. The clock decides when to stop, never what is computed; it is
-read here and nowhere else in this package.
+The result does not depend on where a run is cut, nor on which process evolves which island.
+Islands evolve alone up to the next *border*. Only there they exchange migrants, and the end
+conditions are checked. The clock decides when to stop, never what is computed. It is read here and
+nowhere else in this package.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 CALL_SECONDS = 0.1
-"""Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
+"""Target duration of one compiled call, so that a cancel takes effect in time."""
 
 FIRST_CALL_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
 
@@ -48,11 +48,11 @@ def begin_run(
     seed: int,
     warm: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> RunState:
-    """A run before its first generation; `warm`: parameter values that seed a quarter of it.
+    """Create a run before its first generation; `warm` values seed a quarter of the population.
 
-    The improved search of a polynomial is seeded by least squares one step ahead, too. Values of
-    all free parameters are taken for an earlier result, behind which a run settles sooner; those
-    of some of them seed the search, and no more.
+    The improved search of a polynomial is also seeded by one-step least squares. Values of all
+    free parameters count as an earlier result, after which a run settles sooner. Values of only
+    some parameters just seed the search.
     """
     warm_starts = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     warm_starts = tuple(values for values in warm_starts if values)
@@ -67,7 +67,7 @@ def begin_run(
 
 
 def find_next_border(algorithm: GeneticAlgorithm, state: RunState) -> int:
-    """The generation up to which every island evolves alone."""
+    """Compute the generation up to which every island evolves alone."""
     step = get_border_interval(algorithm, is_warm=state.is_warm)
     return compute_next_border(
         state.generation, step, algorithm.migration.every, algorithm.generations
@@ -77,7 +77,7 @@ def find_next_border(algorithm: GeneticAlgorithm, state: RunState) -> int:
 def advance_island(
     problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int
 ) -> Island:
-    """The island after some generations, fewer where it comes to rest."""
+    """Evolve an island for some generations, fewer if it comes to rest."""
     plan = make_plans(problem, algorithm, island.seed)[island.index]
     return evolve(problem.evaluator, plan, island, generations)
 
@@ -85,7 +85,7 @@ def advance_island(
 def exchange_migrants(
     algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Island]
 ) -> RunState:
-    """The run at the next border, when all its islands have got there: migrate, look at the end."""
+    """Exchange migrants at the next border, and check the end conditions."""
     generation = find_next_border(algorithm, state)
     state = replace(state, islands=tuple(islands), generation=generation)
     if generation % algorithm.migration.every == 0 and len(islands) > 1:
@@ -116,9 +116,9 @@ def advance_run(
     seconds: float | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> RunState:
-    """Go on until an end condition holds, `seconds` are used up, or `should_stop` says so.
+    """Continue until an end condition holds, `seconds` are used up, or `should_stop` is true.
 
-    `should_stop` is asked between compiled calls, about every 0.1 s.
+    `should_stop` is called between compiled calls, about every 0.1 s.
     """
     plan = make_search_plan(problem, algorithm, state.seed, is_warm=state.is_warm)
     size = algorithm.population // algorithm.n_islands
@@ -153,14 +153,14 @@ def advance_run(
 
 
 def _count_generations(state: RunState) -> int:
-    """Generations of all islands together."""
+    """Count the generations of all islands together."""
     return sum(island.generation for island in state.islands)
 
 
 class _CallBudget:
-    """How many generations one compiled call may run, and when to stop, by the clock.
+    """Generations per compiled call, and the time to stop, by the clock.
 
-    `first`: those of the first call, before anything is measured.
+    `first` is the number of generations of the first call, before any measurement.
     """
 
     def __init__(
@@ -184,14 +184,14 @@ class _CallBudget:
         return self._before + perf_counter() - self._start
 
     def is_over(self) -> bool:
-        """Whether to stop; at least one call is made, so that every advance advances."""
+        """Whether to stop; at least one call is always made, so every advance makes progress."""
         stopped = self._should_stop is not None and self._should_stop()
         return stopped or (self._calls > 0 and self._last - self._start >= self._end)
 
     def count_affordable_generations(self, wanted: int) -> int:
-        """Generations for the next call: as many as are left, or as the time allows; one at least.
+        """Count the generations of the next call: those left, or those the time allows.
 
-        No time at all stands for the least that can be done.
+        At least one, even if no time is left.
         """
         left = min(CALL_SECONDS, self._start + self._end - self._last)
         if left <= 0:

@@ -1,12 +1,13 @@
-"""Whether estimates hang on input that nobody recorded.
+"""Test whether the estimates depend on input from before the record.
 
-For t < L a model reads the input from before the record's first sample. Where nothing is known of
-it, its first value is taken to have stood there, which is right for a plant at rest and a guess for
-a record that begins in the middle of things. Without the samples that read it the estimate would
-move by -(S'ᵀS')⁻¹S'ᵀe', S' and e' being the sensitivities and residuals of the others (one step of
-Gauss and Newton; Cook 1977). Of two estimates, one from a part of the data of the other, the
-difference has the difference of their variances (Hausman 1978): a move that is far larger says that
-these samples do not fit the others. Only then the estimate is found anew without them, to be told.
+For t < L a model reads the input from before the record's first sample. If that was not recorded,
+its first value is assumed. This is right for a plant at rest, and a guess for any other record.
+
+Without the samples that read the assumed input, the estimate would move by -(S'ᵀS')⁻¹S'ᵀe'. Here
+S' and e' are the sensitivities and residuals of the other samples (one Gauss-Newton step; Cook
+1977). If one estimate uses a part of the data of another, the variance of their difference is the
+difference of their variances (Hausman 1978). A far larger move shows that these samples do not fit
+the others. Only then is the model fitted again without them, and the move is reported.
 """
 
 import numpy as np
@@ -30,7 +31,7 @@ _MAX_STEPS = 30  # of least squares, with as many simulations as there are param
 
 
 def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
-    """What to say of estimates that are others without the samples that read an assumed input."""
+    """Warn about estimates that change without the samples that read an assumed input."""
     if (
         analysis.residuals_and_sensitivities is None
         or analysis.linear_model is None
@@ -40,7 +41,7 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
     if analysis.is_cut_short:
         return []  # the time is over
     if not all(isinstance(one, EstimatedInitial) for one in problem.model.initial):
-        return []  # a start that is given carries the effect of the guess into the other samples
+        return []  # a fixed start carries the effect of the assumption into the other samples
     parts = find_assumed_samples(problem, analysis)
     assumed = np.concatenate(parts)[problem.scored_rows]
     count = int(np.count_nonzero(assumed))
@@ -64,7 +65,7 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
 
 
 def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
-    """Of every output of every experiment, which samples read an input of before what is known."""
+    """Mark the samples of every output that read an input from before its recorded part."""
     return [
         channel.times < until
         for record, until in zip(
@@ -80,7 +81,7 @@ def _order_outputs(problem: Problem, record: Record) -> list[Channel]:
 
 
 def _find_recorded_starts(problem: Problem, analysis: Analysis) -> list[float]:
-    """For each experiment the time (s) from which on only recorded inputs are read."""
+    """Find the time (s) in each experiment from which only recorded inputs are read."""
     reach = _compute_longest_input_delay(problem, analysis)
     return [
         experiment.grid.start + reach - record.history_duration
@@ -89,7 +90,7 @@ def _find_recorded_starts(problem: Problem, analysis: Analysis) -> list[float]:
 
 
 def _compute_longest_input_delay(problem: Problem, analysis: Analysis) -> float:
-    """How far (s) the estimated lags of inputs reach back."""
+    """Compute how far (s) the estimated time lags of inputs reach back."""
     if not list_delayed_values(problem.model, "input"):
         return 0.0
     spans = {one.name: (one.value, one.value) for one in analysis.estimates}
@@ -102,7 +103,7 @@ def _compute_longest_input_delay(problem: Problem, analysis: Analysis) -> float:
 
 
 def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> bool:
-    """Whether one step without these samples moves an estimate by far more than chance would."""
+    """Whether a step without these samples moves an estimate by far more than chance."""
     if analysis.residuals_and_sensitivities is None:
         return False
     error, columns = analysis.residuals_and_sensitivities
@@ -120,7 +121,7 @@ def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> boo
 
 
 def _select_identified(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
-    """The estimates in the order of the free parameters (D,); None of starts, and of vague ones."""
+    """List the identified estimates in the order of the free parameters (D,); None for others."""
     names = {estimate.name for estimate in problem.model.parameters}
     by_name = {
         estimate.name: estimate
@@ -136,7 +137,7 @@ def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
 
 
 def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
-    """The estimate (D,) from the other samples, from where it is; itself if there is none."""
+    """Fit the other samples, from the estimate (D,) on; return the estimate if that fails."""
     theta = _to_theta(problem, analysis)
     scored_from = problem.settings.scored_from or [-np.inf] * len(problem.records)
     from_then = zip(_find_recorded_starts(problem, analysis), scored_from, strict=True)
@@ -151,7 +152,7 @@ def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
 
 
 def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
-    """Estimates that would be others, with their moves in standard errors."""
+    """Describe estimates that would change, with their moves in standard errors."""
     moves = []
     for estimate, value in zip(_select_identified(problem, analysis), end.tolist(), strict=True):
         if estimate is None or not estimate.stderr:
@@ -166,7 +167,7 @@ def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> li
 
 
 def _compute_variances(columns: FloatArray) -> FloatArray:
-    """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
+    """Compute the diagonal of (SᵀS)⁻¹, (D,); inf for parameters that these rows leave open."""
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
     _, singular, rows, retained = truncated_svd(triangle)
     variances: FloatArray = np.sum((rows[retained].T / singular[retained]) ** 2, axis=1)

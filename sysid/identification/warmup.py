@@ -1,4 +1,4 @@
-"""Compile what every search needs before the first one does, once for an installation."""
+"""Compile the search once for an installation, before its first use."""
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from sysid.models.catalogue.load import load_model
 
 
 def compile_search() -> None:
-    """Run the smallest search there is.
+    """Run a minimal search.
 
-    The search is one compiled function for all models; its machine code is kept on disk, so this
-    takes some twenty seconds after an installation or update and a moment otherwise.
+    The search is one compiled function for all models, and its machine code is stored on disk.
+    So this takes some twenty seconds after an installation or update, and a moment otherwise.
     """
     times = 0.1 * np.arange(40.0)
     step = np.where(times < 0.5, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What a user should be told about a result, in whole sentences."""
+"""Warnings about a result, in whole sentences."""
 
 from collections.abc import Mapping
 
@@ -24,18 +24,19 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
 
+# Correlations that are reported: of an insignificant time lag, and of other parameters.
 _RIDGE_CORRELATION, _STRONG_CORRELATION = (
     0.9,
     0.95,
-)  # of correlations, of a lag that may as well be 0, and of others
+)
 _HELD_SHARE = (
-    0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
+    0.5  # share of equal neighbouring samples from which an input counts as piecewise constant
 )
 _NOTABLE_GAIN = 0.01
-_SEPARABLE_STDERRS = 2.0  # standard errors: a lag on a ridge that is less than that
-_VAGUE_SHARE = 0.5  # of its value: standard error of a group of which next to nothing is known
+_SEPARABLE_STDERRS = 2.0  # standard errors: a smaller time lag is insignificant
+_VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practically unidentifiable
 _WHITENESS_LEVEL = (
-    1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
+    1e-3  # probability of such residuals under a true model, below which a warning is given
 )
 _ROUNDING_SHARE = 1e-9  # of the output: below, the residual is rounding and has no optimum
 
@@ -58,7 +59,7 @@ def collect_warnings(
     rms: float,
     tests: ResidualTests | None = None,
 ) -> tuple[str, ...]:
-    """All warnings, the weightiest first; `tests` are those of the residuals."""
+    """Collect all warnings, the most important first; `tests` are those of the residuals."""
     messages = []
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
@@ -101,7 +102,7 @@ def collect_warnings(
 
 
 def _warn_active_bounds(analysis: Analysis) -> list[str]:
-    """Bounds too narrow for the data, and which of them to widen."""
+    """Warn about bounds that are too narrow for the data, and say which to widen."""
     if not analysis.active_bounds:
         return []
     first, *others = analysis.active_bounds
@@ -111,9 +112,9 @@ def _warn_active_bounds(analysis: Analysis) -> list[str]:
 
 
 def _warn_held_inputs(problem: Problem) -> list[str]:
-    """Inputs that look held between samples, but are read as straight lines.
+    """Warn about inputs that look held between samples, but are interpolated linearly.
 
-    A jump read as a ramp over one sample moves the estimate of a lag by half a sample.
+    A jump read as a ramp over one sample moves the estimate of a time lag by half a sample.
     """
     if is_difference(problem.model):
         return []  # a recursion reads inputs at the samples only
@@ -132,7 +133,7 @@ def _warn_held_inputs(problem: Problem) -> list[str]:
 
 
 def _warn_early_response(problem: Problem) -> list[str]:
-    """Records of a lagged input whose output leaves its rest while no input has moved."""
+    """Warn about records whose output leaves its rest before any input has moved."""
     if not list_delayed_values(problem.model, "input"):
         return []
     messages = []
@@ -149,7 +150,7 @@ def _warn_early_response(problem: Problem) -> list[str]:
 
 
 def _warn_no_prediction(problem: Problem) -> list[str]:
-    """Whether predictions one step ahead are asked for of a model that reads no measured output."""
+    """Warn if one-step predictions are requested of a model that reads no measured output."""
     if problem.prediction == "simulation" or reads_outputs(problem.model):
         return []
     names = ", ".join(output.name for output in problem.model.outputs)
@@ -160,7 +161,7 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
 
 
 def _warn_constant_outputs(problem: Problem) -> list[str]:
-    """Outputs whose scored samples are all the same, in every experiment."""
+    """Warn about outputs whose scored samples are all equal, in every experiment."""
     measured = problem.split_by_output(problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
     messages = []
@@ -178,7 +179,7 @@ def _warn_constant_outputs(problem: Problem) -> list[str]:
 
 
 def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
-    """Whether straight lines through the outputs would fit better than the model does."""
+    """Warn if a straight line through an output fits better than the model."""
     measured = problem.split_by_output(problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
     models = problem.split_by_output(simulated)
@@ -228,9 +229,9 @@ def _warn_unidentified(estimate: Estimate) -> str:
 
 
 def _warn_insignificant(estimate: Estimate) -> str:
-    """Of a quantity that cannot be negative, and that may as well be 0.
+    """Warn about a quantity that cannot be negative and is not distinguishable from 0.
 
-    Where both signs are allowed (an offset, an initial state) 0 is a value like any other.
+    Where both signs are allowed (an offset, an initial state), 0 is a value like any other.
     """
     if estimate.status != "identified" or not estimate.stderr or estimate.lower < 0:
         return ""
@@ -253,7 +254,7 @@ def _warn_vague_group(group: IdentifiableCombination) -> str:
 
 
 def find_delay_parameters(problem: Problem) -> set[str]:
-    """Names of the parameters that lags are made of."""
+    """Find the names of the parameters that time lags depend on."""
     past_values = [
         *list_delayed_values(problem.model, "input"),
         *list_delayed_values(problem.model, "state"),
@@ -268,10 +269,11 @@ def find_delay_parameters(problem: Problem) -> set[str]:
 def _warn_correlations(
     uncertainty: Uncertainty, estimates: tuple[Estimate, ...], delay_names: set[str]
 ) -> list[str]:
-    """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
+    """Warn about strongly correlated estimates.
 
-    Coloured residuals turn the ellipsoid of the estimates; what one sensitivity makes up for in
-    another stays. Of parameters that have no standard error their groups tell.
+    A time lag that is not distinguishable from 0 is not separable from a correlated parameter.
+    Coloured residuals turn the ellipsoid of the estimates, but the correlation of the
+    sensitivities stays. Parameters without a standard error are described by their groups.
     """
     without_stderr = {e.name for e in estimates if e.stderr is None}
     insignificant = {
@@ -315,14 +317,14 @@ def _warn_coloured_residuals(
     *,
     may_be_noise: bool,
 ) -> list[str]:
-    """Residuals that are clearly not white: the model lacks something, most often an order.
+    """Warn about residuals that are clearly not white: dynamics are missing, often an order.
 
-    A lag makes up for an order that is missing. Of whether the tests are passed the result tells
-    by itself; a true model fails them often enough that a warning asks for more. Residuals that
-    depend on an input contain dynamics, which no noise model is for; those that do not may be slow
-    noise (Ljung, System Identification, 2nd ed., ch. 16.6). On validation data alone the errors of
-    the estimates do the same as dynamics that are missing: nothing is wrong with the standard
-    errors then.
+    A time lag compensates for a missing order. The result itself reports whether the tests are
+    passed. A true model fails them often enough, so a warning needs stronger evidence. Residuals
+    that depend on an input contain dynamics, and no noise model describes these. Residuals that
+    do not may be slow noise (Ljung, System Identification, 2nd ed., ch. 16.6). On validation data
+    alone, errors of the estimates look the same as missing dynamics. The standard errors are
+    correct then.
     """
     if all(
         test.kind != "whiteness" or test.p is None or test.p > _WHITENESS_LEVEL
@@ -354,7 +356,7 @@ def _warn_coloured_residuals(
 
 
 def warn_time_limit(is_cut_short: bool) -> tuple[str, ...]:
-    """What refinement left out because the time was over."""
+    """Warn if the time limit ended the refinement."""
     if not is_cut_short:
         return ()
     return (
@@ -367,7 +369,7 @@ def warn_time_limit(is_cut_short: bool) -> tuple[str, ...]:
 def warn_noise_model(
     problem: Problem, correlation_times: Mapping[str, float], is_complete: bool
 ) -> tuple[str, ...]:
-    """What a noise model did, or why it did nothing."""
+    """Describe the effect of the noise model, or why it had none."""
     if problem.loss.noise_model != "ar1":
         return ()
     times = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
@@ -390,7 +392,7 @@ def warn_noise_model(
 
 
 def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
-    """Inputs that stay constant in every record, and what they leave open."""
+    """Warn about inputs that are constant in every record, and parameters they leave open."""
     unidentified = ", ".join(
         e.name for e in estimates if e.status in ("group", "unidentifiable") and e.stderr is None
     )

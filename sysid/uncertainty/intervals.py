@@ -1,4 +1,4 @@
-"""From the local analysis to what is told of each parameter: free, fixed and tied ones."""
+"""Estimates of free, fixed and tied parameters from the local analysis."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -20,7 +20,7 @@ _MAX_NAMED_GROUPS = 4  # groups that a reason names
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalStatistics:
-    """What the analysis found.
+    """Result of the local analysis.
 
     Attributes
     ----------
@@ -28,17 +28,17 @@ class LocalStatistics:
     statuses : tuple of EstimateStatus
     covariance : FloatArray, shape (D, D)
         In the parameters' units.
-    quantile : FloatArray, shape (D,)
+    t_quantile : FloatArray, shape (D,)
         Of the t distribution, for 95 %.
-    blind : BoolArray, shape (D,)
+    lacks_stderr : BoolArray, shape (D,)
         Parameters without a standard error.
-    groups : tuple of Group
-    null : FloatArray, shape (m, D)
-        Directions without effect, over the places.
+    groups : tuple of IdentifiableCombination
+    null_directions : FloatArray, shape (m, D)
+        Directions without effect, in unit coordinates p.
     scale : FloatArray, shape (D,)
-        ∂θ/∂p of the places p.
+        ∂θ/∂p.
     reason : str
-        Why there is no standard error of any; empty where there is.
+        Why no parameter has a standard error; empty if some have one.
     """
 
     theta: FloatArray
@@ -53,7 +53,7 @@ class LocalStatistics:
 
 
 def make_estimates(problem: Problem, statistics: LocalStatistics) -> tuple[Estimate, ...]:
-    """All parameters in the problem's order."""
+    """Make the estimates of all parameters in the problem's order."""
     free = {
         p.name: _make_free_estimate(p, statistics, d) for d, p in enumerate(problem.free_parameters)
     }
@@ -93,7 +93,7 @@ def _make_fixed_or_tied_estimate(
 def _linearise_tie(
     problem: Problem, tree: Expression, theta: FloatArray, scale: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Value of a tied parameter, and its slopes in the free ones by central differences."""
+    """Compute a tied parameter and its slopes in the free ones, by central differences."""
     fixed_values = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
 
     def evaluate_at(values: FloatArray) -> float:
@@ -115,14 +115,11 @@ def _explain_status(
     lacks_stderr: bool,
     groups: tuple[IdentifiableCombination, ...],
 ) -> str:
-    """Why there is no standard error, or what to think of it."""
+    """Explain why there is no standard error, or its limits."""
     if status == "group":
         expressions = [group.expression for group in groups if name in group.members]
-        others = (
-            f": {', '.join(expressions[:_MAX_NAMED_GROUPS])}{', …' if len(expressions) > _MAX_NAMED_GROUPS else ''}"
-            if expressions
-            else ""
-        )
+        more = ", …" if len(expressions) > _MAX_NAMED_GROUPS else ""
+        others = f": {', '.join(expressions[:_MAX_NAMED_GROUPS])}{more}" if expressions else ""
         if lacks_stderr:
             return f"only a combination with other parameters has an effect on the output{others}"
         return (

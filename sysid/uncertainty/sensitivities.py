@@ -1,14 +1,15 @@
-"""How the simulated output moves with each free parameter, also where it moves in jumps.
+"""Sensitivities of the simulated output to each free parameter, also across jumps.
 
-Where the sign of a velocity flips one sample earlier, the output jumps. A difference across such a
-jump is as large as its step is small, and a standard error made of it far too small; searches end
-beside jumps, since the loss jumps too. So where the slopes to both sides disagree, each side is cut
-into segments from 1e-6 to 1e-2 of the range, and the slopes of two neighbours that agree are taken.
+If the sign of a velocity changes one sample earlier, the output jumps. A difference quotient across
+such a jump grows as its step shrinks, and a standard error from it is far too small. Searches end
+near jumps, because the loss jumps too. So if the slopes to both sides disagree, each side is
+divided into segments from 1e-6 to 1e-2 of the range. The slopes of two neighbouring segments that
+agree are used.
 
-A lag that is rounded to whole samples (nearest interpolation) leaves the output unchanged on a
-*plateau* and changes it at the plateau's ends. A small difference says nothing there: it is zero,
-or as large as the step is small. So each side is searched for the nearest jump, and the slope is
-taken from the middle of the plateau below to the middle of the plateau above.
+A time lag that is rounded to whole samples (nearest interpolation) leaves the output unchanged on a
+*plateau* and changes it at the plateau's ends. A small difference is useless there: it is zero, or
+grows as its step shrinks. So each side is searched for the nearest jump. The slope is taken from
+the middle of the plateau below to the middle of the plateau above.
 """
 
 from typing import NamedTuple
@@ -27,23 +28,23 @@ _STEP_GROWTH, _MAX_STEP = (
     4.0,
     0.7,
 )  # of the step of the search for a jump; the largest, of the range
-_HALVINGS = 6  # a jump's place is then known to about 1 % of its distance
+_HALVINGS = 6  # locate a jump to about 1 % of its distance
 
 
 class Sensitivities(NamedTuple):
-    """Weighted residuals and their slopes at an estimate, over the places in [0, 1].
+    """Weighted residuals and their slopes at an estimate, in unit coordinates p.
 
     Attributes
     ----------
-    error : FloatArray, shape (n,)
+    residuals : FloatArray, shape (n,)
     columns : FloatArray, shape (n, D)
-        ∂ŷ/∂p, weighted; zero where none is known.
-    plateau : FloatArray, shape (D,)
-        Width on which the output does not change with that parameter; 0: it changes at once.
+        ∂ŷ/∂p, weighted; zero if undefined.
+    plateau_width : FloatArray, shape (D,)
+        Width on which the output does not change with that parameter; 0: no plateau.
     one_sided : BoolArray, shape (D,)
-        The output changes on one side of the estimate only, and not at once: no slope.
-    middle : FloatArray, shape (D,)
-        How far above the estimate the middle of its plateau lies; 0 where there is none.
+        The output jumps on one side of the estimate only: no slope.
+    plateau_offset : FloatArray, shape (D,)
+        Distance from the estimate up to the middle of its plateau; 0: no plateau.
     evaluations : int
     """
 
@@ -56,9 +57,9 @@ class Sensitivities(NamedTuple):
 
 
 class BudgetSpentError(Exception):
-    """The simulations that were left do not suffice; `evaluations` of them were run.
+    """The budget of simulations does not suffice; `evaluations` of them were run.
 
-    `error` are the weighted residuals (n,) at the estimate, None where not even one was left.
+    `residuals` are the weighted residuals (n,) at the estimate; None if no simulation was left.
     """
 
     def __init__(self, evaluations: int, error: FloatArray | None) -> None:
@@ -69,12 +70,12 @@ class BudgetSpentError(Exception):
 def compute_sensitivities(
     problem: Problem, theta: FloatArray, max_simulations: int | None = None
 ) -> Sensitivities:
-    """Central differences at an estimate (D,); beside a bound one-sided.
+    """Compute sensitivities at an estimate (D,) by central differences; one-sided at a bound.
 
     Raises
     ------
     BudgetSpentError
-        If they take more than `most` simulations.
+        If they take more than `max_simulations` simulations.
     """
     probe = _OutputProbe(problem, theta, max_simulations)
     d = probe.place.size
@@ -107,11 +108,13 @@ def compute_sensitivities(
 def _compute_central_differences(
     predicted: FloatArray, steps: FloatArray, shifted: FloatArray
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Central differences (n, D); whether the output moves on both sides at once, whether unlike.
+    """Compute central differences (n, D), and compare both sides of each parameter.
+
+    Also returned: whether the output moves on both sides, and whether the slopes differ.
 
     Parameters
     ----------
-    here, beside : FloatArray, shape (n,), (n, 2D)
+    predicted, shifted : FloatArray, shape (n,), (n, 2D)
         Output at the estimate, and after `steps` (2D,) of each parameter down and then up.
     """
     d = steps.size // 2
@@ -137,7 +140,7 @@ def _compute_central_differences(
 
 
 def _estimate_slope_near_jumps(probe: "_OutputProbe", d: int) -> FloatArray:
-    """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
+    """Estimate the slope (n,) in one parameter: the mean of the sides that have one."""
     sides = [_estimate_side_slope(probe, d, side) for side in (-1.0, 1.0)]
     best = min(doubt for doubt, _ in sides)
     slopes = [slope for doubt, slope in sides if doubt <= max(best, _SLOPE_AGREEMENT)]
@@ -145,7 +148,7 @@ def _estimate_slope_near_jumps(probe: "_OutputProbe", d: int) -> FloatArray:
 
 
 def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[float, FloatArray]:
-    """How far the two neighbouring segments that agree best differ, and their slope (n,)."""
+    """Find the neighbouring segments that agree best: their difference and slope (n,)."""
     room = 1.0 - probe.place[d] if side > 0 else probe.place[d]
     ends = side * _SEGMENT_EDGES[room >= _SEGMENT_EDGES]
     if ends.size < 2:
@@ -161,7 +164,7 @@ def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[fl
 
 
 class _OutputProbe:
-    """The scored output beside an estimate, one parameter moved at a time."""
+    """Scored output near an estimate, with one parameter moved at a time."""
 
     def __init__(self, problem: Problem, theta: FloatArray, max_simulations: int | None) -> None:
         if max_simulations is not None and max_simulations < 1:
@@ -179,7 +182,7 @@ class _OutputProbe:
         return np.asarray(self.weight * (self.predicted - self.measured))
 
     def simulate_steps(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
+        """Simulate steps, cut off at the bounds: steps taken and outputs (n, len(which))."""
         if self._most is not None and self.evaluations + which.size > self._most:
             raise BudgetSpentError(self.evaluations, self.residuals)
         moved = np.clip(self.place[which] + steps, 0.0, 1.0)
@@ -191,9 +194,9 @@ class _OutputProbe:
         return moved - self.place[which], np.ascontiguousarray(scored.T)
 
     def find_jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
-        """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
+        """Find each parameter's nearest jump on one side: its distance and the outputs beyond it.
 
-        The distance is infinite where there is none.
+        The distance is infinite if there is no jump.
         """
         near, far = np.zeros(which.size), np.full(which.size, np.inf)
         beyond = np.repeat(self.predicted[:, None], which.size, axis=1)
@@ -214,7 +217,7 @@ class _OutputProbe:
         far: FloatArray,
         beyond: FloatArray,
     ) -> None:
-        """Narrow down each jump, in place, by the output at one more step of each parameter."""
+        """Narrow down each jump, in place, by one more simulation of each parameter."""
         open_ = np.flatnonzero((near < steps) & (steps < far))
         if open_.size == 0:
             return
