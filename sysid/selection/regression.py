@@ -1,9 +1,9 @@
 """The regression y(k) = Σ aᵢ · termᵢ(k) over measured past values, compressed to a triangle.
 
-Rows without a value somewhere (missing samples, those not scored, those before the longest lag)
-are left out; several experiments lie one below the other. All that follows needs only inner
-products of the columns, so the rows are folded into the triangular factor of a QR decomposition,
-block by block. That keeps full accuracy, where normal equations would keep half the digits.
+Rows with a missing value, unscored rows and rows before the longest lag are omitted. The rows of
+several experiments are stacked. Selection needs only inner products of the columns. So the rows are
+folded into the triangular factor of a QR decomposition, block by block. This keeps full accuracy;
+normal equations would lose half of the digits.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,9 +24,9 @@ from sysid.models.ties import collect_parameter_names
 from sysid.simulation.experiments import GridExperiment, place_on_grid
 
 BLOCK_ROWS = 4096
-"""Rows folded in at once."""
+"""Rows that are folded at once."""
 
-_WHOLE_TOLERANCE = 1e-9  # samples: nearer, a lag is a whole number of them
+_WHOLE_TOLERANCE = 1e-9  # samples: a lag nearer to a whole number is rounded
 
 PastReader = Callable[[PastValue], FloatArray]
 
@@ -38,12 +38,12 @@ class RegressionExperiment:
     Attributes
     ----------
     output : FloatArray, shape (points,)
-        The measured output at the grid points; nan where there is none.
+        The measured output at the grid points; nan where it is missing.
     inputs : mapping of str to FineInput
     period : float
         Sampling period in s.
     rows : IntArray
-        Grid points that are explained: scored, with a value, later than the longest lag.
+        Grid points to explain: scored, with a value, later than the longest lag.
     """
 
     output: FloatArray
@@ -54,7 +54,7 @@ class RegressionExperiment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """A polynomial's regression on some experiments, for any values of its lags."""
+    """Regression of a polynomial on experiments, for any values of its lags."""
 
     experiments: tuple[RegressionExperiment, ...]
 
@@ -62,20 +62,20 @@ class Regression:
     def from_records(
         cls, model: Model, records: Sequence[Record], parameters: Sequence[Parameter], skip: int = 0
     ) -> "Regression":
-        """Lay the records out, with a polynomial's parameters and their bounds.
+        """Place records on the grid, with a polynomial's parameters and their bounds.
 
         Raises
         ------
         InvalidRecord, RecordTooShort
             If a record does not have what the model needs.
         """
-        everything = (*parameters, *build_initial_parameters(model, len(records)))
+        all_parameters = (*parameters, *build_initial_parameters(model, len(records)))
         weights = {output.name: 1.0 for output in model.outputs}
-        laid = [
-            place_on_grid(model, record, e, everything, weights, skip)
+        placed = [
+            place_on_grid(model, record, e, all_parameters, weights, skip)
             for e, record in enumerate(records)
         ]
-        return cls.from_experiments(model, records, laid, parameters)
+        return cls.from_experiments(model, records, placed, parameters)
 
     @classmethod
     def from_experiments(
@@ -85,25 +85,25 @@ class Regression:
         experiments: Sequence[GridExperiment],
         parameters: Sequence[Parameter],
     ) -> "Regression":
-        """The regression on records that are laid out already."""
-        spans = {one.name: get_interval(one) for one in parameters}
+        """Make the regression on records that are already on a grid."""
+        spans = {item.name: get_interval(item) for item in parameters}
         pairs = zip(records, experiments, strict=True)
         return cls(
-            tuple(_make_regression_experiment(model, record, one, spans) for record, one in pairs)
+            tuple(_make_regression_experiment(model, record, item, spans) for record, item in pairs)
         )
 
     @property
     def most_rows(self) -> int:
-        """Rows at most: those with missing regressors are still among them."""
+        """Upper limit of the number of rows; it counts those with missing regressors."""
         return sum(piece.rows.size for piece in self.experiments)
 
     def thin_rows(self, most: int) -> "Regression":
-        """At most about that many rows, evenly taken."""
+        """Thin the rows evenly to about `most`."""
         stride = max(1, ceil(self.most_rows / max(most, 1)))
         return Regression(
             tuple(
-                RegressionExperiment(one.output, one.inputs, one.period, one.rows[::stride])
-                for one in self.experiments
+                RegressionExperiment(piece.output, piece.inputs, piece.period, piece.rows[::stride])
+                for piece in self.experiments
             )
         )
 
@@ -113,10 +113,10 @@ class Regression:
         lags: Mapping[str, float],
         simulated: Sequence[FloatArray] | None = None,
     ) -> tuple[FloatArray, int]:
-        """R of the QR decomposition of [terms, y], (M + 1, M + 1), and the number of rows.
+        """Compute R of the QR decomposition of [terms, y], (M + 1, M + 1), and count the rows.
 
-        With `simulated`, one output at the grid points for each experiment, of [the terms of
-        that output, the terms, y], (2M + 1, 2M + 1).
+        `simulated` has one output at the grid points for each experiment. With it, R is that of
+        [terms of that output, terms, y], (2M + 1, 2M + 1).
         """
         width = (1 if simulated is None else 2) * len(terms) + 1
         folded, count = np.zeros((0, width)), 0
@@ -139,21 +139,21 @@ class Regression:
 
 
 def fold_rows(folded: FloatArray, block: FloatArray) -> FloatArray:
-    """R of the QR decomposition of all rows so far, with a block of further rows in it."""
+    """Fold a block of rows into R of the QR decomposition of all previous rows."""
     return np.asarray(np.linalg.qr(np.vstack([folded, block]), mode="r"))
 
 
 def evaluate_terms(terms: Sequence[Term], read: PastReader, rows: int) -> FloatArray:
-    """The terms' values, (rows, M), each past value read once."""
-    known: dict[PastValue, FloatArray] = {}
+    """Evaluate the terms, (rows, M), reading each past value once."""
+    values: dict[PastValue, FloatArray] = {}
     matrix = np.empty((rows, len(terms)))
     with np.errstate(over="ignore", invalid="ignore"):
         for column, term in enumerate(terms):
             product = np.ones(rows)
             for factor in term.factors:
-                if factor not in known:
-                    known[factor] = read(factor)
-                product = product * known[factor]
+                if factor not in values:
+                    values[factor] = read(factor)
+                product = product * values[factor]
             matrix[:, column] = product
     return matrix
 
@@ -161,7 +161,7 @@ def evaluate_terms(terms: Sequence[Term], read: PastReader, rows: int) -> FloatA
 def make_past_reader(
     piece: RegressionExperiment, lags: Mapping[str, float], rows: IntArray, output: FloatArray
 ) -> PastReader:
-    """How past values are read at rows, those of the output from `output`."""
+    """Make a reader of past values at rows; those of the output come from `output`."""
 
     def read(past: PastValue) -> FloatArray:
         lag = evaluate_lag(past, lags, piece.period)
@@ -170,7 +170,7 @@ def make_past_reader(
                 output, np.asarray(rows - past.offset - lag, dtype=np.float64)
             )
         signal = piece.inputs[past.name]
-        # At a jump the fine grid holds the mean of both sides: without lag, read behind it.
+        # At a jump the fine grid has the mean of both sides. Without lag, read after it.
         jump = signal.begin if past.delay is None else 0
         places = signal.start_index + (rows - past.offset - lag) * signal.points_per_step + jump
         return _interpolate_places(signal.values, np.asarray(places, dtype=np.float64))
@@ -179,31 +179,31 @@ def make_past_reader(
 
 
 def find_lag_parameters(model: Model) -> set[str]:
-    """Names of the parameters in a polynomial's lags."""
+    """Find the names of the parameters in a polynomial's lags."""
     lags = {factor.delay for term in model.terms for factor in term.factors}
     return {name for lag in lags if lag is not None for name in collect_parameter_names(lag)}
 
 
 def evaluate_lag(past: PastValue, lags: Mapping[str, float], period: float) -> float:
-    """The unknown part of a lag in samples, for values of the parameters in it."""
+    """Evaluate the unknown part of a lag, in samples."""
     if past.delay is None:
         return 0.0
-    value = bound_expression(past.delay, {name: (one, one) for name, one in lags.items()}, period)[
+    value = bound_expression(past.delay, {name: (lag, lag) for name, lag in lags.items()}, period)[
         0
     ]
     whole = round(value)
     return float(whole) if abs(value - whole) < _WHOLE_TOLERANCE else value
 
 
-def _interpolate_places(values: FloatArray, places: FloatArray) -> FloatArray:
-    places = np.clip(places, 0.0, values.size - 1.0)
-    older = np.floor(places).astype(np.int64)
-    share = places - older
+def _interpolate_places(values: FloatArray, positions: FloatArray) -> FloatArray:
+    positions = np.clip(positions, 0.0, values.size - 1.0)
+    older = np.floor(positions).astype(np.int64)
+    share = positions - older
     if not np.any(share > 0):
         return values[older]
     newer = np.minimum(older + 1, values.size - 1)
-    found: FloatArray = values[older] * (1.0 - share) + values[newer] * share
-    return found
+    interpolated: FloatArray = values[older] * (1.0 - share) + values[newer] * share
+    return interpolated
 
 
 def _make_regression_experiment(
@@ -213,7 +213,11 @@ def _make_regression_experiment(
     spans: Mapping[str, tuple[float, float]],
 ) -> RegressionExperiment:
     [samples] = experiment.outputs
-    [channel] = [one for one in record.outputs if one.name == model.outputs[0].name]
+    [channel] = [
+        output_channel
+        for output_channel in record.outputs
+        if output_channel.name == model.outputs[0].name
+    ]
     grid = experiment.grid
     places = np.round(samples.places).astype(np.int64)
     output = np.full(grid.points, np.nan)

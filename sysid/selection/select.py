@@ -1,4 +1,4 @@
-"""Resolving a model whose terms are to be selected on the estimation records."""
+"""Selection of a model's terms on the estimation records."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,56 +22,61 @@ ParameterChanges = Mapping[str, Mapping[str, Any]]
 def select_model_terms(
     model: Model, records: Sequence[Record], changes: ParameterChanges | None = None, skip: int = 0
 ) -> tuple[Model, dict[str, Mapping[str, Any]]]:
-    """The model with the terms that its rule selects on the records; another as it is.
+    """Select the terms of a model by its rule; a model without a rule stays the same.
 
-    Without records the model stays as it is, too. Unknown lags are tried at whole samples inside
-    their bounds; the terms are those at the lags where they explain most. The lags stay unknown:
-    their values are in the `selection` of the model, for the search to begin with.
+    Without records the model stays the same, too. Unknown lags are tried at whole samples inside
+    their bounds, and the terms are selected at the lags that explain most. The lags stay unknown.
+    The `selection` of the model has their values as starts for the search.
 
     Parameters
     ----------
     model : Model
     records : sequence of Record
-        Those for the estimate.
+        The estimation records.
     changes : mapping of str to mapping
         Changed bounds, scales or fixed values, also of candidates' coefficients.
     skip : int
-        First samples of each output that are not scored.
+        Number of first samples of each output that are not scored.
 
     Returns
     -------
     Model
     dict
-        The changes, without those of coefficients that the model no longer has.
+        The changes without those of removed coefficients.
 
     Raises
     ------
     InvalidSettings
-        If the records have fewer samples than there are candidates, or nothing to explain.
+        If the records have fewer samples than candidates, or nothing to explain.
     InvalidRecord, RecordTooShort, InvalidBounds
         If a record does not have what the model needs, or a change cannot be used.
     """
-    given = dict(changes or {})
+    remaining_changes = dict(changes or {})
     if model.rule is None or not records:
-        return model, given
-    own = {parameter.name for parameter in model.parameters}
+        return model, remaining_changes
+    names = {parameter.name for parameter in model.parameters}
     parameters = override_parameters(
-        model.parameters, {name: fields for name, fields in given.items() if name in own}
+        model.parameters,
+        {name: fields for name, fields in remaining_changes.items() if name in names},
     )
     with use_one_thread():  # so that the last bit does not depend on the number of cores
-        found, lags, coefficients, samples = _select_one_step(
+        selected, lags, coefficients, samples = _select_one_step(
             model, model.rule, records, parameters, skip
         )
         if model.rule.error == "simulation":
-            better = select_by_free_run(model, model.rule, records, given, skip, found.order, lags)
-            if better is not None:
-                found, lags = better.forward_selection, better.lags
-                coefficients = better.coefficients.tolist()
-    resolved = keep_terms(model, [model.terms[i].label for i in found.order])
-    dropped = frozenset(own - {parameter.name for parameter in resolved.parameters})
-    selection = Selection(_list_selected_terms(model, found, coefficients), lags, samples)
-    kept = {name: fields for name, fields in given.items() if name not in dropped}
-    return replace(resolved, selection=selection), kept
+            by_free_run = select_by_free_run(
+                model, model.rule, records, remaining_changes, skip, selected.order, lags
+            )
+            if by_free_run is not None:
+                selected, lags = by_free_run.forward_selection, by_free_run.lags
+                coefficients = by_free_run.coefficients.tolist()
+    resolved = keep_terms(model, [model.terms[i].label for i in selected.order])
+    dropped = frozenset(names - {parameter.name for parameter in resolved.parameters})
+    selection = Selection(_list_selected_terms(model, selected, coefficients), lags, samples)
+    final_changes = {
+        name: fields for name, fields in remaining_changes.items() if name not in dropped
+    }
+    return replace(resolved, selection=selection), final_changes
 
 
 def _select_one_step(
@@ -87,29 +92,31 @@ def _select_one_step(
     lags: dict[str, float] = {}
     if values:
         effort = plan_effort(values, len(model.terms))
-        few = regression.thin_rows(effort.rows)
+        thinned = regression.thin_rows(effort.rows)
 
         def unexplained(tried: Mapping[str, float]) -> float:
-            triangle, _ = few.factor_terms(model.terms, tried)
+            triangle, _ = thinned.factor_terms(model.terms, tried)
             return select_forward(triangle, rule.keep, rule.err).unexplained
 
         lags = search_lags(values, unexplained, effort.trials)[0].lags
     triangle, samples = regression.factor_terms(model.terms, lags)
     check_candidate_count(len(model.terms), samples)
-    found = select_terms(triangle, rule, samples)
-    if not found.order:
+    selection = select_terms(triangle, rule, samples)
+    if not selection.order:
         raise InvalidSettings(
             "/model/terms",
-            "the output, or every candidate, is zero where it is scored; there is nothing to "
-            "explain, so no term can be selected",
+            "no term can be selected: the output, or every candidate, is zero at all scored "
+            "samples",
         )
-    return found, lags, solve_coefficients(triangle, found.order).tolist(), samples
+    return selection, lags, solve_coefficients(triangle, selection.order).tolist(), samples
 
 
 def _list_selected_terms(
-    model: Model, found: ForwardSelection, coefficients: Sequence[float]
+    model: Model, selection: ForwardSelection, coefficients: Sequence[float]
 ) -> tuple[SelectedTerm, ...]:
     return tuple(
-        SelectedTerm(model.terms[i].label, ratio, 1.0 - left, coefficients[i])
-        for i, ratio, left in zip(found.order, found.ratios, found.unexplained_shares, strict=True)
+        SelectedTerm(model.terms[i].label, ratio, 1.0 - unexplained, coefficients[i])
+        for i, ratio, unexplained in zip(
+            selection.order, selection.ratios, selection.unexplained_shares, strict=True
+        )
     )
