@@ -260,8 +260,7 @@ def test_another_projects_runs_are_not_seen(database):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "a\x00b", "\ud800"])
 def test_a_document_that_not_every_database_can_keep_is_refused(database, value):
     got, (run_id,) = claimed(database)
-    result = {"parameters": [], "note": [value]}
-    bad = RunOutcome(run_id=run_id, state=State.SUCCEEDED, result=result)
+    bad = RunOutcome(run_id=run_id, state=State.SUCCEEDED, result={"parameters": [], "note": [value]})
     with pytest.raises(UnstorableValue):
         record(database, got.lease, bad)
 
@@ -269,9 +268,10 @@ def test_a_document_that_not_every_database_can_keep_is_refused(database, value)
 def test_text_that_only_looks_like_an_escape_is_kept(database):
     got, (run_id,) = claimed(database)
     text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
-    result = {"parameters": [], "note": text}
-    outcome = RunOutcome(run_id=run_id, state=State.FAILED, result=result, error=text)
-    record(database, got.lease, outcome)
+    record(
+        database, got.lease,
+        RunOutcome(run_id=run_id, state=State.FAILED, result={"parameters": [], "note": text}, error=text),
+    )  # fmt: skip
     (run,) = runs_of(database, got.job.id)
-    assert run.result == result
+    assert run.result == {"parameters": [], "note": text}
     assert run.error == text

@@ -59,13 +59,7 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     """Write everything; the job that runs can be driven on with `progress`."""
     recording = _recording()
     dataset = add_recording(
-        database,
-        store,
-        recording,
-        name="tube 40 m",
-        kind="upload",
-        key="tube",
-        details={"warnings": []},
+        database, store, recording, name="tube 40 m", kind="upload", key="tube", details={"warnings": []}
     ).dataset.id
     finished = _claimed(database, settings, _body(dataset, "tube 40 m, pattern 1"))
     run = _end(database, store, finished, recording)
