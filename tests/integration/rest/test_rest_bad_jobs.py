@@ -61,6 +61,19 @@ def ended(parts: tuple[TestClient, Parts], content: bytes, **fields: Any) -> dic
     return dict(answer.json())
 
 
+def test_a_delay_in_another_unit_is_refused_to_a_job_and_to_the_store(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    client, _ = parts
+    delay = {"lower": 0, "upper": 2, "unit": "min"}
+    model = {**FIRST, "parameters": {**FIRST["parameters"], "L": delay}}
+    said = "found 'min', but this lag counts seconds: give it in s, or write t - 60*L"
+    job = refused(client.post("/v1/jobs", json={"model": model, "datasets": ["r"]}), 422, "invalid")
+    assert ("/model/parameters/L/unit", said) in [(one["pointer"], one["detail"]) for one in job]
+    [fault] = refused(client.post("/v1/models", json=model), 422, "invalid")
+    assert (fault["pointer"], fault["detail"]) == ("/parameters/L/unit", said)
+
+
 def test_an_input_that_is_zero_fails_the_run_with_one_line_that_says_why(
     parts: tuple[TestClient, Parts],
 ) -> None:
