@@ -1,1 +1,1 @@
-"""HTML pages and the report."""
+"""HTML pages and reports."""

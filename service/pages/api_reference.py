@@ -1,4 +1,4 @@
-"""The page of the REST interface, written from its OpenAPI document; nothing remote is loaded."""
+"""List the operations of the REST interface from its OpenAPI document, for the page /docs."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -7,7 +7,7 @@ HTTP_METHODS = ("get", "post", "put", "patch", "delete")
 
 
 class ApiField(NamedTuple):
-    """One field of a body, or one value of a path or query."""
+    """One field of a body, or one parameter of a path or query."""
 
     name: str
     kind: str
@@ -30,7 +30,7 @@ class ApiOperation(NamedTuple):
 
 
 def list_operations(document: Mapping[str, Any]) -> tuple[ApiOperation, ...]:
-    """Every operation of an OpenAPI document, in its order."""
+    """List every operation of an OpenAPI document, in its order."""
     return tuple(
         _to_operation(document, method, path, item[method])
         for path, item in document["paths"].items()
@@ -81,7 +81,7 @@ def _iterate_fields(document: Mapping[str, Any], schema: Mapping[str, Any]) -> I
 
 
 def _describe_schema(schema: Mapping[str, Any]) -> str:
-    """A schema in a word or two."""
+    """Describe a schema in a word or two."""
     if "$ref" in schema:
         return str(schema["$ref"].rpartition("/")[2])
     if "anyOf" in schema or "oneOf" in schema:

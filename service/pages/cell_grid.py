@@ -1,4 +1,4 @@
-"""The cells of a sweep as a grid by its axes: what a page shows instead of thousands of runs."""
+"""Build the cells of a sweep as a grid by its axes; pages show it instead of thousands of runs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,10 @@ from service.storage.tables import Job
 from service.sweeps.groups import get_groups
 
 MAX_LISTED_RUNS = 50
-"""Runs that a page lists one by one; of more it shows the grid."""
+"""Most runs that a page lists; for more it shows the grid."""
 MAX_CELLS = 2_000
 MAX_COLUMNS = 12
-MEDIAN_INDEX = 2  # place of the median among the quantiles
+MEDIAN_INDEX = 2  # index of the median among the quantiles
 
 CellKey = tuple[Any, ...]
 
@@ -39,7 +39,7 @@ class CellView:
 
 @dataclass(frozen=True, slots=True)
 class GridView:
-    """Rows by all axes but the last, columns by the last one; an absent cell is None."""
+    """Grid of cells: rows by all axes but the last, columns by the last; a missing cell is None."""
 
     quantity: str
     row_names: Sequence[str]
@@ -50,7 +50,7 @@ class GridView:
 
 
 def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
-    """The grid of a job; None where its runs are few, or differ by nothing but seeds."""
+    """Build the grid of a job; None if it has few runs, or they differ only in seeds."""
     paths = [axis["path"] for axis in job.spec["sweep"]["axes"]]
     keys = [path for path in paths if not path.endswith("/seed")]
     if job.n_runs <= MAX_LISTED_RUNS or not keys:
@@ -84,7 +84,7 @@ def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> Gr
 
 
 def cell_query(cell: Mapping[str, Any]) -> str:
-    """Query that chooses the runs of a cell."""
+    """Build the query that selects the runs of a cell."""
     pairs = [("cell", f"{path}={json.dumps(value)}") for path, value in cell.items()]
     return f"?{urlencode(pairs)}" if pairs else ""
 
@@ -134,7 +134,7 @@ def _has_ended_runs(group: RunGroup) -> bool:
 
 
 def _rank_medians(found: Sequence[RunGroup], error: SummaryQuantity) -> list[float]:
-    """How dark each cell is, from 0 to 1: the rank of its median among all."""
+    """Rank the medians of the cells, from 0 to 1, for their colours."""
     medians = [
         one.quantiles[error][MEDIAN_INDEX] if error in one.quantiles else None for one in found
     ]

@@ -1,4 +1,4 @@
-"""Choices of the form of a new identification: the names of the core, with texts for people."""
+"""Choices of the form of a new identification: names of the core with their texts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,25 +28,25 @@ DEFAULTS: Mapping[str, str] = {
     "prediction": "simulation",
     "hold": "",
 }
-"""What is chosen at first; of a hold nothing, since the recording has one."""
+"""Preselected names; no hold, since the recording has one."""
 
 TEXTS: Mapping[str, str] = {
     "improved": "improved (islands, sequence search)",
     "improved-paper": "improved, as in the paper",
     "simple": "simple genetic algorithm",
     "soft-l1": "soft-l1 (outliers)",
-    "auto": "by the residuals (auto)",
-    "ar1": "slow, first order (ar1)",
+    "auto": "selected by the residuals (auto)",
+    "ar1": "first-order coloured (ar1)",
     "simulation": "simulation (free run)",
     "one-step": "one step ahead",
     "zero": "held (zero)",
     "first": "straight line (first)",
 }
-"""What a name means; a name without a text stands for itself."""
+"""Texts of names; a name without a text is shown itself."""
 
 
 def list_choices() -> dict[str, list[tuple[str, str]]]:
-    """Values and texts of every field with names to choose from."""
+    """List values and texts of every field with choices."""
     return {
         field: [(name, TEXTS.get(name, name)) for name in names] for field, names in NAMES.items()
     }

@@ -1,4 +1,4 @@
-"""The datasets of a job as pages and reports name them: each with its role, and its label."""
+"""List the datasets of a job for pages and reports, each with its role and label."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -15,11 +15,11 @@ from service.storage.errors import RowNotFound
 from service.storage.tables import Job
 
 MAX_LISTED_DATASETS = 100
-"""Datasets of a job that are named."""
+"""Most datasets of a job that are listed."""
 
 
 def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
-    """Datasets of a job, each with its role, label, name and parents."""
+    """List the datasets of a job, each with its role, label, name and parents."""
     lineage = LineageRepository(session)
     return [
         {
@@ -34,12 +34,12 @@ def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
 
 
 def count_unlisted_datasets(job: Job) -> int:
-    """How many datasets of a job are not named."""
+    """Count the datasets of a job that are not listed."""
     return max(0, sum(1 for _ in _iterate_datasets(job.spec)) - MAX_LISTED_DATASETS)
 
 
 def _iterate_datasets(spec: Document) -> Iterator[tuple[str, str, str]]:
-    """Role, label and identifier of each; those of an axis stand for the job's own."""
+    """Yield role, label and id of each dataset; datasets of an axis replace the job's."""
     axes = [
         axis for axis in sweep_axes(spec) if axis["path"] == DATASETS_PATH and axis.get("values")
     ]

@@ -1,4 +1,4 @@
-"""What pages show of the evidence beside the estimates: residual tests, onset delays, criteria."""
+"""Views of diagnostics for the pages: residual tests, onset delays, information criteria."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Document = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ResidualTestView:
-    """One residual test as a line of a table."""
+    """One residual test as a row of a table."""
 
     experiment: int
     output: str
@@ -30,7 +30,7 @@ class ResidualTestView:
 
 @dataclass(frozen=True, slots=True)
 class OnsetView:
-    """The onset delay of one output behind one input."""
+    """The onset delay between one input and one output."""
 
     pair: str
     text: str
@@ -48,7 +48,7 @@ class SelectedTermView:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """All of it for one run; empty where a result does not tell it.
+    """Diagnostics of one run; fields are empty if the result has none.
 
     `verdict` is ``passed``, ``failed`` or ``not tested``, or empty without tests.
     """
@@ -64,7 +64,7 @@ class Diagnostics:
 
 
 def to_diagnostics(result: Document) -> Diagnostics:
-    """From a result document, which is empty as long as the run has none."""
+    """Build the diagnostics from a result document; it is empty until the run ends."""
     tested = result.get("residual_tests", {})
     tests = tested.get("tests", [])
     onsets = result.get("onset_delays", [])
@@ -91,7 +91,7 @@ def to_diagnostics(result: Document) -> Diagnostics:
 
 
 def to_correlation_trace(one: CorrelationFunction) -> CorrelationTrace:
-    """A correlation function as its figure wants it."""
+    """Convert a correlation function to the data of its figure."""
     test = one.test
     of = "" if test.input is None else f" with {test.input}"
     kind = "autocorrelation" if test.input is None else "correlation"
@@ -102,7 +102,7 @@ def to_correlation_trace(one: CorrelationFunction) -> CorrelationTrace:
 
 
 def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int = 2) -> Figure:
-    """Correlation functions of the residuals of one experiment; empty where none was tested."""
+    """Draw the residual correlations of one experiment; empty if none was tested."""
     functions = [
         to_correlation_trace(one)
         for one in tested.correlations

@@ -1,7 +1,4 @@
-"""Signals of datasets and runs out of the object store, as figures want them.
-
-From stored rows to what figures are made of.
-"""
+"""Load the data of figures: signals from the object store, results from stored rows."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
@@ -35,27 +32,27 @@ from sysid.models.parameters import Parameter, ParameterScale
 
 
 def fitness_label(body: Mapping[str, Any]) -> str:
-    """What the search minimises, as figures of it call it: with soft-l1 it is not J."""
+    """Label of the minimised fitness; with soft-l1 it is not J."""
     robust = (body.get("loss") or {}).get("kind") == "soft-l1"
     return "soft-l1 loss, as RMS" if robust else "RMS"
 
 
 def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:
-    """The free parameters in the order of the history's columns.
+    """List the free parameters in the order of the history's columns.
 
-    The result names them once the run has ended; until then the model and the request do.
+    They come from the result once the run has ended; before, from the model and the request.
     """
     known = stored.parameters(session)
     if stored.estimates:
         scales = {one.name: one.scale for one in known}
         return [_to_estimated_parameter(one, scales) for one in stored.estimates if is_free(one)]
     if stored.model.rule is not None:
-        return []  # which of the candidates are sought is told with the result
+        return []  # only the result says which candidates are selected
     return [_to_free_parameter(one) for one in known if one.is_free]
 
 
 def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
-    """All that is known of a run's search and result."""
+    """Read the data of a run's search and result."""
     job, run, body = stored.job, stored.run, stored.body
     runs = RunRepository(session)
     history = _group_by_island(runs.read_history(run.id))
@@ -91,7 +88,7 @@ def _replace_none(value: float | None, otherwise: float) -> float:
 def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
     found: list[list[IslandImprovement]] = []
     for island, points in groupby(rows, key=lambda row: row.island):
-        while len(found) < island:  # an island that has not told anything yet
+        while len(found) < island:  # an island without any improvement yet
             found.append([])
         found.append(
             [
@@ -105,7 +102,7 @@ def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
 def _match_history_width(
     known: list[FreeParameter], history: Sequence[Sequence[IslandImprovement]]
 ) -> list[FreeParameter]:
-    """As many parameters as the history has columns, whatever the model says today."""
+    """Match the number of parameters to the history's columns; the model may have changed."""
     points = [point for island in history for point in island]
     if not points:
         return known
@@ -143,14 +140,14 @@ def _to_free_parameter(parameter: Parameter) -> FreeParameter:
 
 
 def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrace]:
-    """The channels of a dataset."""
+    """Read the channels of a dataset."""
     return [_to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
 
 
 def read_run_experiments(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[ExperimentTraces]:
-    """What a run was fitted to, record by record; empty as long as nothing is stored."""
+    """Read the records that a run was fitted to; empty until the run stores its signals."""
     if stored.run.signals_sha256 is None:
         return []
     fitted = _by_experiment(read_fitted_signals(store, stored.run))
@@ -177,7 +174,7 @@ def read_run_experiments(
 def _by_experiment(
     fits: Iterable[FittedOutput],
 ) -> dict[FitRole, dict[int, Sequence[FittedOutput]]]:
-    """Of each role, the outputs of its experiments by number, in order."""
+    """Group the outputs by role and by number of the experiment."""
     found: dict[FitRole, dict[int, list[FittedOutput]]] = {"estimation": {}, "validation": {}}
     for fit in fits:
         found[fit.role].setdefault(fit.number, []).append(fit)
@@ -194,7 +191,7 @@ def _to_output_traces(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]
 def _join_validation(
     experiment: ExperimentTraces, later: Sequence[FittedOutput]
 ) -> ExperimentTraces:
-    """One record again, of which the last part was kept for validation."""
+    """Join the parts of a record whose last part was used for validation."""
     if not later:
         return experiment
     outputs = tuple(
@@ -227,7 +224,7 @@ def _get_inputs(inputs: Sequence[tuple[SignalTrace, ...]], number: int) -> tuple
 def _read_inputs(
     session: Session, store: ObjectStore, stored: StoredRun, datasets: Sequence[str]
 ) -> Iterator[tuple[SignalTrace, ...]]:
-    """Inputs of every record; a dataset that is gone takes only its own inputs off the plot."""
+    """Read the inputs of every record; a deleted dataset omits only its own inputs."""
     for name in datasets:
         try:
             for record in stored.read_datasets(session, store, [name]):
@@ -238,7 +235,7 @@ def _read_inputs(
 
 def _to_signal_trace(channel: Channel) -> SignalTrace:
     held, before = channel.hold == "zero", None
-    if channel.history is not None:  # as far as the first sample, so that the lines meet
+    if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
         times, values = (np.append(known, own[0]) for known, own in pairs)
         before = SignalTrace(channel.name, channel.unit, times, values, held)

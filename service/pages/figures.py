@@ -1,4 +1,4 @@
-"""Use cases of figures: a figure of a run or of a dataset, as a request chose it."""
+"""Load the data of a requested figure, and draw it."""
 
 from typing import Literal
 
@@ -31,28 +31,30 @@ FigureName = Literal["history", "convergence", "response", "residuals", "correla
 
 
 class FigureChoice(BaseModel):
-    """What a request may choose about a figure."""
+    """Options of a figure in a request."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    theme: Theme = Field(default="light", description="light or dark paper")
-    format: Literal["json", "csv"] = Field(default="json", description="Plotly JSON or numbers")
-    abscissa: Abscissa = Field(default="generations", description="of the RMS history")
-    columns: int = Field(default=3, ge=1, le=8, description="small plots side by side")
-    experiment: int = Field(default=0, ge=0, description="number of the record, from 0")
-    start: float | None = Field(default=None, allow_inf_nan=False, description="from here on, s")
-    stop: float | None = Field(default=None, allow_inf_nan=False, description="up to here, s")
+    theme: Theme = Field(default="light", description="light or dark colours")
+    format: Literal["json", "csv"] = Field(
+        default="json", description="Plotly JSON, or numbers as CSV"
+    )
+    abscissa: Abscissa = Field(default="generations", description="abscissa of the RMS history")
+    columns: int = Field(default=3, ge=1, le=8, description="small plots per row")
+    experiment: int = Field(default=0, ge=0, description="index of the record, from 0")
+    start: float | None = Field(default=None, allow_inf_nan=False, description="start time, s")
+    stop: float | None = Field(default=None, allow_inf_nan=False, description="stop time, s")
 
 
 def load_run_figure(
     session: Session, store: ObjectStore, run_id: str, name: FigureName, choice: FigureChoice
 ) -> Figure:
-    """One figure of a run; empty where the run has nothing to show yet.
+    """Draw a figure of a run; it is empty as long as the run has no data for it.
 
     Raises
     ------
     NotFound
-        If the run, or the experiment that was asked for, is not there.
+        If the run or the requested experiment does not exist.
     """
     stored = load_run(session, run_id)
     if name == "response":
@@ -84,7 +86,7 @@ def load_run_figure(
 
 
 def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
-    """Errors against the noise of a job; empty where σ is no axis of it, or nothing ended yet."""
+    """Draw a job's errors against the noise; empty if σ is no axis or no run has ended."""
     job = JobRepository(session).get(job_id)
     keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
@@ -94,7 +96,7 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
 
 
 def load_trend_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
-    """Estimates over the label of a batch; empty where the job asks for no trend."""
+    """Draw estimates over the label of a batch; empty if the job requests no trend."""
     found = load_trend(session, JobRepository(session).get(job_id))
     if found is None:
         return figures.empty_figure()
@@ -109,7 +111,7 @@ def _check_experiment(number: int, count: int) -> None:
 def load_dataset_figure(
     session: Session, store: ObjectStore, dataset_id: str, choice: FigureChoice
 ) -> Figure:
-    """The signals of a dataset."""
+    """Draw the signals of a dataset."""
     dataset = DatasetRepository(session).get(dataset_id)
     return figures_signals.plot_signals(
         read_dataset_traces(store, dataset), choice.start, choice.stop

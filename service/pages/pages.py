@@ -1,7 +1,4 @@
-"""The pages: what each template is given.
-
-The pages on which a noise sweep and a batch re-identification are submitted.
-"""
+"""Render the pages: jobs, runs, datasets, comparisons, and the forms of recipes."""
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -57,7 +54,7 @@ MAX_COMPARED_RUNS = 50
 
 
 def reference_page(document: Mapping[str, Any]) -> str:
-    """The REST interface, from its OpenAPI document."""
+    """Render the documentation of the REST interface from its OpenAPI document."""
     about = document["info"]["description"]
     return render_template(
         "reference.html",
@@ -68,7 +65,7 @@ def reference_page(document: Mapping[str, Any]) -> str:
 
 
 def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> str:
-    """The list of jobs and the form of a new identification."""
+    """Render the list of jobs and the form of a new identification."""
     states = [state] if state else []
     page = JobRepository(session).list_page(cursor=cursor, limit=JOBS_PER_PAGE, states=states)
     now = datetime.now(UTC)
@@ -96,10 +93,10 @@ def job_page(
     cursor: str | None = None,
     cell: Sequence[str] = (),
 ) -> str:
-    """A job with its runs, one of them in full: the one asked for, else the best or the first.
+    """Render a job with its runs, one of them in full: the requested, the best, or the first.
 
-    Of a large sweep the page has the grid of its cells, and lists the runs of the chosen `cell`,
-    given as ``/noise/sigma=0.1``.
+    For a large sweep, the page shows the grid of its cells. It lists the runs of the chosen `cell`,
+    such as ``/noise/sigma=0.1``.
     """
     job = JobRepository(session).get(job_id)
     runs = RunRepository(session)
@@ -132,12 +129,12 @@ def job_page(
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:
-    """Runs of several models side by side.
+    """Render a comparison of runs of several models.
 
     Raises
     ------
     InvalidRequest
-        If the runs do not compare.
+        If the runs cannot be compared.
     """
     found = compare_runs(session, runs)
     rows = []
@@ -149,20 +146,20 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:
-    """The page of a run's job, with this run in full."""
+    """Render the page of a run's job, with this run in full."""
     run = RunRepository(session).get(run_id)
     return job_page(session, run.job_id, base_url, run.id)
 
 
 def datasets_page(session: Session, cursor: str | None) -> str:
-    """The stored recordings, newest first."""
+    """Render the list of stored recordings, newest first."""
     page = DatasetRepository(session).list_page(cursor=cursor, limit=JOBS_PER_PAGE)
     following = _encode_query({"cursor": page.next}) if page.next else ""
     return render_template("datasets.html", datasets=page.items, cursor=cursor, next=following)
 
 
 def dataset_page(session: Session, dataset_id: str) -> str:
-    """A dataset: its signals, channels, and lineage."""
+    """Render a dataset: its signals, channels, and lineage."""
     dataset = DatasetRepository(session).get(dataset_id)
     lineage = LineageRepository(session)
     edges = [
@@ -188,12 +185,12 @@ def dataset_page(session: Session, dataset_id: str) -> str:
 
 
 def model_text(session: Session, name: str) -> str:
-    """A model as YAML, to be read in the form and changed there."""
+    """Return a model as YAML, to read and change in the form."""
     return _to_yaml(models.get_model(session, name).document)
 
 
 def job_model_text(session: Session, job_id: str) -> str:
-    """The model document of a job as YAML, for a job that is cloned."""
+    """Return the model document of a job as YAML, for the form of its clone."""
     model = JobRepository(session).get(job_id).spec["model"]
     return _to_yaml(models.get_model(session, model).document if isinstance(model, str) else model)
 
@@ -203,16 +200,16 @@ def _to_yaml(document: dict[str, Any] | None) -> str:
 
 
 def load_run_row(session: Session, stored: StoredRun) -> RunView:
-    """A run as a line of a table."""
+    """Load a run as a row of a table."""
     return to_run_view(stored.run, stored.rms_unit(session), {})
 
 
 def load_full_run(session: Session, stored: StoredRun) -> RunView:
-    """A run with what its plots need to be laid out before they are drawn."""
+    """Load a run with the heights of its plots, so that the page reserves their room."""
     run, result, model = stored.run, stored.result, stored.model
     sought = list_free_parameters(session, stored)
     counts = len(model.outputs), len(model.inputs)
-    # What comes with the end of the run lies below the live plots and takes its room then.
+    # Plots that appear when the run ends lie below the live plots; they get their room then.
     heights = {
         "response": figures_signals.response_height(*counts) if run.signals_sha256 else 0,
         "convergence": convergence_height(len(sought), columns=3),
@@ -229,7 +226,7 @@ def _residuals_height(result: Mapping[str, Any]) -> int:
 
 
 def _comparison_query(runs: Sequence[Run]) -> str:
-    """Query of a comparison of a sweep over models, of the first of each that has a result."""
+    """Build the query that compares the models of a sweep: the first run with a result of each."""
     first: dict[str, str] = {}
     for run in runs:
         if "/model" in run.cell and run.result is not None:
@@ -239,7 +236,7 @@ def _comparison_query(runs: Sequence[Run]) -> str:
 
 
 def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
-    """Height (px) of the figure of a sweep over σ; 0 where it is none."""
+    """Height (px) of the figure of a sweep over σ; 0 for other jobs."""
     if job.n_runs == 1 or noise_group_keys(job.spec["sweep"]["axes"]) is None:
         return 0
     sought = list_free_parameters(session, stored) if stored is not None else []
@@ -260,7 +257,7 @@ def _find_best_run(runs: RunRepository, job: Job) -> Run | None:
 
 
 def _latest_events(session: Session, job: Job) -> list[Any]:
-    # Progress is on the page already; what remains are the few lines that tell a story.
+    # The page shows progress already, so the list has only state changes and log lines.
     return EventRepository(session).list_latest(job.id, EVENTS_SHOWN, kinds=("state", "log", "end"))
 
 
@@ -292,7 +289,7 @@ MAX_CHOICES = 200
 
 
 def noise_sweep_page(session: Session) -> str:
-    """The form of a noise sweep."""
+    """Render the form of a noise sweep."""
     chosen = NoiseSweepIn.model_fields["methods"].default
     methods = [(one, one in chosen) for one in SEARCH_METHODS]
     return render_template(
@@ -304,7 +301,7 @@ def noise_sweep_page(session: Session) -> str:
 
 
 def reidentify_page(session: Session) -> str:
-    """The form of a batch re-identification."""
+    """Render the form of a batch re-identification."""
     return render_template(
         "reidentify.html",
         models=_list_models(session),
@@ -314,7 +311,7 @@ def reidentify_page(session: Session) -> str:
 
 
 def _list_models(session: Session) -> Sequence[ModelOut]:
-    """Every model once, under the name that means its latest version."""
+    """List every model once, under the name of its latest version."""
     found = models.list_models(session, None, MAX_CHOICES).items
     return list({one.name: one for one in reversed(found)}.values())[::-1]
 

@@ -1,8 +1,7 @@
-"""Files that the pages load: our own, and Plotly out of its installed wheel. Nothing is remote.
+"""Render templates, and load the static files of pages and reports.
 
-Templates with their context: the one environment of pages and reports.
-
-What every report carries inside: the sheet of the pages.
+The files are the package's own, and Plotly from its installed wheel. Nothing is loaded from other
+servers.
 """
 
 import gzip
@@ -27,7 +26,7 @@ MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+
 
 @dataclass(frozen=True, slots=True)
 class Asset:
-    """A file as it is served."""
+    """A static file with its media type and ETag."""
 
     content: bytes
     media_type: str
@@ -36,7 +35,7 @@ class Asset:
 
 @cache
 def load_asset(name: str) -> Asset | None:
-    """One of our own files; None if there is no such file."""
+    """Load a static file of the package; None if it does not exist."""
     path = STATIC_FOLDER / name
     if Path(name).name != name or path.suffix not in MEDIA_TYPES or not path.is_file():
         return None
@@ -47,12 +46,12 @@ def load_asset(name: str) -> Asset | None:
 
 @cache
 def plotly_file_name() -> str:
-    """Name under which Plotly is served; it changes with the version, so it may be kept forever."""
+    """Name under which Plotly is served; it contains the version, so browsers may cache it."""
     return f"plotly-{version('plotly')}.min.js"
 
 
 def plotly_path() -> Path:
-    """The bundle inside the wheel. The package itself is not imported: that takes long."""
+    """Path of the bundle in the wheel. The package is not imported, since that is slow."""
     spec = find_spec("plotly")
     assert spec is not None
     assert spec.submodule_search_locations
@@ -61,13 +60,13 @@ def plotly_path() -> Path:
 
 @cache
 def compress_plotly() -> bytes:
-    """The bundle, compressed once per process."""
+    """Compress the bundle once per process."""
     return gzip.compress(plotly_path().read_bytes(), compresslevel=6, mtime=0)
 
 
 @cache
 def template_environment() -> Environment:
-    """The templates. Every text of a user is escaped, and a name that is not given is an error."""
+    """Load the templates; users' texts are escaped, and an undefined variable is an error."""
     made = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
@@ -84,11 +83,11 @@ def template_environment() -> Environment:
 
 
 def render_template(template: str, **context: Any) -> str:
-    """A template with its context, as of now."""
+    """Render a template with its context and the present time as `now`."""
     return template_environment().get_template(template).render(now=datetime.now(UTC), **context)
 
 
 @cache
 def load_stylesheet() -> Markup:
-    """The sheet of pages and reports."""
+    """Load the style sheet of pages and reports."""
     return Markup((STATIC_FOLDER / "lagid.css").read_text(encoding="utf-8"))

@@ -1,9 +1,8 @@
-"""A job as one HTML file: it needs no server and no network, and runs no script but its own.
+"""Render a job as one HTML file that needs no server and no network.
 
-The report of a job of many runs: what they have in common, and the few that stand out.
-
-Its figures are drawings and it runs no script, so that it stays small. All else is where it came
-from: every run as CSV and JSON at the service.
+The report of few runs draws its figures with its own scripts. The report of many runs shows a
+summary and the best and worst runs. It has SVG figures and no scripts, so that it stays small. All
+runs remain available at the service as CSV and JSON.
 """
 
 import base64
@@ -45,13 +44,13 @@ from service.trends.schemas import TrendOut
 MAX_RANKED_RUNS = 10
 MAX_FAILED_RUNS = 20
 MAX_GRID_ROWS = 60
-"""Rows of the grid of cells that a report shows."""
+"""Most rows of the cell grid in a report."""
 STATIC_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 @dataclass(frozen=True, slots=True)
 class _ReportSection:
-    """One run in full: why it is shown, and its drawings."""
+    """One run in full, with the reason why it is shown, and its drawings."""
 
     reason: str
     run: RunView
@@ -66,12 +65,12 @@ def render_large_report(
     made: datetime,
     base_url: str,
 ) -> str:
-    """The report of a job of more runs than a page lists.
+    """Render the report of a job with more runs than a page lists.
 
     Parameters
     ----------
     base_url : str
-        Of the service, for what the report leaves out.
+        Address of the service, for links to all runs.
     """
     view = to_job_view(job, find_rms_unit(session, job.spec), made)
     best, worst = _best_and_worst_runs(session, job, is_batch=view.is_batch)
@@ -112,7 +111,7 @@ def render_large_report(
 def _best_and_worst_runs(
     session: Session, job: Job, *, is_batch: bool
 ) -> tuple[list[Run], list[Run]]:
-    """The best and the worst runs that succeeded; of a batch by fit: RMS do not compare."""
+    """Find the best and worst succeeded runs by RMS, or by fit in a batch (data differ)."""
     runs, only = RunRepository(session), [JobState.SUCCEEDED]
     by: Any = "fit_estimation" if is_batch else "best_rms"
     best, worst = (
@@ -142,7 +141,7 @@ def _truncate_grid(grid: GridView | None) -> GridView | None:
 def _overview_drawings(
     session: Session, job: Job, trend: TrendOut | None
 ) -> list[tuple[str, Markup]]:
-    """Titles and drawings of the figures of all runs together."""
+    """Draw the figures that cover all runs; each has a title."""
     found = [
         ("Errors against the noise", load_noise_figure(session, job.id, FigureChoice(columns=2)))
     ]
@@ -173,9 +172,9 @@ MAX_EXPERIMENTS = 4
 
 
 def render_job_report(session: Session, store: ObjectStore, job_id: str, base_url: str = "") -> str:
-    """The report of a job: every run in a table, the few best (of a batch first) in full.
+    """Render the report of a job: every run in a table, the best (of a batch the first) in full.
 
-    Of a job of more runs than a page lists: what they have in common, and those that stand out.
+    If the job has more runs than a page lists, the report summarises them.
     """
     job = JobRepository(session).get(job_id)
     made, batch = datetime.now(UTC), load_trend(session, job)
@@ -211,7 +210,7 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
 
 @cache
 def security_policy() -> str:
-    """Content security policy: the two scripts of the report by their hashes, nothing from afar."""
+    """Content security policy: only the report's two scripts, identified by hashes."""
     hashes = " ".join(
         f"'sha256-{_script_hash(script)}'" for script in (plotly_script(), draw_script())
     )
@@ -221,7 +220,7 @@ def security_policy() -> str:
 
 
 def _overview_figures(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
-    """Title, height (px) and Plotly JSON of the figures of all runs together."""
+    """Title, height (px) and Plotly JSON of the figures that cover all runs."""
     found = load_noise_figure(session, job.id, FigureChoice(columns=2))
     if not found["data"]:
         return []
@@ -237,7 +236,7 @@ def _overview_figures(session: Session, job: Job) -> list[tuple[str, int, Markup
 def _run_figures(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[tuple[str, int, Markup]]:
-    """Title, height (px) and Plotly JSON of a run's figures, those with something to show."""
+    """Title, height (px) and Plotly JSON of a run's figures that have data."""
     evidence = read_run_figure_data(session, stored)
     made = [("Progress of every island", figures.plot_history(evidence))]
     for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
@@ -267,18 +266,18 @@ def _has_points(trace: dict[str, Any]) -> bool:
 
 @cache
 def plotly_script() -> Markup:
-    """The Plotly bundle as the content of a script element."""
+    """Load the Plotly bundle as the content of a script element."""
     return _to_script(assets.plotly_path().read_text(encoding="utf-8"))
 
 
 @cache
 def draw_script() -> Markup:
-    """What draws the figures, as the content of a script element."""
+    """Load the script that draws the figures, as the content of a script element."""
     return _to_script((assets.STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
 
 
 def _to_script(text: str) -> Markup:
-    # In a string or an expression of a script, <\/ means the same and does not end the element.
+    # In a string or a regular expression, <\/ means </ and does not end the element.
     return Markup(text.replace("</script", "<\\/script"))
 
 

@@ -1,4 +1,4 @@
-"""The page on which an identified model is simulated; its address carries the whole request."""
+"""Render the page that simulates an identified model; its address contains the whole request."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -57,12 +57,12 @@ MAX_LISTED_DATASETS = 200
 MAX_LISTED_RECORDS = 50
 MAX_DEFAULT_SAMPLES = 5000
 IMPLIED_VALUES = {"amplitude": "1", "offset": "0", "time": "0"}
-"""What an address without them means; a form that is still empty suggests others."""
+"""Values of fields that an address omits; an empty form suggests other values."""
 
 
 @dataclass(frozen=True, slots=True)
 class _FormContext:
-    """What the form is made from."""
+    """Data for the form: run, model, datasets, units and defaults."""
 
     run: str
     title: str
@@ -76,17 +76,17 @@ class _FormContext:
 
     @property
     def input_choices(self) -> list[tuple[str, str]]:
-        """Choices of an input."""
+        """Choices of the controlled input."""
         return [(one.name, one.name) for one in self.model.inputs]
 
     @property
     def output_choices(self) -> list[tuple[str, str]]:
-        """Choices of an output."""
+        """Choices of the controlled output."""
         return [(one.name, one.name) for one in self.model.outputs]
 
     @property
     def gain_unit(self) -> str:
-        """Unit of the gain, where there is one input and one output to choose."""
+        """Unit of the gain, if the model has one input and one output."""
         if len(self.model.inputs) != 1 or len(self.model.outputs) != 1:
             return ""
         above, below = (self.units[one[0].name] for one in (self.model.inputs, self.model.outputs))
@@ -102,7 +102,7 @@ class _FormContext:
 
 @dataclass(frozen=True, slots=True)
 class SimulationAnswer:
-    """The answer to a request: a page, or the numbers of its figure."""
+    """Answer to a request: a page, or the numbers of its figure as CSV."""
 
     text: str
     is_csv: bool
@@ -112,7 +112,7 @@ class SimulationAnswer:
 def simulate_page(
     database: Database, store: ObjectStore, run_id: str, query: Mapping[str, str], base_url: str
 ) -> SimulationAnswer:
-    """The form, and what the model does where the query asks for it.
+    """Render the form, and the simulation if the query requests one.
 
     Raises
     ------
@@ -184,12 +184,12 @@ def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) 
 def _find_dataset(session: Session, dataset: str) -> list[Dataset]:
     try:
         return [DatasetRepository(session).get(dataset)]
-    except StorageError:  # deleted since, or never there: the form says so where it is chosen
+    except StorageError:  # deleted, or never stored: the form reports it at its field
         return []
 
 
 def _signal_units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
-    """Unit of every signal: the model's, or where it leaves it open that of the recording."""
+    """Unit of every signal: the model's, or the recording's if the model declares none."""
     recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
     model, by_signal = stored.model, stored.channels.by_signal
     own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
@@ -219,16 +219,16 @@ def _default_values(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]
 
 
 def _mean_period(irregular: Dataset) -> float | None:
-    """A period (s) for a recording that has none: of as many samples over the same time."""
+    """Mean sampling period (s) of an irregular recording."""
     if irregular.n_samples < 2 or not irregular.duration > 0:
         return None
     return float(f"{irregular.duration / (irregular.n_samples - 1):.2g}")
 
 
 def _default_step(stored: StoredRun) -> dict[str, str]:
-    """A step of the reference within what was measured: half the span of the first output.
+    """Suggest a step of the reference inside the measured range: half the first output's span.
 
-    A step from 0 to 1 would lie outside it for most plants, with an output's offset or in Pa.
+    A step from 0 to 1 would lie outside this range for most plants, such as outputs in Pa.
     """
     told = (stored.result.get("agreement") or {}).get("estimation", [])
     of_output = (one for one in told if one["output"] == stored.model.outputs[0].name)
@@ -243,7 +243,7 @@ def _default_step(stored: StoredRun) -> dict[str, str]:
 
 
 def _shift_step_time(defaults: Mapping[str, str]) -> dict[str, str]:
-    """The step one record later: the model starts at rest, not at the reference before the step."""
+    """Shift the step by one record: the model first settles at the reference before the step."""
     if defaults["offset"] == "0":
         return {}
     duration = float(defaults["duration"])
@@ -251,7 +251,7 @@ def _shift_step_time(defaults: Mapping[str, str]) -> dict[str, str]:
 
 
 def _round_text(value: float) -> str:
-    """Two significant digits, without a power of ten as long as that can be read."""
+    """Round to two significant digits; avoid a power of ten."""
     return f"{float(f'{value:.2g}'):.10g}"
 
 
@@ -287,7 +287,7 @@ def _validate_body(kind: type[Any], body: Mapping[str, Any]) -> Any:
 
 
 def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
-    """What a rule chose, as the form's own numbers: to go on from there by hand."""
+    """Return a rule's settings as values of the form, as a start for tuning by hand."""
     if found is None or found.tuning is None or found.controller is None:
         return {}
     used = found.controller
@@ -300,19 +300,19 @@ def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
 
 
 def _step_verdict(found: RunSimulationOut) -> tuple[str, str]:
-    """The verdict on a step response as the sheet styles it, and in words."""
+    """Judge a step response: style class and text."""
     metrics: StepMetricsOut | None = found.metrics
     if metrics is None:
         return "", ""
     if metrics.runs_away:
-        return "failed", "runs away"
+        return "failed", "diverges"
     if metrics.swing is not None:
-        return "failed", "keeps swinging"
+        return "failed", "keeps oscillating"
     return ("passed", "settles") if metrics.is_settled else ("apart", "does not settle")
 
 
 def _to_experiment_traces(free: FreeRun) -> ExperimentTraces:
-    """The first record; a table tells the agreement of all."""
+    """Return the traces of the first record; a table shows the agreement of all records."""
     record, simulated = free.records[0], free.simulated[0]
     outputs = tuple(
         OutputTraces(SignalTrace(one.name, one.unit, one.times, one.values), values)
@@ -337,7 +337,7 @@ def _figure_context(figure: Figure) -> dict[str, Any]:
 
 
 def _request_context(run: str, wanted: SimulationQuery, base_url: str) -> dict[str, str]:
-    """The same over REST."""
+    """Build the same request as a curl command."""
     verb = "validate" if wanted.kind == "recording" else "simulate"
     body = json.dumps(wanted.body, indent=2, ensure_ascii=False)
     url = f"{base_url.rstrip('/')}/v1/runs/{run}:{verb}"

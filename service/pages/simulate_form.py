@@ -1,4 +1,4 @@
-"""The form of a simulation: what a query asks for, as the body that the REST interface takes."""
+"""Parse the form of a simulation: its query becomes a body of the REST interface."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -46,19 +46,19 @@ FIELD_LABELS = {
     "duration": "duration",
     "sample_time": "sampling period",
     "dataset": "recording",
-    "skip": "samples not judged",
+    "skip": "skipped samples",
 }
 MANUAL_TUNING = "by hand"
 TUNINGS = {
     MANUAL_TUNING: "by hand",
     **{f"{rule} {kind}": f"{rule.upper()}, {kind}" for rule in RULES for kind in CONTROLLERS},
 }
-"""Rule and controller: a rule chooses gain and times itself."""
+"""Choices of rule and controller; a rule chooses gain and times itself."""
 CHOICES = {
     "derivative_on": [(one, one) for one in get_args(DerivativeOn)],
     "anti_windup": [(one, one) for one in get_args(AntiWindup)],
 }
-"""Values and texts of the fields of a controller that take one of some names."""
+"""Values and texts of the controller's fields with fixed choices."""
 _NUMBER_FIELDS = (
     "derivative_filter",
     "setpoint_weight",
@@ -92,19 +92,19 @@ _POINTER_FIELDS = {
 
 @dataclass(frozen=True, slots=True)
 class SimulationQuery:
-    """A query that can be read: its kind, and the body for it."""
+    """A valid query: its kind, and the body for it."""
 
     kind: SimulationKind
     body: Mapping[str, Any]
 
 
 def read_kind(query: Mapping[str, str]) -> SimulationKind:
-    """What is to be simulated; a closed loop if the query does not say.
+    """Read the kind of simulation; the default is a closed loop.
 
     Raises
     ------
     InvalidRequest
-        If it says something else.
+        If the kind is unknown.
     """
     wanted = query.get("kind", "loop")
     for kind in NOISE_KINDS:
@@ -116,12 +116,12 @@ def read_kind(query: Mapping[str, str]) -> SimulationKind:
 
 
 def has_request(query: Mapping[str, str]) -> bool:
-    """Whether something is to be simulated, or only the form to be shown."""
+    """Whether the query requests a simulation, not only the form."""
     return any(name not in ("kind", "format") for name in query)
 
 
 def list_form_fields(model: Model, kind: SimulationKind) -> list[str]:
-    """Names of the fields of a form."""
+    """List the names of the fields of a form."""
     inputs = [f"input.{one.name}" for one in model.inputs]
     if kind == "recording":
         signals = list(chain(*list_signals(model)))
@@ -149,12 +149,12 @@ def list_form_fields(model: Model, kind: SimulationKind) -> list[str]:
 
 
 def parse_query(model: Model, query: Mapping[str, str]) -> SimulationQuery:
-    """What a query asks for.
+    """Parse a query.
 
     Raises
     ------
     InvalidRequest
-        With every field that is unknown or no number, its pointer ``?name``.
+        With a fault for every unknown field and every invalid number; its pointer is ``?name``.
     """
     kind = read_kind(query)
     known = list_form_fields(model, kind)
@@ -173,7 +173,7 @@ def parse_query(model: Model, query: Mapping[str, str]) -> SimulationQuery:
 
 
 def to_form_fault(fault: FieldError) -> FieldError:
-    """A fault of the body at the field of the form that it comes from."""
+    """Move a fault of the body to the field of the form that it comes from."""
     if fault.pointer.startswith("?"):
         return fault
     for theirs, field in _POINTER_FIELDS.items():
@@ -187,13 +187,13 @@ def to_form_fault(fault: FieldError) -> FieldError:
 
 
 def field_label(field: str) -> str:
-    """How the form calls a field."""
+    """Label of a field in the form."""
     head, _, name = field.partition(".")
     return f"{head} {name}" if name else FIELD_LABELS.get(field, field)
 
 
 class _QueryReader:
-    """Numbers and texts of a query; what cannot be read is kept as a fault."""
+    """Reader of a query's numbers and texts; it collects faults."""
 
     def __init__(self, query: Mapping[str, str]) -> None:
         self._query = query
@@ -203,7 +203,7 @@ class _QueryReader:
         return self._query.get(name, "").strip() or default
 
     def read_number(self, name: str, default: float | None = None) -> float | None:
-        """A number; the default where the field is empty, and where there is a fault."""
+        """Read a number; the default if the field is empty or invalid."""
         given = self.read_text(name)
         if not given:
             return default
@@ -217,7 +217,7 @@ class _QueryReader:
         return default
 
     def read_samples(self) -> tuple[int, float]:
-        """Number of samples and sampling period (s) of a duration; both fields are needed."""
+        """Read number of samples and sampling period (s) from the fields; both are required."""
         duration, period = self.read_number("duration"), self.read_number("sample_time")
         for name, value in (("duration", duration), ("sample_time", period)):
             if any(one.pointer == f"?{name}" for one in self.faults):
@@ -232,8 +232,8 @@ class _QueryReader:
             self.faults.append(
                 FieldError(
                     "?duration",
-                    f"{duration:g} s in steps of {period:g} s are {count:.3g} samples; need 2 to "
-                    f"{MAX_SERIES_SAMPLES}",
+                    f"{duration:g} s with a period of {period:g} s are {count:.3g} samples; "
+                    f"need 2 to {MAX_SERIES_SAMPLES}",
                 )
             )
             return 2, 1.0
@@ -271,7 +271,7 @@ def _loop_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
 
 
 def _controller_body(reader: _QueryReader) -> dict[str, Any]:
-    """The controller's numbers; with a rule, which chooses them, those that it leaves."""
+    """Read the controller's settings; with a tuning rule only those that the rule does not set."""
     tuning = reader.read_text("tuning", MANUAL_TUNING)
     found: dict[str, Any] = {}
     if tuning == MANUAL_TUNING:

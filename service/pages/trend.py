@@ -1,4 +1,4 @@
-"""What pages and reports show of a trend: tables as texts, ready to be written."""
+"""Views of a trend for pages and reports: tables of texts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from service.trends.trend import compute_trend, has_trend
 
 @dataclass(frozen=True, slots=True)
 class TrendView:
-    """A trend; `laws` are (text, AIC, Birge ratio, whether chosen).
+    """View of a trend; `laws` are (text, AIC, Birge ratio, whether chosen).
 
-    Offered to be accepted is the run at the reference's label under its name; of a batch without
-    one the run in the middle, which is the nearest to all others.
+    The form suggests to accept the run at the reference's label under its name. In a batch without
+    a reference it suggests the middle run, which is the nearest to all others.
     """
 
     x: str
@@ -44,7 +44,7 @@ class TrendView:
 
 
 def load_trend(session: Session, job: Job) -> TrendOut | None:
-    """The trend of a job; None where it asks for none, or has too many runs for one."""
+    """Load the trend of a job; None if it requests none, or has too many runs for one."""
     if not has_trend(job):
         return None
     try:
@@ -54,7 +54,7 @@ def load_trend(session: Session, job: Job) -> TrendOut | None:
 
 
 def to_trend_view(found: TrendOut) -> TrendView:
-    """The tables of a trend."""
+    """Build the view of a trend."""
     document = found.model_dump()
     tables = build_tables(document, TYPESET)
     return TrendView(

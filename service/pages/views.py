@@ -1,4 +1,4 @@
-"""What the templates show of jobs and runs: their documents, with texts ready to be written."""
+"""Views of jobs and runs for the templates: their documents with formatted texts."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +19,7 @@ Document = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class EstimateView:
-    """One line of the table of estimates."""
+    """One row of the table of estimates."""
 
     name: str
     unit: str
@@ -35,7 +35,7 @@ DATASETS_PATH = "/datasets"
 
 
 class RunView(Answer):
-    """One run: what it gave, or how far it is."""
+    """View of a run: its result or its progress."""
 
     id: str
     number: int
@@ -60,9 +60,10 @@ class RunView(Answer):
 
 
 class JobView(JobOut):
-    """The document of a job as REST gives it, and what pages say besides, as of `now`.
+    """View of a job: its REST document and further texts of the pages, as of `now`.
 
-    The RMS of a batch, whose runs see different recordings, do not compare: it has no best one.
+    The runs of a batch see different recordings, so their RMS cannot be compared. A batch therefore
+    has no best RMS.
     """
 
     request: dict[str, Any]
@@ -72,17 +73,17 @@ class JobView(JobOut):
 
     @property
     def is_open(self) -> bool:
-        """Whether it waits or runs."""
+        """Whether the job waits or runs."""
         return self.state in OPEN_STATES
 
     @property
     def can_resume(self) -> bool:
-        """Whether it ended before it was done."""
+        """Whether the job ended before it was done."""
         return self.state in ("failed", "cancelled")
 
     @property
     def is_batch(self) -> bool:
-        """Whether its runs see different recordings."""
+        """Whether the job's runs see different recordings."""
         return any(axis["path"].startswith(DATASETS_PATH) for axis in sweep_axes(self.request))
 
     @property
@@ -92,7 +93,7 @@ class JobView(JobOut):
 
     @property
     def took(self) -> float | None:
-        """Seconds since it was begun, up to its end."""
+        """Seconds from the job's start to its end, or to now."""
         if self.started_at is None:
             return None
         return max(((self.finished_at or self.now) - self.started_at).total_seconds(), 0.0)
@@ -105,7 +106,7 @@ class JobView(JobOut):
 
     @property
     def share(self) -> float:
-        """How much is done, from 0 to 1: runs, and the generations of a single one."""
+        """Share that is done, from 0 to 1: by runs, or by generations of a single run."""
         done = self.progress
         if self.state == "succeeded":
             return 1.0
@@ -119,7 +120,7 @@ class JobView(JobOut):
 
     @property
     def progress_text(self) -> str:
-        """How far it is, in words."""
+        """Progress in words."""
         done = self.progress
         if done.runs > 1:
             return f"{format_count(done.finished)} of {format_count(done.runs)} runs"
@@ -131,13 +132,13 @@ class JobView(JobOut):
 
     @property
     def request_text(self) -> str:
-        """The request as it was submitted, for reading."""
+        """The request as it was submitted, as indented JSON."""
         return json.dumps(self.request, indent=2, ensure_ascii=False)
 
 
 @dataclass(frozen=True, slots=True)
 class EventView:
-    """One line of a job's events."""
+    """One row of a job's events."""
 
     at: datetime
     kind: str
@@ -145,7 +146,7 @@ class EventView:
 
 
 def to_job_view(job: Job, unit: str, now: datetime) -> JobView:
-    """What pages show of a job; `unit` is that of its RMS."""
+    """Build the view of a job; `unit` is the unit of its RMS."""
     document = to_job_out(job, with_request=True, rms_unit=unit)
     return JobView.from_source(
         document, lost_leases=job.lost_leases, max_attempts=job.max_attempts, now=now
@@ -153,7 +154,7 @@ def to_job_view(job: Job, unit: str, now: datetime) -> JobView:
 
 
 def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
-    """What pages show of a run; `heights` (px) are those of its plots."""
+    """Build the view of a run; `heights` (px) are those of its plots."""
     result = run.result or {}
     return RunView.from_source(
         run,
@@ -170,7 +171,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
 
 
 def to_estimate_view(one: Document) -> EstimateView:
-    """A line of the table, from an entry of the result's ``parameters``."""
+    """Build a row of the table from an entry of the result's ``parameters``."""
     stderr = one["stderr"]
     value, error = format_estimate(one["value"], stderr)
     bounds = [one[name] for name in ("lower", "upper") if one[name] is not None]
@@ -187,7 +188,7 @@ def to_estimate_view(one: Document) -> EstimateView:
 
 
 def to_event_view(event: Event) -> EventView:
-    """An event as one line of text."""
+    """Format an event as one line of text."""
     data = event.data
     if event.kind in ("state", "end"):
         attempt = f", attempt {data['attempt']}" if data.get("attempt") else ""
@@ -203,19 +204,19 @@ def to_event_view(event: Event) -> EventView:
 
 
 def sweep_axes(spec: Document) -> list[Document]:
-    """The axes of a job's sweep."""
+    """List the axes of a job's sweep."""
     return list(spec["sweep"]["axes"])
 
 
 def format_cell(cell: Document, labels: Document) -> str:
-    """What distinguishes a run from the others of its job; labels tell data better than ids."""
+    """Describe a run's place in its sweep; labels replace the ids of datasets."""
     told = {path: value for path, value in cell.items() if not (labels and path == DATASETS_PATH)}
     pairs = [(_axis_name(path, told), value) for path, value in told.items()]
     return ", ".join(f"{name} {format_value(value)}" for name, value in [*labels.items(), *pairs])
 
 
 def _axis_name(path: str, others: Iterable[str]) -> str:
-    """Last part of a pointer; all of it where others end like it, as those of two seeds do."""
+    """Last part of a pointer; the whole pointer if others end alike, such as two seeds."""
     last = path.rsplit("/", 1)[-1]
     same = [one for one in others if one.rsplit("/", 1)[-1] == last]
     return last if len(same) == 1 else path.removeprefix("/").replace("/", " ")

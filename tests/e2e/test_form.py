@@ -47,13 +47,13 @@ def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page
     expect(check).to_contain_text("column 2")
     expect(check).to_contain_text("Kp")
     write_own(page, EQUATIONS)
-    expect(check).to_contain_text("can be used")
+    expect(check).to_contain_text("the model is valid")
 
 
 def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, page: Page) -> None:
     opened(own_site, page, f"?dataset={own_site.filled.dataset}")
     write_own(page, EQUATIONS)
-    expect(page.locator("#check")).to_contain_text("can be used")
+    expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("upper of L").fill("0.3")
     page.get_by_label("output y").select_option("P2")
     page.get_by_label("u between samples").select_option("zero")
@@ -77,7 +77,7 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
 def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     opened(site, page, f"?dataset={site.filled.dataset}")
     write_own(page, EQUATIONS)  # of the recording's units: nothing else is refused
-    expect(page.locator("#check")).to_contain_text("can be used")
+    expect(page.locator("#check")).to_contain_text("the model is valid")
     page.get_by_label("output y").select_option("P2")
     page.get_by_label("population").fill("2")
     page.get_by_role("button", name="Identify").click()

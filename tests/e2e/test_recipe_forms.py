@@ -83,7 +83,7 @@ def test_a_sweep_of_a_recording_says_that_it_adds_the_runs_without_noise(
     page.get_by_label("σ, as a list").fill("1, 2")
     page.get_by_label("replicates").fill("2")
     expect(page.locator("#runs-count")).to_have_text(
-        "2 σ × 2 replicates × 2 methods = 8 runs, and 4 at σ = 0, which errors are told against"
+        "2 σ × 2 replicates × 2 methods = 8 runs, and 4 at σ = 0 as the reference of the errors"
     )
     page.get_by_label("output y").select_option("P2")
     page.get_by_role("button", name="Sweep").click()
@@ -111,7 +111,7 @@ def test_recordings_with_labels_become_a_batch_with_a_trend(own_site: Site, page
     page.get_by_role("button", name="Identify").click()
     expect(page.locator('[data-fault="/label"]')).not_to_be_empty()
     page.get_by_label("name of the label").fill("length_m")
-    page.get_by_label("parameters to look at").fill("L, T")
+    page.get_by_label("parameters to report").fill("L, T")
     page.get_by_label("predict at").fill("30")
     page.get_by_label("input u").select_option("P1")
     page.get_by_label("output y").select_option("P2")

@@ -61,7 +61,7 @@ export function overrides() {
 export function showFaults(form, problem) {
   const top = form.querySelector('#form-fault');
   problem.errors.forEach((fault) => beside(form, fault));
-  const summary = problem.errors.length ? 'The request cannot be used:' : problem.document.title;
+  const summary = problem.errors.length ? 'The request is invalid:' : problem.document.title;
   top.replaceChildren(element('b', summary));
   const list = document.createElement('ul');
   const texts = problem.errors.length ? problem.errors.map(said) : [problem.message];

@@ -145,7 +145,7 @@ async function check(changes) {
 function verdict(found) {
   const place = document.getElementById('check');
   field('equations').ariaInvalid = String(!found.valid);
-  if (found.valid) return place.replaceChildren(element('span', 'the model can be used', 'status identified'));
+  if (found.valid) return place.replaceChildren(element('span', 'the model is valid', 'status identified'));
   const list = document.createElement('ul');
   for (const one of found.errors) {
     const where = [one.pointer, one.column && `column ${one.column}`].filter(Boolean).join(', ');
@@ -153,7 +153,7 @@ function verdict(found) {
     item.append(element('b', where), ` ${one.detail}`);
     list.append(item);
   }
-  place.replaceChildren(element('span', 'the model cannot be used yet', 'fault'), list);
+  place.replaceChildren(element('span', 'the model is not valid yet', 'fault'), list);
 }
 
 function take(document, changes) {
@@ -251,7 +251,7 @@ async function isReady() {
     const usable = await check();
     if (usable) return true;
     if (usable === null) continue;
-    say('the model cannot be used yet');
+    say('the model is not valid yet');
     field('equations').focus();
     return false;
   }

@@ -74,8 +74,8 @@ document.addEventListener('submit', async (event) => {
   try {
     const found = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
     const before = found.history[0];
-    told.textContent = `The reference ${found.name} is ${found.run} now, `
-      + (before ? `${before.run} was before it.` : 'the first of this name.');
+    told.textContent = `The reference ${found.name} is now ${found.run}. `
+      + (before ? `Before: ${before.run}.` : 'It is the first of this name.');
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     told.textContent = error.message;

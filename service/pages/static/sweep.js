@@ -62,7 +62,7 @@ function count() {
   const runs = (n) => (n * replicates * chosen).toLocaleString('en').replaceAll(',', '\u202f');
   const product = `${sigma.size} σ × ${replicates} replicates × ${chosen} method${chosen > 1 ? 's' : ''} = ${runs(sigma.size)} runs`;
   const isKnown = isTruth() || sigma.has(0) || field('dataset').selectedOptions[0]?.dataset.truth === '1';
-  told.textContent = isKnown ? product : `${product}, and ${runs(1)} at σ = 0, which errors are told against`;
+  told.textContent = isKnown ? product : `${product}, and ${runs(1)} at σ = 0 as the reference of the errors`;
 }
 
 function truth() {
