@@ -1,1 +1,1 @@
-"""One Plotly definition per figure; formats; no rendering of pages."""
+"""Figures: one Plotly definition each, also drawn as SVG; no rendering of pages."""

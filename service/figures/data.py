@@ -1,4 +1,4 @@
-"""What the figures and the tables of one run are made of: plain values, whoever stored them."""
+"""Data of figures and tables as plain values, independent of storage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class IslandImprovement:
 
 @dataclass(frozen=True, slots=True)
 class FreeParameter:
-    """A free parameter: its bounds, and its estimate once there is one."""
+    """A free parameter: its bounds, and its estimate if it exists."""
 
     name: str
     unit: str
@@ -38,7 +38,7 @@ class FreeParameter:
 class SignalTrace:
     """One signal on its own times (s); `is_held` if it keeps its value until the next sample.
 
-    `history` is the same signal up to its first sample, as far back as it is known.
+    `history` is the same signal before its first sample, as far back as it is recorded.
     """
 
     name: str
@@ -51,7 +51,7 @@ class SignalTrace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputTraces:
-    """A measured output and what the identified model gives at the same times."""
+    """A measured output, and the output of the identified model at the same times."""
 
     measured: SignalTrace
     identified: Floats
@@ -59,10 +59,10 @@ class OutputTraces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExperimentTraces:
-    """One record as fitted or as kept for validation.
+    """One record of the estimation or validation data.
 
-    `validation_from` is the time (s) from which on the samples were not used for the estimate;
-    None: all were used; minus infinity: none was.
+    Samples from the time `validation_from` (s) on were not used for the estimate. None: all were
+    used. Minus infinity: none was used.
     """
 
     name: str
@@ -75,7 +75,7 @@ class ExperimentTraces:
 class CorrelationTrace:
     """A correlation function of residuals over lags, with its bands.
 
-    `period` (s) is that of a lag; None where lags count irregular samples.
+    `period` (s) is the length of one lag; None if lags count irregular samples.
     """
 
     title: str
@@ -89,22 +89,22 @@ class CorrelationTrace:
 
 @dataclass(frozen=True, slots=True)
 class RunFigureData:
-    """All that is known of one run's search and result.
+    """Data of one run's search and result.
 
     Attributes
     ----------
     unit : str
         Unit of the RMS.
     fitness : str
-        What the search minimised: RMS, or with a robust loss that loss as an RMS.
+        What the search minimised: the RMS, or a robust loss expressed as an RMS.
     history : sequence of sequence of Improvement
         One sequence per island, in the order of the generations.
     epoch : int
-        Generations between two migrations; 0 when no island sends any.
+        Generations between two migrations; 0 without migration.
     migrations : sequence of int
-        Epochs after which migrants went.
+        Epochs after which individuals migrated.
     islands : sequence of (champion RMS, refined RMS or None)
-        What each island found.
+        Result of each island.
     correlation : mapping or None
         ``{"names": [...], "matrix": [[...]]}``.
     """

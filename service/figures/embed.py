@@ -1,4 +1,4 @@
-"""Figures inside a page: their JSON in script elements that run nothing."""
+"""Embed figures in a page: their JSON in script elements that are not executed."""
 
 import json
 
@@ -9,17 +9,17 @@ from service.figures.theme import plotly_template
 
 
 def strip_template(figure: Figure) -> Figure:
-    """Without the template, which the report holds once for all its figures."""
+    """Remove the template, which a report stores once for all its figures."""
     kept = {name: value for name, value in figure["layout"].items() if name != "template"}
     return {"data": figure["data"], "layout": kept}
 
 
 def to_script_json(value: object) -> Markup:
-    """JSON inside a script element: no text in it can end the element."""
+    """Write JSON for a script element; no text in it can end the element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def templates_json() -> Markup:
-    """Both papers, held once for all figures of a page."""
+    """Write the light and the dark template, once for all figures of a page."""
     return to_script_json({"light": plotly_template("light"), "dark": plotly_template("dark")})

@@ -1,4 +1,4 @@
-"""Small plots in rows and columns: where they stand, their axes and captions."""
+"""Lay out small plots in rows and columns: domains, axes and captions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,25 +6,25 @@ from typing import Any
 
 Domain = tuple[float, float]
 Place = tuple[Domain, Domain]
-"""Horizontal and vertical part of the figure that a plot takes."""
+"""Horizontal and vertical domain of a plot in the figure."""
 
 WIDE_MARGIN = {"l": 72, "r": 16, "t": 36, "b": 6}
 
 
 @dataclass(frozen=True, slots=True)
 class PlotGrid:
-    """Where small plots stand; heights of a row in px or any other unit.
+    """Layout of small plots; heights are in px or in any other unit.
 
     Attributes
     ----------
     count, columns : int
-        Number of plots and of plots beside each other, at most.
+        Number of plots, and most plots per row.
     caption, plot, axis : float
         Heights of the parts of a row, from the top.
     gap : float
-        Between two columns, as a part of the whole width.
+        Gap between two columns, as a share of the whole width.
     has_last_axis : bool
-        Whether the grid makes room for the axis of the last row; else the margin does.
+        Whether the grid has room for the axis of the last row; else the margin has.
     """
 
     count: int
@@ -37,20 +37,20 @@ class PlotGrid:
 
     @property
     def n_columns(self) -> int:
-        """Plots beside each other."""
+        """Plots per row."""
         return max(1, min(self.columns, self.count))
 
     @property
     def n_rows(self) -> int:
-        """Rows, one at least."""
+        """Number of rows, at least one."""
         return max(-(-self.count // self.n_columns), 1)
 
     def height(self, margin: Mapping[str, int]) -> int:
-        """Height (px) of the figure, so that a page can leave room for it."""
+        """Compute the height (px) of the figure, so that a page can reserve its room."""
         return self.n_rows * int(self._row) + margin["t"] + margin["b"]
 
     def place(self, number: int) -> Place:
-        """Horizontal and vertical domain of a plot, counted from 0."""
+        """Compute the horizontal and vertical domain of a plot, counted from 0."""
         row, column = divmod(number, self.n_columns)
         width = (1 - self.gap * (self.n_columns - 1)) / self.n_columns
         left = column * (width + self.gap)
@@ -64,14 +64,14 @@ class PlotGrid:
 
 
 def wide_grid(count: int, columns: int) -> PlotGrid:
-    """The grid of figures over a label or σ; their margin is `WIDE_MARGIN`."""
+    """Build the grid of figures over a label or σ; their margin is `WIDE_MARGIN`."""
     return PlotGrid(count, columns, caption=30, plot=250, axis=54, gap=0.1)
 
 
 def add_axes(
     figure: dict[str, Any], number: int, place: Place, x: dict[str, Any], y: dict[str, Any]
 ) -> dict[str, str]:
-    """Add the axes of a plot, counted from 0; gives what its traces need to name them."""
+    """Add the axes of a plot, counted from 0; return the axis names for its traces."""
     suffix = "" if number == 0 else str(number + 1)
     across, upward = place
     figure["layout"][f"xaxis{suffix}"] = {"domain": across, "anchor": f"y{suffix}", **x}

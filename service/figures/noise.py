@@ -1,4 +1,4 @@
-"""Figure 15: errors of the response and of each parameter against the noise, method by method."""
+"""Draw Figure 15: errors of the response and of each parameter against the noise, by method."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ class _Band:
 
 @dataclass(slots=True)
 class _Panel:
-    """One pair of axes: a band for each series, and the floor by σ."""
+    """One pair of axes: a band for each series, and the Cramér–Rao bound by σ."""
 
     caption: str
     title: str
@@ -51,16 +51,16 @@ class _Panel:
 
 
 def noise_group_keys(axes: Sequence[Mapping[str, Any]]) -> list[str] | None:
-    """Keys to group by for this figure: σ and all axes but seeds; None without an axis of σ."""
+    """Return the keys to group runs by: σ and all axes but seeds; None if σ is no axis."""
     paths = [axis["path"] for axis in axes]
     return [path for path in paths if not path.endswith("/seed")] if SIGMA_PATH in paths else None
 
 
 def plot_noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure:
-    """Medians and 5 to 95 % bands over σ, one line a method, and the Cramér–Rao floor.
+    """Draw medians and 5 to 95 % bands over σ, one line per method, and the Cramér–Rao bound.
 
-    The first plot has the RMS between the identified response and the record without noise, the
-    others each parameter's estimate minus its reference. Quantiles are those of the runs that
+    The first plot shows the RMS between the identified response and the record without noise. The
+    others show each parameter's estimate minus its reference. Quantiles are of the runs that
     succeeded.
     """
     panels = _build_panels(summary, unit)
@@ -76,7 +76,7 @@ def plot_noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure
 
 
 def noise_sweep_height(n_panels: int, columns: int = 2) -> int:
-    """Height (px) of the figure, so that a page can leave room for it."""
+    """Compute the height (px) of the figure, so that a page can reserve its room."""
     return wide_grid(n_panels, columns).height(WIDE_MARGIN)
 
 
@@ -121,7 +121,7 @@ def _is_shown(name: str, panel: _Panel) -> bool:
 
 
 def _series_name(group: GroupOut) -> str:
-    """What the runs of a group have in common besides σ."""
+    """Name a group by its keys other than σ."""
     rest = {key: value for key, value in group.key.items() if key != SIGMA_PATH}
     if list(rest) == [METHOD_PATH]:
         return str(rest[METHOD_PATH])
@@ -172,7 +172,7 @@ def _add_panel(
 def _band_traces(
     band: _Band, label: str, group: str, line: dict[str, Any], at: dict[str, str], first: bool
 ) -> list[dict[str, Any]]:
-    """The band between its two edges, and the median over it."""
+    """Draw the band between its two edges, and the median over it."""
     order = sorted(range(len(band.x)), key=band.x.__getitem__)
     x = to_json_numbers(band.x[i] for i in order)
     low, middle, high = (
@@ -209,12 +209,12 @@ def _band_traces(
 
 
 def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
-    """The floor: of the response its value, of a parameter the 5 and 95 % that it stands for."""
+    """Draw the Cramér–Rao bound: for parameters, the 5 and 95 % quantiles that it implies."""
     x = sorted(panel.floor)
     if not x:
         return []
     signs = (-NORMAL_95, NORMAL_95) if panel.is_signed else (1.0,)
-    name = "Cramér–Rao floor (of parameters: 5 and 95 %)"
+    name = "Cramér–Rao bound (of parameters: 5 and 95 %)"
     lines = []
     for sign in signs:
         lines.append(
@@ -228,7 +228,7 @@ def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dic
                 "y": to_json_numbers(sign * panel.floor[one] for one in x),
                 "line": dict(_FLOOR_STYLE),
                 **at,
-                "hovertemplate": "floor, σ %{x:.4g}: %{y:.4g}<extra></extra>",
+                "hovertemplate": "bound, σ %{x:.4g}: %{y:.4g}<extra></extra>",
             }
         )
         told.add(name)

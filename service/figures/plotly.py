@@ -1,7 +1,7 @@
-"""Figures of a run as Plotly JSON: one definition for the pages, the REST route and the report.
+"""Draw the figures of a run as Plotly JSON: one definition for pages, REST route and report.
 
-A figure is a plain ``{"data": […], "layout": {…}}``. Colours that depend on the paper come from
-the template (`service.figures.theme`); no line has more than `decimation.MAX_POINTS` points.
+A figure is a plain ``{"data": […], "layout": {…}}``. Colours that depend on the background come
+from the template (`service.figures.theme`). No line has more than `theme.MAX_POINTS` points.
 """
 
 import csv
@@ -24,7 +24,7 @@ MARGIN = {"l": 64, "r": 16, "t": 28, "b": 44}
 WATERFALL_HEIGHT = 280
 _MAX_MARKED_EPOCHS = 80
 _CROWDED_RATIO = 8.0
-"""Ratio of the largest to the smallest value from which on digits of a log axis stand too close."""
+"""Ratio of largest to smallest value above which the digits of a log axis are crowded."""
 _PHASE_MARKERS = {
     "sequence": ("sequence", "diamond-open"),
     "migration": ("migration", "triangle-up-open"),
@@ -33,12 +33,12 @@ _PHASE_MARKERS = {
 
 
 def to_json_numbers(values: Iterable[float]) -> list[float | None]:
-    """Numbers as JSON takes them, seven digits long; what is not finite is a gap."""
+    """Convert numbers for JSON with seven digits; None, a gap, if not finite."""
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
 def base_layout(height: int, **more: Any) -> dict[str, Any]:
-    """The layout that all figures share; `uirevision` keeps a zoom through live updates."""
+    """Build the layout that all figures share; `uirevision` keeps a zoom during live updates."""
     shared: dict[str, Any] = {
         "height": height,
         "margin": MARGIN,
@@ -51,17 +51,17 @@ def base_layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def empty_figure() -> Figure:
-    """A figure with nothing to show yet."""
+    """Build a figure without data."""
     return {"data": [], "layout": base_layout(200)}
 
 
 def apply_theme(figure: Figure, paper: theme.Theme) -> Figure:
-    """The same figure on light or dark paper."""
+    """Set the template for a light or dark background."""
     return {**figure, "layout": {**figure["layout"], "template": theme.plotly_template(paper)}}
 
 
 def plot_history(run: RunFigureData, abscissa: Abscissa = "generations") -> Figure:
-    """Fitness of every island's champion over generations or evaluations, phases marked."""
+    """Draw the fitness of every island's champion over generations or evaluations."""
     end = _last_abscissa(run, abscissa)
     lines = [
         _island_line(number, points, abscissa, end)
@@ -83,7 +83,7 @@ def plot_history(run: RunFigureData, abscissa: Abscissa = "generations") -> Figu
 
 
 def plot_convergence(run: RunFigureData, columns: int = 3) -> Figure:
-    """Every free parameter of the islands' champions over generations, between its bounds."""
+    """Draw the free parameters of the islands' champions over generations, with their bounds."""
     parameters = run.parameters
     grid = _parameter_grid(len(parameters), columns)
     figure: Figure = {
@@ -102,7 +102,7 @@ def plot_convergence(run: RunFigureData, columns: int = 3) -> Figure:
 
 
 def convergence_height(n_parameters: int, columns: int) -> int:
-    """Height (px) of the small plots, so that a page can leave room for them."""
+    """Compute the height (px) of the small plots, so that a page can reserve their room."""
     return _parameter_grid(n_parameters, columns).n_rows * 214 + 20
 
 
@@ -115,12 +115,12 @@ def _parameter_grid(n_parameters: int, columns: int) -> PlotGrid:
 
 
 def correlation_height(n_parameters: int) -> int:
-    """Height (px) of the correlation matrix."""
+    """Compute the height (px) of the correlation matrix."""
     return min(130 + max(n_parameters, 3) * (46 if n_parameters <= 12 else 24), 760)
 
 
 def plot_correlation(run: RunFigureData) -> Figure:
-    """Correlation matrix of the estimates, from −1 to 1."""
+    """Draw the correlation matrix of the estimates, from −1 to 1."""
     names = list((run.correlation or {}).get("names", ()))
     rows = [to_json_numbers(row) for row in (run.correlation or {}).get("matrix", ())]
     few = len(names) <= 12
@@ -157,7 +157,7 @@ def plot_correlation(run: RunFigureData) -> Figure:
 
 
 def plot_waterfall(run: RunFigureData) -> Figure:
-    """Fitness that each island found, best first, before and after refinement."""
+    """Draw the final fitness of each island, best first, before and after refinement."""
     order = sorted(range(len(run.islands)), key=lambda i: _final_fitness(run.islands[i]))
     rank = list(range(1, len(order) + 1))
     islands = [f"island {i + 1}" for i in order]
@@ -195,7 +195,7 @@ def plot_waterfall(run: RunFigureData) -> Figure:
 
 
 def to_csv(figure: Figure) -> str:
-    """The numbers drawn, one a row: series, x, y (and z of a matrix)."""
+    """Write the drawn numbers as CSV, one per row: series, x, y (and z of a matrix)."""
     sink = io.StringIO()
     rows = csv.writer(sink, lineterminator="\n")
     matrix = any("z" in trace for trace in figure["data"])
@@ -216,7 +216,7 @@ def _abscissa_value(point: IslandImprovement, abscissa: Abscissa) -> int:
 
 def _last_abscissa(run: RunFigureData, abscissa: Abscissa) -> int:
     last = [_abscissa_value(points[-1], abscissa) for points in run.history if points]
-    # Evaluations of a run are those of all its islands, which count their own.
+    # A run's evaluations are the sum over its islands; each island counts only its own.
     return max([*last, run.generations if abscissa == "generations" else 0])
 
 
@@ -283,13 +283,13 @@ def _distinct_epochs(epochs: Sequence[int]) -> list[int]:
 
 
 def _fitness_axis(run: RunFigureData, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The axis of the fitness; `data` are the traces upon it."""
+    """Build the axis of the fitness; `data` are its traces."""
     title = {"text": run.fitness_label + bracket_unit(run.unit)}
-    # Over less than a decade the digits between its powers would stand alone, without any power.
+    # Below one decade the axis would show only digits and no power of ten.
     axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
     positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
     if positive and _CROWDED_RATIO <= max(positive) / min(positive) < 1000 * _CROWDED_RATIO:
-        axis["dtick"] = "D2"  # 1, 2, 5: all nine digits of a decade lie upon each other
+        axis["dtick"] = "D2"  # 1, 2, 5: all nine digits of a decade would overlap
     return axis
 
 

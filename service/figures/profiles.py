@@ -1,4 +1,4 @@
-"""Figure of profile likelihoods: the ratio over each parameter, and where it crosses 95 %."""
+"""Draw profile likelihoods: the ratio over each parameter, and its 95 % interval."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,11 +10,11 @@ from service.figures.plotly import MARGIN, Figure, base_layout
 from service.runs.schemas import ProfileOut
 
 _ROW_PX, _GAP = 230, 0.08
-_MAX_THRESHOLDS = 3.0  # thresholds that are drawn: the walls of a steep profile would hide its foot
+_MAX_THRESHOLDS = 3.0  # height of the axis in thresholds, so that the minimum stays visible
 
 
 def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) -> Figure:
-    """Likelihood ratio of each parameter over its values, with the threshold and the interval."""
+    """Draw the likelihood ratio of each parameter, with the threshold and the interval."""
     grid = PlotGrid(
         len(profiles), columns, caption=0, plot=1, axis=0.35, gap=_GAP, has_last_axis=False
     )
@@ -59,7 +59,7 @@ def _profile_trace(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
 def _threshold_shapes(
     one: ProfileOut, at: dict[str, str], threshold: float
 ) -> list[dict[str, Any]]:
-    """The threshold, and an upright at each end of the interval that is not open."""
+    """Draw the threshold, and a vertical line at each end of the interval that is not open."""
     style = {"color": theme.GREY, "width": 1, "dash": "dot"}
     level = {
         "type": "line",

@@ -1,4 +1,4 @@
-"""Figure of the residual tests: correlation functions with their bands."""
+"""Draw the residual tests: correlation functions with their bands."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,10 +17,10 @@ _BAND95 = "rgba(138,146,155,0.22)"
 def plot_residuals(
     functions: Sequence[CorrelationTrace], columns: int = 2, names: Sequence[str] = ()
 ) -> Figure:
-    """Correlation functions of one experiment, each over its bands.
+    """Draw the correlation functions of one experiment, each over its bands.
 
-    Lag 0 of an autocorrelation, which is 1, is not drawn: it would dwarf the others. `names` are
-    those of all experiments.
+    Lag 0 of an autocorrelation is omitted: it is 1 and would dwarf the others. `names` are the
+    names of all experiments.
     """
     grid = _grid(len(functions), columns)
     figure: Figure = {
@@ -43,7 +43,7 @@ def _grid(n_functions: int, columns: int) -> PlotGrid:
 
 
 def residuals_height(n_functions: int, columns: int = 2) -> int:
-    """Height (px) of the figure, so that a page can leave room for it."""
+    """Compute the height (px) of the figure, so that a page can reserve its room."""
     return _grid(n_functions, columns).height(_MARGIN)
 
 
@@ -80,8 +80,8 @@ def _lag_title(one: CorrelationTrace) -> str:
 def _band_traces(
     lags: Floats, bands: tuple[Floats, Floats], at: dict[str, str], *, first: bool
 ) -> list[dict[str, Any]]:
-    """The 95 % band as an area, the 99 % band as dashed lines about it."""
-    # Half a lag further at each end, so that the first and the last bar stand on the band.
+    """Draw the 95 % band as an area and the 99 % band as dashed lines."""
+    # The band extends by half a lag at each end, so that it covers the first and the last bar.
     x = to_json_numbers(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
     shared = {"type": "scatter", "mode": "lines", "x": x, **at, "hoverinfo": "skip"}
     drawn = []

@@ -1,4 +1,4 @@
-"""Figures over time: measured against identified output, and the signals of a dataset."""
+"""Draw signals over time: measured against identified output, and the channels of a dataset."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,19 +13,19 @@ from service.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 from service.figures.theme import MAX_POINTS, thin_indices, window_slice
 
 _GAP_PX = 20
-_HISTORY_FRACTION = 0.1  # of a record's duration, of what its inputs were before it
+_HISTORY_FRACTION = 0.1  # drawn input history before the record, as a share of its duration
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
 
 
 def plot_response(
     experiment: ExperimentTraces, start: float | None = None, stop: float | None = None
 ) -> Figure:
-    """Measured against identified outputs, residuals under each, inputs below, one time axis.
+    """Draw measured and identified outputs, residuals below each, then inputs, over one time axis.
 
     Parameters
     ----------
     start, stop : float, optional
-        Only this stretch (s), so that a zoom shows more of the samples.
+        Draw only this range (s), so that a zoom shows more of the samples.
     """
     figure = stack_plots(_response_heights(len(experiment.outputs), len(experiment.inputs)))
     for number, output in enumerate(experiment.outputs):
@@ -48,19 +48,19 @@ def plot_response(
 
 
 def response_height(n_outputs: int, n_inputs: int) -> int:
-    """Height (px) of a response, so that a page can leave room for it."""
+    """Compute the height (px) of a response, so that a page can reserve its room."""
     return _stack_height(_response_heights(n_outputs, n_inputs))
 
 
 def signals_height(n_channels: int) -> int:
-    """Height (px) of the channels of a dataset."""
+    """Compute the height (px) of the channels of a dataset."""
     return _stack_height([_SIGNAL_PX] * n_channels)
 
 
 def plot_signals(
     channels: Sequence[SignalTrace], start: float | None = None, stop: float | None = None
 ) -> Figure:
-    """The channels of a dataset, one under the other."""
+    """Draw the channels of a dataset, one below the other."""
     figure = stack_plots([_SIGNAL_PX] * len(channels))
     for number, signal in enumerate(channels, 1):
         span = window_slice(signal.times, start, stop)
@@ -81,12 +81,12 @@ def _stack_height(rows: Sequence[int]) -> int:
 
 
 def _is_thinned(traces: Sequence[SignalTrace]) -> bool:
-    """Whether a zoom would show samples that the whole does not."""
+    """Whether the whole view omits samples that a zoom would show."""
     return any(trace.times.size > MAX_POINTS for trace in traces)
 
 
 def stack_plots(heights: Sequence[int]) -> Figure:
-    """Empty plots of these heights (px), one under the other over one time axis."""
+    """Build empty plots of these heights (px), one below the other over one time axis."""
     total = sum(heights) + _GAP_PX * max(len(heights) - 1, 0)
     shared: dict[str, Any] = base_layout(
         _stack_height(heights),
@@ -115,7 +115,7 @@ def name_axis(figure: Figure, number: int, text: str) -> None:
 
 
 def axis_id(name: str) -> str:
-    """Plotly's name of an axis: the first has no number."""
+    """Plotly's name of an axis; the first has no number."""
     return "y" if name == "y1" else name
 
 
@@ -149,7 +149,7 @@ def _output_traces(
 
 
 def _measured_style(times: Floats, drawn: int) -> dict[str, Any]:
-    """Points where single samples can be told apart or share a time, else a line."""
+    """Choose points if single samples are distinguishable or share a time, else a line."""
     pooled = bool(np.any(np.diff(times) <= 0))
     if pooled or drawn <= 400:
         return {"mode": "markers", "marker": {"color": theme.GREY, "size": 3 if pooled else 4}}
@@ -178,7 +178,7 @@ def _residual_trace(
 def signal_line(
     signal: SignalTrace, span: slice, axis: str, colour: str, *, legend: bool
 ) -> dict[str, Any]:
-    """A signal as one line of a stack, thinned to what a screen shows."""
+    """Draw a signal as one line of a stack, thinned to what a screen shows."""
     times, values = signal.times[span], signal.values[span]
     kept = thin_indices(values, MAX_POINTS)
     return {
@@ -199,7 +199,7 @@ def _record_duration(experiment: ExperimentTraces) -> float:
 
 
 def _recent_history(signal: SignalTrace, seconds: float) -> SignalTrace | None:
-    """The end of a signal's history; all of it could take half of the plot from the record."""
+    """Cut a signal's history to its end; all of it could fill half of the plot."""
     if signal.history is None:
         return None
     first = int(np.searchsorted(signal.history.times, signal.times[0] - seconds))
@@ -210,7 +210,7 @@ def _recent_history(signal: SignalTrace, seconds: float) -> SignalTrace | None:
 def _history_traces(
     history: SignalTrace | None, start: float | None, stop: float | None, axis: str, colour: str
 ) -> list[dict[str, Any]]:
-    """What is known of a signal from before its first sample: dotted, in the same row."""
+    """Draw a signal's history before its first sample as a dotted line in the same row."""
     if history is None or not history.times.size:
         return []
     drawn = signal_line(
@@ -223,7 +223,7 @@ def _history_traces(
 
 
 def _validation_shading(experiment: ExperimentTraces) -> dict[str, Any]:
-    """Shade what was kept for validation, and say so."""
+    """Shade and label the validation part."""
     since = experiment.validation_from
     if since is None or not experiment.outputs:
         return {}

@@ -1,4 +1,4 @@
-"""Figures of a simulated run: the outputs with their reference, what the controller gives below."""
+"""Draw a simulated run: the outputs with their reference, then inputs and command."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -19,12 +19,12 @@ _LINE_STYLE = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "
 
 
 def plot_simulation(found: RunSimulationOut, step_time: float | None = None) -> Figure:
-    """Outputs over time with the reference and the band that they settle in, then the inputs.
+    """Draw outputs over time with the reference and the settling band, then the inputs.
 
     Parameters
     ----------
     step_time : float, optional
-        When the reference steps (s): settling is counted from there.
+        Time (s) of the reference's step; the settling time counts from it.
     """
     below = list(found.inputs)
     if found.command is not None and _command_differs(found, found.command):
@@ -52,7 +52,7 @@ def plot_simulation(found: RunSimulationOut, step_time: float | None = None) -> 
 
 
 def apply_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:
-    """The same with the units of signals that the model leaves open."""
+    """Set the units of signals for which the model declares none."""
 
     def told(one: SeriesOut) -> SeriesOut:
         return one.model_copy(update={"unit": units.get(one.name, one.unit)})
@@ -68,7 +68,7 @@ def apply_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulat
 
 
 def _command_differs(found: RunSimulationOut, command: SeriesOut) -> bool:
-    """Whether the command is not just the input: something lies between the two."""
+    """Whether the command differs from all inputs, as with a transport between them."""
     return all(one.values != command.values or one.times != command.times for one in found.inputs)
 
 
@@ -83,7 +83,7 @@ def _signal_trace(
 
 
 def _limit_lines(controller: ControllerOut | None, number: int) -> Iterator[dict[str, Any]]:
-    """Least and largest value that the controller may give."""
+    """Draw the lower and the upper limit of the controller."""
     if controller is None:
         return
     for limit in (controller.lower, controller.upper):
@@ -92,7 +92,7 @@ def _limit_lines(controller: ControllerOut | None, number: int) -> Iterator[dict
 
 
 def _horizontal_line(axis: str, height: float) -> dict[str, Any]:
-    """A dotted line at a height, all over the width."""
+    """Draw a dotted horizontal line over the whole width."""
     return {
         "type": "line",
         "xref": "paper",
@@ -108,7 +108,7 @@ def _horizontal_line(axis: str, height: float) -> dict[str, Any]:
 def _settling_shapes(
     metrics: StepMetricsOut, number: int, since: float
 ) -> Sequence[dict[str, Any]]:
-    """The band of 2 % about the final value, and the time from which on it is kept."""
+    """Draw the 2 % band about the final value, and the settling time."""
     if metrics.final_value is None or metrics.settling_time is None:
         return []
     axis = axis_id(f"y{number}")

@@ -1,10 +1,7 @@
-"""Figures as drawings (SVG): the same definitions, for a report that runs no script at all.
+"""Draw the Plotly figures as SVG, for reports without scripts.
 
-They follow the paper by the sheet's colours, and hold at most `MAX_LINE_POINTS` points a line.
-
-Axes of a figure that is drawn without a script: ranges, ticks, places in px.
-
-Symbols of points in a drawing, by the names that figures give them.
+Colours come from the report's style sheet. A line has at most `MAX_LINE_POINTS` points. This module
+computes ranges, ticks and positions (px) of the axes, and draws symbols by Plotly's names.
 """
 
 import re
@@ -24,7 +21,7 @@ _MarkerPath = Callable[[float, float, float], str]
 
 
 def draw_marker(name: str, x: float, y: float, radius: float, colour: str) -> str:
-    """A symbol about a place (px); a name that ends with ``-open`` is only an outline."""
+    """Draw a symbol at a position (px); a name that ends with ``-open`` is only an outline."""
     shape, is_open = name.removesuffix("-open"), name.endswith("-open")
     is_thin = shape in _LINE_MARKERS
     paint = f'fill="none" stroke="{colour}"' if is_open or is_thin else f'fill="{colour}"'
@@ -49,7 +46,10 @@ def _cross_path(x: float, y: float, r: float) -> str:
 
 
 def _star_path(x: float, y: float, r: float) -> str:
-    return f"{_cross_path(x, y, 0.7 * r)}M{x - r:.1f} {y:.1f}h{2 * r:.1f}M{x:.1f} {y - r:.1f}v{2 * r:.1f}"
+    return (
+        f"{_cross_path(x, y, 0.7 * r)}M{x - r:.1f} {y:.1f}h{2 * r:.1f}"
+        f"M{x:.1f} {y - r:.1f}v{2 * r:.1f}"
+    )
 
 
 _MARKER_PATHS: Mapping[str, _MarkerPath] = {
@@ -67,9 +67,9 @@ _TICK_STEPS = (1.0, 2.0, 5.0, 10.0)
 
 @dataclass(frozen=True, slots=True)
 class SvgAxis:
-    """One axis; `low` and `high` are exponents of ten where it is logarithmic.
+    """One axis; `low` and `high` are exponents of ten if it is logarithmic.
 
-    `start` and `stop` are the px of `low` and `high`; of an upright one `start` lies below.
+    `start` and `stop` are the px of `low` and `high`. On a vertical axis `start` is the lower end.
     """
 
     name: str
@@ -82,18 +82,18 @@ class SvgAxis:
     n_ticks: int
 
     def to_pixel(self, value: float | None) -> float | None:
-        """Place (px) of a value; None where it has none."""
+        """Compute the position (px) of a value; None if it has none."""
         if value is None or not isfinite(value) or (self.is_log and value <= 0):
             return None
         place = log10(value) if self.is_log else value
         return self.start + (place - self.low) / (self.high - self.low) * (self.stop - self.start)
 
     def fraction_to_pixel(self, part: float) -> float:
-        """Place (px) of a part of the axis, from 0 to 1."""
+        """Compute the position (px) of a fraction of the axis, from 0 to 1."""
         return self.start + part * (self.stop - self.start)
 
     def tick_positions(self) -> Iterator[tuple[float, str]]:
-        """Places (px) and labels of the ticks inside the range."""
+        """Yield positions (px) and labels of the ticks inside the range."""
         decades = self.is_log and self.high - self.low >= 1
         for value in _decade_ticks(self) if decades else _round_ticks(self):
             place = self.to_pixel(value)
@@ -104,12 +104,12 @@ class SvgAxis:
 def build_axes(
     figure: Mapping[str, Any], box: tuple[float, float, float, float]
 ) -> dict[str, SvgAxis]:
-    """All axes of a figure by their names (``x``, ``y2``).
+    """Build all axes of a figure by their names (``x``, ``y2``).
 
     Parameters
     ----------
     box : (left, right, top, bottom)
-        Edges (px) of what the axes share.
+        Edges (px) of the area that the axes share.
     """
     left, right, top, bottom = box
     found = {}
@@ -136,7 +136,7 @@ def build_axes(
 
 
 def format_tick(value: float) -> str:
-    """A tick's value: thousands as k, M, G, small ones by powers of ten."""
+    """Format a tick: thousands as k, M, G; small values by powers of ten."""
     size = abs(value)
     for unit, prefix in _SI_PREFIXES:
         if 10_000 <= size < 1e13 and size >= unit:
@@ -147,7 +147,7 @@ def format_tick(value: float) -> str:
 
 
 def axis_name(trace: PlotlyTrace, kind: str) -> str:
-    """Name of the axis that a trace lies on."""
+    """Name of a trace's axis."""
     return str(trace.get(f"{kind}axis", kind))
 
 
@@ -185,7 +185,7 @@ def _pad_range(
 def _axis_values(
     figure: Mapping[str, Any], name: str, layout: Mapping[str, Any], is_log: bool
 ) -> Iterator[float]:
-    """What lies on an axis, or on one that it matches, as its exponents where it is one of ten."""
+    """Yield the values on an axis and on axes that match it; exponents of ten if logarithmic."""
     kind = name[0]
     shared = {name, layout.get("matches", name)}
     for key, other in figure["layout"].items():
@@ -244,24 +244,24 @@ _TAG_SPANS = {
 
 
 def is_drawable(figure: Figure) -> bool:
-    """Whether all that it shows are lines, points and bands."""
+    """Whether the figure has only lines, points and bands."""
     return bool(figure["data"]) and all(one["type"] == "scatter" for one in figure["data"])
 
 
 def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
-    """A figure as an SVG element.
+    """Draw a figure as an SVG element.
 
     Parameters
     ----------
     title : str
-        What it shows, for those who do not see it.
+        Description for screen readers.
     width : int
-        px; the height is the figure's.
+        Width in px; the height is the figure's.
     """
     legend = list(_lay_out_legend(figure, width))
     rows = 1 + max((row for _, row, _ in legend), default=-1)
     margin, height = figure["layout"]["margin"], figure["layout"]["height"]
-    more = max(rows - 1, 0) * _LEGEND_ROW_PX  # the layout has left room for one row
+    more = max(rows - 1, 0) * _LEGEND_ROW_PX  # the layout has room for one row
     box = (margin["l"], width - margin["r"], margin["t"] + more, height + more - margin["b"])
     axes = build_axes(figure, box)
     parts = [
@@ -282,13 +282,13 @@ def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
 
 
 def to_markup(text: str) -> str:
-    """A label as markup: bold and raised parts as such, all else escaped."""
+    """Convert a label to markup: bold and superscript stay, the rest is escaped."""
     return "".join(_TAG_SPANS.get(part) or str(escape(part)) for part in _TAG_PATTERN.split(text))
 
 
 def _draw_grid(figure: Figure, axes: Mapping[str, SvgAxis]) -> Iterator[str]:
     for x, y in _axis_pairs(figure, axes):
-        # Of several plots over one axis the one that it is anchored to has its labels.
+        # If several plots share an axis, the plot that it is anchored to has its labels.
         is_below = figure["layout"][f"xaxis{x.name[1:]}"].get("anchor", "y") == y.name
         for axis in (x, y):
             for place, label in axis.tick_positions():
@@ -307,7 +307,7 @@ def _draw_tick(axis: SvgAxis, x: SvgAxis, y: SvgAxis, place: float, label: str) 
 
 
 def _axis_pairs(figure: Figure, axes: Mapping[str, SvgAxis]) -> list[tuple[SvgAxis, SvgAxis]]:
-    """Axes that are drawn at each other; of several over one time axis each has it."""
+    """List the pairs of axes; plots that share a time axis each form a pair with it."""
     layout = figure["layout"]
     return [
         (axes[str(layout[f"yaxis{name[1:]}"].get("anchor", "x"))], axis)
@@ -394,7 +394,7 @@ def _draw_trace(
 def _thin_line(
     trace: PlotlyTrace, x: SvgAxis, y: SvgAxis
 ) -> list[tuple[float | None, float | None]]:
-    """Places of a line, no more than a drawing needs; None where it has a gap."""
+    """Compute the positions of a line, thinned for a drawing; None at a gap."""
     values = np.array([np.nan if v is None else v for v in trace["y"]], dtype=np.float64)
     whole = bool(np.isfinite(values).all())
     kept = (
@@ -471,7 +471,7 @@ def _stroke_attributes(line: Mapping[str, Any]) -> str:
 
 
 def _lay_out_legend(figure: Figure, width: int) -> Iterator[tuple[float, int, PlotlyTrace]]:
-    """Left edge (px), row and trace of each entry."""
+    """Yield left edge (px), row and trace of each legend entry."""
     if figure["layout"].get("showlegend") is False:
         return
     left, row = float(figure["layout"]["margin"]["l"]), 0
@@ -490,7 +490,10 @@ def _draw_legend(legend: Sequence[tuple[float, int, PlotlyTrace]]) -> Iterator[s
         y = 12 + row * _LEGEND_ROW_PX
         mode = trace.get("mode", "lines")
         if "lines" in mode:
-            yield f'<path d="M{left:.1f} {y}h{_LEGEND_KEY_PX - 6}" {_stroke_attributes(trace.get("line", {}))}/>'
+            yield (
+                f'<path d="M{left:.1f} {y}h{_LEGEND_KEY_PX - 6}" '
+                f"{_stroke_attributes(trace.get('line', {}))}/>"
+            )
         if "markers" in mode:
             marker = trace.get("marker", {})
             yield draw_marker(
@@ -500,7 +503,10 @@ def _draw_legend(legend: Sequence[tuple[float, int, PlotlyTrace]]) -> Iterator[s
                 4,
                 _marker_property(marker.get("color", "currentColor"), 0),
             )
-        yield f'<text x="{left + _LEGEND_KEY_PX:.1f}" y="{y + 4}">{escape(_trace_label(trace))}</text>'
+        yield (
+            f'<text x="{left + _LEGEND_KEY_PX:.1f}" y="{y + 4}">'
+            f"{escape(_trace_label(trace))}</text>"
+        )
 
 
 def _trace_label(trace: PlotlyTrace) -> str:

@@ -1,9 +1,9 @@
-"""Colours and templates of the figures. One set of line colours serves light and dark paper.
+"""Colours and templates of the figures, and thinning of lines.
 
-The colours are those of Okabe and Ito, darkened where they vanish on white: each has a contrast of
-about 3 or more against both papers, and they stay apart for the colour-blind.
-
-Thinning of lines to what a screen can show, without losing what the eye looks for.
+One set of line colours serves light and dark backgrounds. The colours are those of Okabe and Ito,
+darkened where they vanish on white. Each has a contrast of about 3 or more against both
+backgrounds, and the colour-blind can distinguish them. Lines are thinned to what a screen can
+show; extremes stay visible.
 """
 
 from typing import Any, Literal
@@ -32,7 +32,7 @@ _INK_COLOURS: dict[Theme, dict[str, str]] = {
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Colour and dash of the numbered series; no two of the first 24 are alike."""
+    """Return colour and dash of the numbered series; the first 24 all differ."""
     return {
         "color": SERIES_COLOURS[number % len(SERIES_COLOURS)],
         "dash": SERIES_DASHES[number // len(SERIES_COLOURS) % len(SERIES_DASHES)],
@@ -41,7 +41,7 @@ def series_style(number: int) -> dict[str, Any]:
 
 
 def plotly_template(theme: Theme) -> dict[str, Any]:
-    """Plotly template: quiet axes on a transparent ground."""
+    """Build the Plotly template: plain axes on a transparent background."""
     ink = _INK_COLOURS[theme]
     axis = {
         "gridcolor": ink["grid"],
@@ -56,7 +56,7 @@ def plotly_template(theme: Theme) -> dict[str, Any]:
         "title": {"standoff": 8},
     }
     return {
-        # Plotly takes a transparent cell for a white one and would write on it in black.
+        # Plotly treats a transparent cell as white and would write on it in black.
         "data": {"heatmap": [{"textfont": {"color": ink["text"]}}]},
         "layout": {
             "paper_bgcolor": "rgba(0,0,0,0)",
@@ -84,9 +84,9 @@ MAX_POINTS = 1000
 
 
 def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
-    """Indices of at most `max_points` samples: the ends, and each bin's least and greatest.
+    """Choose at most `max_points` indices: the ends, and each bin's minimum and maximum.
 
-    A spike of one sample therefore stays visible at any zoom. Several arrays may share them.
+    A spike of one sample therefore stays visible at any zoom. Several arrays may share the indices.
     """
     if values.size <= max_points:
         return np.arange(values.size)
@@ -95,20 +95,20 @@ def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.int
 
 
 def window_slice(times: Floats, start: float | None, stop: float | None) -> slice:
-    """Samples between two times (s), with one more at each side so that lines reach the edge."""
+    """Slice the samples between two times (s), plus one at each side so lines reach the edge."""
     first = 0 if start is None else int(np.searchsorted(times, start, "left")) - 1
     last = times.size if stop is None else int(np.searchsorted(times, stop, "right")) + 1
     return slice(max(first, 0), min(last, times.size))
 
 
 def stride_indices(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
-    """Indices of at most `max_points` of `count` steps, the first and the last among them."""
+    """Choose at most `max_points` of `count` indices, including the first and the last."""
     if count <= max_points:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, max_points).round().astype(np.intp))
 
 
 def fade(colour: str, opacity: float) -> str:
-    """A colour (``#rrggbb``) that lets through what lies below."""
+    """Make a colour (``#rrggbb``) transparent."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity:g})"

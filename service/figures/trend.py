@@ -1,4 +1,4 @@
-"""The trend of a batch: every quantity over the label, its law with band, and predictions."""
+"""Draw the trend of a batch: every quantity over the label, its law with band, and predictions."""
 
 from typing import Any
 
@@ -21,10 +21,10 @@ AxisNames = dict[str, str]
 
 
 def plot_trend(found: TrendOut, columns: int = 2) -> Figure:
-    """Estimates with error bars over x, one small plot a quantity.
+    """Draw estimates with error bars over x, one small plot per quantity.
 
-    In each the chosen law as a line in its confidence band, the other law dotted, predictions as
-    diamonds with their intervals, and rings round outliers and what has drifted.
+    Each plot has the chosen law as a line in its confidence band, and the other law dotted.
+    Predictions are diamonds with their intervals. Rings mark outliers and drifted estimates.
     """
     shown = [one for one in found.quantities if any(p.value is not None for p in one.points)]
     grid = wide_grid(len(shown), columns)
@@ -45,7 +45,7 @@ def plot_trend(found: TrendOut, columns: int = 2) -> Figure:
 
 
 def trend_height(n_quantities: int, columns: int = 2) -> int:
-    """Height (px) of the figure, so that a page can leave room for it."""
+    """Compute the height (px) of the figure, so that a page can reserve its room."""
     return wide_grid(n_quantities, columns).height(WIDE_MARGIN)
 
 
@@ -121,7 +121,7 @@ def _law_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
 
 
 def _other_law_traces(one: QuantityOut) -> list[dict[str, Any]]:
-    """The law that was not chosen, over the same stretch."""
+    """Draw the law that was not chosen, over the same range."""
     law = next((law for law in one.laws if not law.is_chosen), None)
     if law is None:
         return []
