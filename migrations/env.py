@@ -1,7 +1,7 @@
-"""Alembic's environment: what it runs around every command.
+"""Alembic environment: the code that runs around every command.
 
-The service passes its own connection, inside a transaction that holds the lock of
-`service.storage.migrate`. From the command line the address is that of ``alembic.ini``, or
+The service passes its own connection, in a transaction that holds the lock of
+`service.storage.migrate`. On the command line the address is that of ``alembic.ini``, or of
 ``alembic -x url=…``.
 """
 
@@ -15,12 +15,12 @@ from service.storage.tables import Base
 
 
 def run(connection: Connection) -> None:
-    """Run the command's migrations in the transaction of this connection."""
+    """Run the migrations of the command in the transaction of this connection."""
     options: dict[str, Any] = {"compare_type": True, "compare_server_default": True}
     context.configure(
         connection=connection,
         target_metadata=Base.metadata,
-        # SQLite alters most of a table only by copying it.
+        # SQLite can alter most parts of a table only by copying it.
         render_as_batch=connection.dialect.name == "sqlite",
         transactional_ddl=True,
         **options,

@@ -1,7 +1,7 @@
-"""The first tables, and the default project.
+"""Create the first tables and the default project.
 
-Types are spelt out here and not taken from `service.storage`: what a migration did must not
-change when the program does.
+Types are spelled out here, not imported from `service.storage`: a migration must not change with
+the program.
 """
 
 from datetime import UTC, datetime
@@ -21,7 +21,7 @@ LARGE = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 REAL: sa.Double[Any] = sa.Double()
 BINARY = sa.LargeBinary()
 JSON = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
-ORDERED_JSON = sa.JSON()  # keeps the order of keys, which JSONB does not
+ORDERED_JSON = sa.JSON()  # preserves the order of keys, unlike JSONB
 TIME = sa.DateTime(timezone=True)
 STATE = sa.String(16)
 TABLES = (
@@ -182,7 +182,7 @@ def _create_jobs() -> None:
         _refer("jobs", "project_id", "projects"),
     )
     _index("jobs", "project_id", "id")
-    # Claims and looks at the queue read these alone: a row may hold megabytes.
+    # Claims and polls of the queue read only these: a row may have megabytes.
     _index("jobs", "state", "priority", "id", "project_id", "n_runs", name="ix_jobs_queue")
     _index("jobs", "lease_owner", "state", "cancel_requested", "id", name="ix_jobs_owned")
 

@@ -1,4 +1,4 @@
-"""The body of a CSV file as columns: fast for clean blocks, field by field to name a fault."""
+"""Read the body of a CSV file: fast for clean blocks, field by field to locate a fault."""
 
 import csv
 from collections.abc import Callable, Iterable, Iterator
@@ -17,26 +17,26 @@ ColumnValues = FloatArray | NDArray[np.str_]
 
 
 class CsvTable:
-    """Columns of a file and the row of the file each sample stood in."""
+    """Columns of a file, and the row of the file of each sample."""
 
     def __init__(self, columns: dict[str, ColumnValues], rows: NDArray[np.int64]) -> None:
         self.columns, self.rows = columns, rows
 
     def parse_numbers(self, name: str) -> FloatArray:
-        """The values of a column of numbers."""
+        """Return the values of a column of numbers."""
         return np.asarray(self.columns[name], dtype=np.float64)
 
 
 def read_columns(lines: Iterable[str], layout: CsvLayout) -> CsvTable:
-    """All columns of the body; `lines` begin with the header.
+    """Read all columns of the body; `lines` begin with the header.
 
-    Empty fields and ``nan`` in columns of values become ``nan``: they are missing.
+    Empty fields and ``nan`` in value columns become ``nan``: they are missing.
 
     Raises
     ------
     InvalidUpload
-        With row and column, for a ragged row, a text or an infinite value in a column of
-        numbers, or a missing time; and if there are no rows.
+        If a row is ragged, a number is a text or infinite, or a time is missing; with row and
+        column. Also if there are no rows.
     """
     blocks = list(_iterate_blocks(lines, layout))
     if not blocks:
@@ -53,13 +53,13 @@ def _iterate_blocks(
     lines: Iterable[str], layout: CsvLayout
 ) -> Iterator[tuple[list[ColumnValues], NDArray[np.int64]]]:
     reader = csv.reader(lines, delimiter=layout.separator, strict=True)
-    before = 0
+    rows_before = 0
     try:
         next(reader)
-        before = 1
+        rows_before = 1
         while fields := list(islice(reader, BLOCK_ROWS)):
-            numbers = np.arange(before + 1, before + 1 + len(fields))
-            before += len(fields)
+            numbers = np.arange(rows_before + 1, rows_before + 1 + len(fields))
+            rows_before += len(fields)
             filled = np.fromiter((any(map(str.strip, row)) for row in fields), bool, len(fields))
             if not filled.all():
                 fields = [row for row, keep in zip(fields, filled, strict=True) if keep]
@@ -76,11 +76,11 @@ def _parse_block(
     width = len(layout.columns)
     for row, number in zip(fields, numbers, strict=True):
         if len(row) != width:
-            meant = ""
+            hint = ""
             if layout.separator == "," and len(row) > width:
-                meant = "; if commas are decimal here, part the columns by semicolons"
+                hint = "; if commas are decimal signs, separate the columns by semicolons"
             raise InvalidUpload(
-                f"this row has {len(row)} fields, but the header has {width}{meant}",
+                f"this row has {len(row)} fields, but the header has {width}{hint}",
                 row=int(number),
             )
     convert = _parse_decimal_comma if layout.has_decimal_commas else _parse_decimal_point
@@ -103,7 +103,7 @@ def _parse_column(
         if np.isfinite(values).all():
             return values
     except ValueError:
-        pass  # looked at field by field below, to name the one or to find it empty
+        pass  # parsed field by field below, to name the invalid field or to accept an empty one
     return np.array(
         [
             _parse_field(column, text, convert, int(number))
@@ -117,13 +117,15 @@ def _parse_field(column: CsvColumn, text: str, convert: Callable[[str], float], 
         value = convert(text) if text.strip() else float("nan")
     except ValueError:
         raise InvalidUpload(
-            f"found {_shorten_text(text)}, which is not a number{_suggest_cause(text, column, convert)}",
+            f"found {_shorten_text(text)}, which is not a number"
+            f"{_suggest_cause(text, column, convert)}",
             row=row,
             column=column.name,
         ) from None
     if isinf(value):
         raise InvalidUpload(
-            f"found {_shorten_text(text)}; values must be finite (an empty field is a missing value)",
+            f"found {_shorten_text(text)}; values must be finite "
+            "(an empty field is a missing value)",
             row=row,
             column=column.name,
         )

@@ -1,4 +1,4 @@
-"""What the first rows of a CSV file tell: separator, decimal sign, names, units, time column."""
+"""Detect the layout of a CSV file from its first rows: separator, decimal sign, names, units."""
 
 import csv
 import re
@@ -14,7 +14,7 @@ SEPARATORS = ("\t", ";", ",")
 TIME_NAMES = ("t", "t_s", "time", "time_s")
 SECOND_NAMES = ("", "s", "sec", "second", "seconds")
 LONGEST_TIME_UNIT = 86_400.0
-"""Seconds of a day: a longer unit is a slip."""
+"""Longest unit of time in s (a day); a longer one is taken for a mistake."""
 
 _UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
@@ -24,7 +24,7 @@ ColumnRole = Literal["time", "label", "value"]
 
 @dataclass(frozen=True, slots=True)
 class CsvColumn:
-    """One column: its name without the unit, and what it is."""
+    """One column: its name without the unit, its unit and its role."""
 
     name: str
     unit: str
@@ -33,7 +33,7 @@ class CsvColumn:
 
 @dataclass(frozen=True, slots=True)
 class CsvLayout:
-    """How a file is to be read."""
+    """Layout of a file."""
 
     columns: tuple[CsvColumn, ...]
     separator: str
@@ -41,19 +41,19 @@ class CsvLayout:
 
     @property
     def time_index(self) -> int | None:
-        """Place of the time column, if there is one."""
-        return next((i for i, one in enumerate(self.columns) if one.role == "time"), None)
+        """Index of the time column, if there is one."""
+        return next((i for i, column in enumerate(self.columns) if column.role == "time"), None)
 
 
 def detect_layout(
     lines: Sequence[str], segments: Sequence[str], sample_time: float | None
 ) -> CsvLayout:
-    """Layout of a file from its first lines.
+    """Detect the layout of a file from its first lines.
 
     Raises
     ------
     InvalidUpload
-        If there is no usable header, or the time is missing or told twice.
+        If there is no usable header, or if the time is missing or given twice.
     """
     separator = _detect_separator(lines[0])
     try:
@@ -79,8 +79,8 @@ def _detect_separator(header: str) -> str:
 
 
 def _split_unit(field: str) -> tuple[str, str]:
-    found = _UNIT.match(field.strip())
-    return (found["name"], found["unit"].strip()) if found else (field.strip(), "")
+    match = _UNIT.match(field.strip())
+    return (match["name"], match["unit"].strip()) if match else (field.strip(), "")
 
 
 def _is_number(field: str) -> bool:
@@ -98,9 +98,9 @@ def _check_names(names: Sequence[tuple[str, str]]) -> None:
             row=1,
         )
     seen: set[str] = set()
-    for place, (name, _) in enumerate(names, 1):
+    for number, (name, _) in enumerate(names, 1):
         if not name:
-            raise InvalidUpload(f"column {place} of the header has no name", row=1)
+            raise InvalidUpload(f"column {number} of the header has no name", row=1)
         if name in seen:
             raise InvalidUpload("two columns have this name; names must differ", row=1, column=name)
         seen.add(name)
@@ -109,15 +109,15 @@ def _check_names(names: Sequence[tuple[str, str]]) -> None:
 def _assign_roles(
     names: Sequence[tuple[str, str]], segments: Sequence[str], sample_time: float | None
 ) -> tuple[CsvColumn, ...]:
-    known = [name for name, _ in names]
+    column_names = [name for name, _ in names]
     for label in segments:
-        if label not in known:
+        if label not in column_names:
             raise InvalidUpload(
-                f"there is no label column {label!r}{suggest_name(label, known)}", row=1
+                f"there is no label column {label!r}{suggest_name(label, column_names)}", row=1
             )
-    is_time = [name.lower() in TIME_NAMES and name not in segments for name in known]
+    is_time = [name.lower() in TIME_NAMES and name not in segments for name in column_names]
     time = is_time.index(True) if any(is_time) else None
-    _check_time_column(None if time is None else names[time], known, sample_time)
+    _check_time_column(None if time is None else names[time], column_names, sample_time)
     return tuple(
         CsvColumn(name, unit, "time" if i == time else "label" if name in segments else "value")
         for i, (name, unit) in enumerate(names)
@@ -125,13 +125,13 @@ def _assign_roles(
 
 
 def _check_time_column(
-    column: tuple[str, str] | None, known: Sequence[str], sample_time: float | None
+    column: tuple[str, str] | None, column_names: Sequence[str], sample_time: float | None
 ) -> None:
     if column is None:
         if sample_time is None:
             raise InvalidUpload(
-                f"there is no time column; found {', '.join(known)}; name one of them t (in "
-                "seconds) or give the sampling period with sample_time",
+                f"there is no time column; found {', '.join(column_names)}. Name one of them t (in "
+                "seconds), or give the sampling period with sample_time.",
                 row=1,
             )
         if not 0 < sample_time < float("inf"):
@@ -142,7 +142,7 @@ def _check_time_column(
     name, unit = column
     if sample_time is not None:
         raise InvalidUpload(
-            "the file has this time column and sample_time is given too; leave one out",
+            "the file has this time column, and sample_time is given too; remove one of them",
             row=1,
             column=name,
         )
@@ -155,11 +155,11 @@ def _check_time_column(
 
 
 def find_unit_seconds(unit: str) -> float | None:
-    """Seconds in one unit of a time column; None if it is no unit of time."""
+    """Return the seconds in one unit of a time column; None if it is no unit of time."""
     if unit.lower() in SECOND_NAMES:
         return 1.0
-    found = find_conversion_factor(unit, "s")
-    return found if found is not None and 0 < found <= LONGEST_TIME_UNIT else None
+    seconds = find_conversion_factor(unit, "s")
+    return seconds if seconds is not None and 0 < seconds <= LONGEST_TIME_UNIT else None
 
 
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:

@@ -1,16 +1,16 @@
 """CSV files as recordings.
 
-The rules. The first column is ``t`` (also ``t_s``, ``time``, ``t [s]``) in seconds, or in the unit
-of time that its heading names (``t [min]``), or the sampling period is given. The header may carry
-a unit in brackets (``u [V]``). Comma, semicolon and tab separate; decimal commas are detected where
-the separator is not a comma. UTF-8, with or without a byte-order mark. An empty field or ``nan`` is
-a missing value: it is reported, an output is not scored there, and an input with one cannot be
-used. Times must grow, except from one segment to the next. Irregular times are kept as they are,
-never resampled.
+The first column is ``t`` (also ``t_s``, ``time``, ``t [s]``) in seconds, or in the unit of time of
+its heading (``t [min]``). Without it the sampling period must be given. The header may name units
+in brackets (``u [V]``). Separators are comma, semicolon and tab. Decimal commas are detected if the
+separator is not a comma. The text is UTF-8, with or without a byte-order mark.
 
-A recording as CSV, written while it is sent. Numbers come back bit for bit.
+An empty field or ``nan`` is a missing value and is reported. An output is not scored there, and an
+input with a missing value cannot be used. Times must increase, except from one segment to the next.
+Irregular times stay as they are; nothing is resampled.
 
-Repeats of a measurement, laid end to end on one time axis.
+Repeats of a measurement are segments, placed one after another on one time axis. A recording is
+also written as CSV, block by block, and its numbers come back bit for bit.
 """
 
 import csv
@@ -36,17 +36,17 @@ SegmentLabels = Mapping[str, float | str]
 def concatenate_segments(
     times: FloatArray, starts: IntArray, labels: Sequence[SegmentLabels]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
-    """Times on one axis for segments whose own times may all begin anew.
+    """Place segments, whose own times may all begin at 0, on one time axis.
 
-    Segment i begins at i steps, the step being the smallest of 1, 2, 5, 10, … · 10ᵏ s that is
-    longer than every segment: so a segment's place is easily read and its times stay exact.
+    Segment i begins at i steps. The step is the smallest of 1, 2, 5, 10, … · 10ᵏ s that is longer
+    than every segment. So the position of a segment is easily read and its times stay exact.
 
     Parameters
     ----------
     times : FloatArray, shape (N,)
-        Own times in s, growing within each segment.
+        Times of each segment in s, increasing within the segment.
     starts : IntArray, shape (n_segments,)
-        First sample of each.
+        Index of the first sample of each segment.
     labels : sequence of mappings, n_segments long
     """
     lasts = np.append(starts[1:], times.size) - 1
@@ -55,7 +55,7 @@ def concatenate_segments(
     segments = []
     for i, (first, last) in enumerate(zip(starts, lasts, strict=True)):
         origin, start = float(times[first]), i * step
-        # To the nanosecond: what a file's clock holds, so that a stored time is the same again.
+        # Rounded to the ns of a file's clock, so that a stored time is read back unchanged.
         axis[first : last + 1] = np.round(start + (times[first : last + 1] - origin), 9)
         segments.append(Segment(start, float(axis[last]), origin, dict(labels[i])))
     return axis, tuple(segments)
@@ -71,7 +71,7 @@ def _round_up_step(longest: float) -> float:
 PEEK_LINES = 200
 LONGEST_LINE = 1_000_000
 EPOCH_THRESHOLD_SECONDS = 1e8
-"""Times that begin later than this (s, three years) are a clock's, counted from some epoch."""
+"""Times (s) that begin later than this (three years) are clock times since some epoch."""
 
 
 def read_csv(
@@ -89,19 +89,19 @@ def read_csv(
     sample_time : float or None
         Sampling period in s, for a file without a time column.
     segments : sequence of str
-        Columns of labels, numbers or text. Consecutive rows with equal labels are a segment, in
-        which the time may start again. Segments are laid end to end on one axis.
+        Columns of labels, numbers or text. Consecutive rows with equal labels form a segment, and
+        the time may restart with each segment. Segments follow each other on one axis.
 
     Returns
     -------
     recording : Recording
     notes : tuple of str
-        What the user should know: missing values, irregular times, decimal commas.
+        Notes for the user: missing values, irregular times, decimal commas.
 
     Raises
     ------
     InvalidUpload
-        If the file cannot be used; with row (the header is row 1) and column.
+        If the file cannot be used. The error has the row (the header is row 1) and the column.
     """
     with _open_text(source) as stream:
         lines = _iterate_lines(stream)
@@ -139,15 +139,15 @@ def _iterate_lines(stream: TextIOWrapper) -> Iterator[str]:
                 raise InvalidUpload(f"the row is longer than {LONGEST_LINE} characters", row=number)
             yield line
     except UnicodeDecodeError as error:
-        wrong = error.object[error.start]
+        invalid_byte = error.object[error.start]
         raise InvalidUpload(
-            f"the file is not UTF-8 text (byte 0x{wrong:02x}); save it as CSV in UTF-8",
+            f"the file is not UTF-8 text (byte 0x{invalid_byte:02x}); save it as CSV in UTF-8",
             row=_find_undecodable_row(cast(BinaryIO, stream.buffer)),
         ) from None
 
 
 def _find_undecodable_row(binary: BinaryIO) -> int | None:
-    # The decoder works on blocks of many rows, so the row is looked for again.
+    # The decoder works on blocks of many rows, so the row is searched here.
     binary.seek(0)
     for number, raw in enumerate(iter(lambda: binary.readline(LONGEST_LINE), b""), 1):
         try:
@@ -160,18 +160,20 @@ def _find_undecodable_row(binary: BinaryIO) -> int | None:
 def _build_times(
     table: CsvTable, layout: CsvLayout, sample_time: float | None, notes: list[str]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
-    """Times on the recording's axis, and the segments."""
+    """Build the times on the recording's axis, and the segments."""
     labels = [column.name for column in layout.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
-    place = layout.time_index
-    if place is None:
-        assert sample_time is not None  # the layout has checked it
-        ends = [*starts[1:], table.rows.size]
-        counts = [np.arange(b - a) for a, b in zip(starts, ends, strict=True)]
+    time_index = layout.time_index
+    if time_index is None:
+        assert sample_time is not None  # checked with the layout
+        stops = [*starts[1:], table.rows.size]
+        counts = [np.arange(b - a) for a, b in zip(starts, stops, strict=True)]
         times = np.concatenate(counts) * sample_time
     else:
-        name = layout.columns[place].name
-        times = _convert_to_seconds(table.parse_numbers(name), layout.columns[place].unit, notes)
+        name = layout.columns[time_index].name
+        times = _convert_to_seconds(
+            table.parse_numbers(name), layout.columns[time_index].unit, notes
+        )
         _check_increasing(times, starts, table, name)
         _report_repeated_times(times, starts, notes)
         times = _subtract_epoch(times, notes)
@@ -179,11 +181,11 @@ def _build_times(
         _report_irregular_sampling(times, notes)
         return times, ()
     values = {label: _parse_labels(table.columns[label]) for label in labels}
-    each: list[SegmentLabels] = [
+    segment_labels: list[SegmentLabels] = [
         {label: column[first] for label, column in values.items()} for first in starts
     ]
-    axis, spans = concatenate_segments(times, starts, each)
-    notes.append(f"{len(spans)} segments are laid end to end on one time axis")
+    axis, spans = concatenate_segments(times, starts, segment_labels)
+    notes.append(f"{len(spans)} segments follow each other on one time axis")
     return axis, spans
 
 
@@ -209,15 +211,15 @@ def _convert_to_seconds(times: FloatArray, unit: str, notes: list[str]) -> Float
     size = find_unit_seconds(unit) or 1.0
     if size == 1.0:
         return times
-    notes.append(f"times were converted from {unit} to s: lags and time constants are in s")
-    # A product with a whole number of units per second would not be the double nearest to it.
+    notes.append(f"times were converted from {unit} to s: delays and time constants are in s")
+    # Division by a whole number of units per second is correctly rounded, a product is not.
     converted: FloatArray = times * size if size > 1.0 else times / round(1.0 / size)
     return converted
 
 
 def _check_increasing(times: FloatArray, starts: IntArray, table: CsvTable, name: str) -> None:
     steps = np.diff(times)
-    # Repeats are there to be pooled, and pooled samples may share a time.
+    # Repeats may be pooled, and pooled samples may share a time.
     stays = steps < 0 if starts.size > 1 else steps <= 0
     stays[starts[1:] - 1] = False
     wrong = np.flatnonzero(stays)
@@ -226,8 +228,8 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: CsvTable, name
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
     raise InvalidUpload(
-        f"the time {what}: {before!r} s is followed by {after!r} s; times must grow from row to "
-        "row (name the label columns of repeated measurements with segments)",
+        f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
+        "row to row. For repeated measurements, name their label columns with segments.",
         row=int(table.rows[wrong[0] + 1]),
         column=name,
     )
@@ -237,13 +239,15 @@ def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]
     shared = np.diff(times) == 0
     shared[starts[1:] - 1] = False
     if count := int(np.count_nonzero(shared)):
-        notes.append(f"{count} samples have the same time as the one before, in their segment")
+        notes.append(f"{count} samples have the same time as the previous sample of their segment")
 
 
 def _subtract_epoch(times: FloatArray, notes: list[str]) -> FloatArray:
     if float(np.min(times)) < EPOCH_THRESHOLD_SECONDS:
         return times
-    notes.append(f"times are counted from the first, {float(times[0])!r} s of the file's clock")
+    notes.append(
+        f"times are counted from the first sample, at {float(times[0])!r} s of the file's clock"
+    )
     shifted: FloatArray = times - times[0]
     return shifted
 
@@ -254,7 +258,7 @@ def _report_irregular_sampling(times: FloatArray, notes: list[str]) -> None:
         gaps = np.diff(times)
         notes.append(
             f"sampling is irregular: {gaps.min():.4g} to {gaps.max():.4g} s between samples, "
-            f"median {sampling.period:.4g} s; the samples are used at their own times"
+            f"median {sampling.period:.4g} s. Each sample is used at its own time."
         )
 
 
@@ -285,8 +289,8 @@ def _report_missing_values(
         raise InvalidUpload("every value is missing; leave the column out", column=name)
     notes.append(
         f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
-        f"first in row {table.rows[missing[0]]}; as an output they are not scored, as an input "
-        "the channel cannot be used"
+        f"first in row {table.rows[missing[0]]}. An output is not scored at missing values. "
+        "An input with missing values cannot be used."
     )
 
 
@@ -294,10 +298,10 @@ WRITTEN_BLOCK_ROWS = 5000
 
 
 def generate_csv(recording: Recording) -> Iterator[str]:
-    """CSV text in blocks: time in s, label columns of segments, one column a channel.
+    """Generate CSV text in blocks: time in s, label columns of segments, one column per channel.
 
-    In a segment the time is the segment's own, so that an upload with ``?segments=`` and the
-    label columns gives the same recording. Channels with other times have rows of their own.
+    Within a segment the times are those of the segment. So an upload with ``?segments=`` and the
+    label columns gives the same recording. Channels with different times have separate rows.
     """
     labels = sorted({name for segment in recording.segments for name in segment.labels})
     buffer = StringIO()
@@ -322,7 +326,7 @@ def _iterate_rows(recording: Recording, labels: list[str]) -> Iterator[list[str]
 
 
 def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
-    """Times in their order; what a channel does not have at a time stays empty."""
+    """Yield times in order, with the values of all channels; a missing value is empty."""
     groups: list[list[int]] = []
     channels = recording.channels
     for index, channel in enumerate(channels):
@@ -333,21 +337,23 @@ def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
         else:
             groups.append([index])
     times = np.concatenate([channels[group[0]].times for group in groups])
-    whose = np.concatenate(
+    group_of_sample = np.concatenate(
         [np.full(channels[group[0]].times.size, number) for number, group in enumerate(groups)]
     )
-    place = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
+    index_in_group = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
     for index in np.argsort(times, kind="stable").tolist():
         yield (
             float(times[index]),
-            _format_values(channels, groups[int(whose[index])], int(place[index])),
+            _format_values(
+                channels, groups[int(group_of_sample[index])], int(index_in_group[index])
+            ),
         )
 
 
-def _format_values(channels: tuple[Channel, ...], filled: list[int], place: int) -> list[str]:
+def _format_values(channels: tuple[Channel, ...], members: list[int], sample: int) -> list[str]:
     row = [""] * len(channels)
-    for index in filled:
-        row[index] = _format_value(float(channels[index].values[place]))
+    for index in members:
+        row[index] = _format_value(float(channels[index].values[sample]))
     return row
 
 

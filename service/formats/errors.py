@@ -1,8 +1,8 @@
-"""Errors of reading what a user uploads.
+"""Errors of reading uploaded files.
 
 * ServiceError (service.core.errors)
     - InvalidRequest
-        - InvalidUpload      a file that cannot be used, with the place: row and column, or byte
+        - InvalidUpload      a file that cannot be used, with row and column, or byte
 """
 
 from service.core.errors import FieldError, InvalidRequest
@@ -10,18 +10,18 @@ from sysid.core.errors import join_pointer
 
 
 class InvalidUpload(InvalidRequest, ValueError):
-    """A file that a user sent cannot be used.
+    """An uploaded file cannot be used.
 
     Attributes
     ----------
     detail : str
-        What was wrong, where, and what would be right: one line.
+        What was wrong, where, and what would be right; one line.
     row : int or None
         Row of a CSV file, from 1; the header is row 1.
     column : str or None
         Name of the column of a CSV file.
     byte : int or None
-        Place in an MCAP file, from 0.
+        Position in an MCAP file, from 0.
     """
 
     kind, title = "invalid-upload", "The file cannot be used"
@@ -44,9 +44,9 @@ class InvalidUpload(InvalidRequest, ValueError):
 def _format_place(row: int | None, column: str | None, byte: int | None) -> str:
     if byte is not None:
         return f"at byte {byte}: "
-    named = [] if row is None else [f"row {row}"]
-    named += [] if column is None else [f"column {column!r}"]
-    return f"{', '.join(named)}: " if named else ""
+    parts = [] if row is None else [f"row {row}"]
+    parts += [] if column is None else [f"column {column!r}"]
+    return f"{', '.join(parts)}: " if parts else ""
 
 
 def _build_pointer(row: int | None, column: str | None, byte: int | None) -> str:

@@ -1,4 +1,4 @@
-"""How large an upload may be, and what reading it may cost."""
+"""Limits of an upload, and of the process that reads it."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ GIB = 1024**3
 
 @dataclass(frozen=True, slots=True)
 class UploadLimits:
-    """Limits of one upload. Lengths count both as declared and as found.
+    """Limits of one upload. They hold for declared and for actual lengths.
 
     Attributes
     ----------

@@ -1,6 +1,7 @@
-"""MCAP files as recordings: ours by their manifest, others by their schemas.
+"""Read and write recordings and fitted signals as MCAP files.
 
-Recordings and fitted signals as MCAP files, one chunk as one array of messages.
+Files written by lagid are read by their manifest, others by their schemas. One chunk is one array
+of messages.
 """
 
 import io
@@ -41,7 +42,7 @@ from sysid.data.records import Channel, History, Recording
 
 
 class ByteSink(Protocol):
-    """What a file is written to: anything that takes bytes."""
+    """Target of a file: any object that takes bytes."""
 
     def write(self, data: bytes, /) -> object:
         """Take the next bytes."""
@@ -84,18 +85,18 @@ def write_recording(
     """Write a recording as an MCAP file.
 
     The same recording and metadata give the same bytes. Values and times come back bit for bit.
-    What was recorded before the first samples stands in topics of its own, below ``/history``.
+    Samples before the start of the record are stored in separate topics below ``/history``.
 
     Parameters
     ----------
     target : path or writable
     metadata : mapping of str to str
-        Added to the record ``lagid.dataset``: hash of the source, parents, name …
+        Entries added to the record ``lagid.dataset``: hash of the source, parents, name …
 
     Raises
     ------
     ValueError
-        If the times do not fit into a file's clock, or a metadata key is the file's own.
+        If the times exceed the range of a file's clock, or a metadata key is reserved.
     """
     topics, history = group_into_topics(recording), group_history_topics(recording)
     manifest = build_manifest(recording, topics, metadata or {}, history)
@@ -109,10 +110,10 @@ def write_fitted_outputs(
     *,
     metadata: Mapping[str, str] | None = None,
 ) -> None:
-    """Write what a run identified as an MCAP file.
+    """Write the fitted signals of a run as an MCAP file.
 
-    Topic ``/fit/<run>`` has for each output the fields ``<output>`` (simulated),
-    ``<output>_measured`` and ``<output>_residual``; further experiments, and outputs with other
+    Topic ``/fit/<run>`` has three fields per output: ``<output>`` (simulated),
+    ``<output>_measured`` and ``<output>_residual``. Further experiments, and outputs with other
     times, have topics below it.
     """
     groups: list[list[FittedOutput]] = []
@@ -135,14 +136,16 @@ def write_fitted_outputs(
 
 
 def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
-    """Channels of one output; '/' separates experiment, output and what it is."""
-    named = f"{fit.experiment}/{fit.name}"
+    """Return the channels of one output; '/' separates experiment, output and signal."""
+    prefix = f"{fit.experiment}/{fit.name}"
     values = (
         ("simulated", fit.simulated),
         ("measured", fit.measured),
         ("residual", fit.measured - fit.simulated),
     )
-    return tuple(Channel(f"{named}/{what}", fit.times, data, fit.unit) for what, data in values)
+    return tuple(
+        Channel(f"{prefix}/{signal}", fit.times, data, fit.unit) for signal, data in values
+    )
 
 
 def _write_file(target: McapTarget, topics: Sequence[Topic], manifest: Mapping[str, str]) -> None:
@@ -159,10 +162,10 @@ def _write_file(target: McapTarget, topics: Sequence[Topic], manifest: Mapping[s
 
 
 EPOCH_THRESHOLD_NS = 10**17
-"""Log times from here on (three years) are a clock's: they are counted from the first."""
+"""Log times (ns) from this on (three years) are clock times, counted from the first one."""
 
 _TopicColumns = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
-"""Of every topic its times and its columns."""
+"""Times and columns of every topic."""
 
 McapSource = str | os.PathLike[str] | bytes | BinaryIO
 
@@ -181,7 +184,7 @@ def read_recording(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) ->
 def read_fitted_outputs(
     source: McapSource, limits: UploadLimits = DEFAULT_LIMITS
 ) -> tuple[FittedOutput, ...]:
-    """Read what `write_fitted_outputs` wrote.
+    """Read a file of `write_fitted_outputs`.
 
     Raises
     ------
@@ -191,11 +194,11 @@ def read_fitted_outputs(
     recording = read_recording(source, limits)
     fits = []
     for channel in recording.channels:
-        named, _, what = channel.name.rpartition("/")
-        if what != "simulated":
+        prefix, _, signal = channel.name.rpartition("/")
+        if signal != "simulated":
             continue
-        experiment, _, name = named.partition("/")
-        measured = recording.channel(f"{named}/measured").values
+        experiment, _, name = prefix.partition("/")
+        measured = recording.channel(f"{prefix}/measured").values
         role, _, number = experiment.partition(" ")
         fits.append(
             FittedOutput(
@@ -216,7 +219,7 @@ def read_fitted_outputs(
 def read_mcap_with_notes(
     source: McapSource, limits: UploadLimits
 ) -> tuple[Recording, tuple[str, ...]]:
-    """Read a recording, and notes on what was left out or changed.
+    """Read a recording, with notes on what was skipped or changed.
 
     Raises
     ------
@@ -283,9 +286,9 @@ def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns)
     if channel.name not in manifest.history:
         return channel
     topic, field = manifest.history[channel.name]
-    found = History(*_find_column(f"the history of {channel.name!r}", topic, field, topics))
+    history = History(*_find_column(f"the history of {channel.name!r}", topic, field, topics))
     try:
-        return replace(channel, history=found)
+        return replace(channel, history=history)
     except InvalidRecord as error:
         raise InvalidUpload(str(error)) from None
 
@@ -296,7 +299,7 @@ def _find_column(
     times, columns = topics.get(topic, (np.empty(0), {}))
     if field not in columns:
         raise InvalidUpload(
-            f"{what} should be field {field!r} of topic {topic!r}, which the file does not hold"
+            f"{what} refers to field {field!r} of topic {topic!r}, which the file does not have"
         )
     return times, columns[field]
 
@@ -304,20 +307,24 @@ def _find_column(
 def _build_foreign_recording(
     content: McapContent, limits: UploadLimits
 ) -> tuple[Recording, tuple[str, ...]]:
-    read = [(source, *sort_columns(source)) for source in content.channels.values()]
-    usable = [one for one in read if one[2]]
+    topics = [(source, *sort_columns(source)) for source in content.channels.values()]
+    usable = [topic for topic in topics if topic[2]]
     if not usable:
         raise build_no_signal_error(content)
     notes = [
-        f"topic {source.topic!r} is left out: {source.refusal}"
+        f"topic {source.topic!r} is skipped: {source.refusal}"
         for source in content.channels.values()
         if source.refusal
     ]
-    notes += [f"topic {one[0].topic!r} was not in the order of time" for one in usable if one[3]]
+    notes += [
+        f"topic {topic[0].topic!r} was sorted: it was not in order of time"
+        for topic in usable
+        if topic[3]
+    ]
     first = min(int(times[0]) for _, times, _, _ in usable)
     start = first if first >= EPOCH_THRESHOLD_NS else 0
     if start:
-        notes.append(f"times are counted from the first, {start} ns of the file's clock")
+        notes.append(f"times are counted from the first message, at {start} ns of the file's clock")
     channels: dict[str, Channel] = {}
     for source, log_times, columns, _ in usable:
         times = (log_times - np.uint64(start)).astype(np.float64) / 1e9
@@ -325,7 +332,9 @@ def _build_foreign_recording(
             name = _choose_free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
             channels[name] = Channel(name, times, values)
     if len(channels) > limits.channels:
-        raise InvalidUpload(f"the file has {len(channels)} signals; at most {limits.channels}")
+        raise InvalidUpload(
+            f"the file has {len(channels)} signals; at most {limits.channels} are read"
+        )
     return Recording(tuple(channels.values())), tuple(notes)
 
 

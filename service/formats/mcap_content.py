@@ -1,4 +1,4 @@
-"""All channels of an MCAP file as columns, within limits."""
+"""Read all channels of an MCAP file as columns, within limits."""
 
 import struct
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
 @dataclass(eq=False)
 class McapChannel:
-    """One MCAP channel: how it is read, and what has been read. `refused` says why it is not."""
+    """One MCAP channel: its decoder and its columns. `refusal` says why it cannot be read."""
 
     topic: str
     layout: FlatLayout | None = None
@@ -45,7 +45,7 @@ class McapChannel:
 
 @dataclass(eq=False)
 class McapContent:
-    """What a file holds: sources by channel number, and its metadata records by name."""
+    """Content of a file: channels by number, and metadata records by name."""
 
     channels: dict[int, McapChannel] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -57,7 +57,7 @@ def read_content(binary: BinaryIO, size: int, limits: UploadLimits) -> McapConte
     Raises
     ------
     InvalidUpload
-        With the byte, if the file is damaged, goes beyond a limit, or contradicts itself.
+        If the file is damaged, exceeds a limit, or contradicts itself; with the byte.
     """
     reader = _ContentReader(limits)
     for record in iterate_records(binary, size, limits):
@@ -74,13 +74,13 @@ class _ContentReader:
         self._messages = self._total = 0
 
     def add_record(self, record: RawRecord) -> None:
-        """Take a record of the data section."""
+        """Add a record of the data section."""
         if record.opcode == Opcode.CHUNK:
             content = decompress_chunk(record, self._limits)
             self._total += len(content)
             if self._total > self._limits.total_bytes:
                 record.raise_invalid(
-                    f"brings the content to more than {self._limits.total_bytes} bytes"
+                    f"raises the total content to more than {self._limits.total_bytes} bytes"
                 )
             self._add_chunk(record, content)
         elif record.opcode == Opcode.METADATA:
@@ -91,7 +91,7 @@ class _ContentReader:
             self._add_inner_record(record)
 
     def _add_inner_record(self, record: RawRecord) -> None:
-        """Take a record that may stand in a chunk as well as outside."""
+        """Add a record that may stand inside a chunk or outside."""
         if record.opcode == Opcode.MESSAGE:
             self._add_message(record)
         elif record.opcode == Opcode.SCHEMA:
@@ -102,23 +102,23 @@ class _ContentReader:
     def _add_chunk(self, chunk: RawRecord, content: bytes) -> None:
         if self._add_uniform_chunk(chunk, content):
             return
-        at = 0
-        while at < len(content):
-            if len(content) - at < RECORD_HEAD.size:
+        position = 0
+        while position < len(content):
+            if len(content) - position < RECORD_HEAD.size:
                 chunk.raise_invalid(
-                    f"ends inside the head of a record, at byte {at} of its content"
+                    f"ends inside the head of a record, at byte {position} of its content"
                 )
-            opcode, length = RECORD_HEAD.unpack_from(content, at)
-            start, at = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
-            if at > len(content):
+            opcode, length = RECORD_HEAD.unpack_from(content, position)
+            start, position = position + RECORD_HEAD.size, position + RECORD_HEAD.size + length
+            if position > len(content):
                 chunk.raise_invalid(
-                    f"ends inside the {describe_opcode(opcode)} record at byte {start - RECORD_HEAD.size} of its "
-                    "content"
+                    f"ends inside the {describe_opcode(opcode)} record at byte "
+                    f"{start - RECORD_HEAD.size} of its content"
                 )
-            self._add_inner_record(RawRecord(opcode, chunk.byte, content[start:at]))
+            self._add_inner_record(RawRecord(opcode, chunk.byte, content[start:position]))
 
     def _add_uniform_chunk(self, chunk: RawRecord, content: bytes) -> bool:
-        """Take a chunk of messages that all have their channel's flat layout, at once."""
+        """Add a chunk at once, if all its messages have the channel's flat layout."""
         if len(content) < RECORD_HEAD.size + 2 or content[0] != Opcode.MESSAGE:
             return False
         source = self.content.channels.get(
@@ -145,9 +145,11 @@ class _ContentReader:
             )
         schema = MessageSchema(name, encoding, fields.read_bytes(length))
         if number == 0 or self._schemas.setdefault(number, schema) != schema:
-            record.raise_invalid(f"uses the number {number}, which is not free")
+            record.raise_invalid(f"uses the number {number}, which is not available")
         if len(self._schemas) > self._limits.channels:
-            record.raise_invalid(f"is one too many; at most {self._limits.channels} are read")
+            record.raise_invalid(
+                f"exceeds the limit; at most {self._limits.channels} schemas are read"
+            )
 
     def _add_channel(self, record: RawRecord) -> None:
         fields = RecordCursor(record)
@@ -156,14 +158,18 @@ class _ContentReader:
         fields.read_mapping()
         entry = (schema_number, topic, encoding)
         if self._schemas_of.setdefault(number, entry) != entry:
-            record.raise_invalid(f"uses the number {number} a second time, for something else")
+            record.raise_invalid(f"uses the number {number} again, with another definition")
         if number in self.content.channels:
             return
         if len(self.content.channels) >= self._limits.channels:
-            record.raise_invalid(f"is one too many; at most {self._limits.channels} are read")
+            record.raise_invalid(
+                f"exceeds the limit; at most {self._limits.channels} channels are read"
+            )
         schema = self._schemas.get(schema_number)
         if schema is None and schema_number != 0:
-            record.raise_invalid(f"names schema {schema_number}, which does not come before it")
+            record.raise_invalid(
+                f"refers to schema {schema_number}, which is not defined before it"
+            )
         source = self.content.channels[number] = McapChannel(topic)
         try:
             source.decode = choose_decoder(encoding, schema)
@@ -179,7 +185,7 @@ class _ContentReader:
         number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(record.body)
         source = self.content.channels.get(number)
         if source is None:
-            record.raise_invalid(f"names channel {number}, which does not come before it")
+            record.raise_invalid(f"refers to channel {number}, which is not defined before it")
         if log_time >= LATEST_NS:
             record.raise_invalid("has a time beyond 2⁶³ ns")
         self._count_messages(record, 1)
@@ -192,16 +198,18 @@ class _ContentReader:
         if source.columns.count_names() > self._limits.channels:
             record.raise_invalid(f"has more than {self._limits.channels} fields")
 
-    def _count_messages(self, record: RawRecord, more: int) -> None:
-        self._messages += more
+    def _count_messages(self, record: RawRecord, count: int) -> None:
+        self._messages += count
         if self._messages > self._limits.messages:
-            record.raise_invalid(f"brings the messages to more than {self._limits.messages}")
+            record.raise_invalid(
+                f"raises the number of messages to more than {self._limits.messages}"
+            )
 
 
 def sort_columns(
     source: McapChannel,
 ) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]], bool]:
-    """Log times, columns, and whether they had to be sorted by time."""
+    """Return log times and columns sorted by time, and whether sorting changed them."""
     times, columns = source.columns.concatenate_blocks()
     if np.all(times[1:] >= times[:-1]):
         return times, columns, False
@@ -210,7 +218,7 @@ def sort_columns(
 
 
 def build_no_signal_error(content: McapContent) -> InvalidUpload:
-    """Return the error of a file without a signal: for each topic, why."""
+    """Return the error of a file without a signal, with a reason for each topic."""
     reasons = [
         f"topic {source.topic!r}: {source.refusal or 'there is no message'}"
         for source in content.channels.values()

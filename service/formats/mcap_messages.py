@@ -1,10 +1,8 @@
 """Messages of one channel as columns of numbers.
 
-A run of messages that all have the layout of a flat protobuf message with every field written
-(as our own files have) is read as one array. All others are decoded one by one: protobuf by its
-schema, JSON by its keys.
-
-Protobuf schemas of flat messages of doubles, and the fixed layout of such a message.
+Our files have flat protobuf messages of doubles with every field written, so all have the same
+layout. A sequence of such messages is read as one array. Other messages are decoded one by one:
+protobuf by its schema, JSON by its keys.
 """
 
 import json
@@ -29,10 +27,10 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 MESSAGE_HEADER = 9
-"""Opcode and length, which every MCAP record begins with."""
+"""Size of opcode and length, with which every MCAP record begins."""
 
 _CACHE_SIZE = 64
-"""Names and layouts that are remembered: the files of a sweep's runs have the same ones."""
+"""Cached names and layouts: the files of the runs of a sweep share them."""
 
 _WIRE_TYPES = {
     FieldDescriptorProto.TYPE_DOUBLE: (1, "<f8"),
@@ -49,26 +47,26 @@ class NumericField(NamedTuple):
 
 
 def make_identifiers(names: Iterable[str]) -> tuple[str, ...]:
-    """Return names that protobuf allows, all different, as near to `names` as can be."""
+    """Return distinct names that protobuf allows, as similar to `names` as possible."""
     return _make_unique_identifiers(tuple(names))
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _make_unique_identifiers(names: tuple[str, ...]) -> tuple[str, ...]:
-    made: list[str] = []
+    identifiers: list[str] = []
     for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII).strip("_") or "channel"
         plain = plain if not plain[0].isdigit() else f"c{plain}"
         number, unique = 2, plain
-        while unique.lower() in {one.lower() for one in made}:
+        while unique.lower() in {identifier.lower() for identifier in identifiers}:
             number, unique = number + 1, f"{plain}_{number}"
-        made.append(unique)
-    return tuple(made)
+        identifiers.append(unique)
+    return tuple(identifiers)
 
 
 def build_schema(message: str, fields: Sequence[str]) -> bytes:
     """Return the FileDescriptorSet of message ``lagid.<message>`` with one double per field."""
-    fields_of = [
+    descriptors = [
         FieldDescriptorProto(
             name=name,
             number=number,
@@ -81,19 +79,19 @@ def build_schema(message: str, fields: Sequence[str]) -> bytes:
         name=f"lagid/{message}.proto",
         package="lagid",
         syntax="proto3",
-        message_type=[DescriptorProto(name=message, field=fields_of)],
+        message_type=[DescriptorProto(name=message, field=descriptors)],
     )
     return bytes(FileDescriptorSet(file=[file]).SerializeToString(deterministic=True))
 
 
 def _iterate_field_numbers() -> Iterable[int]:
     yield from range(1, 19_000)
-    yield from range(20_000, 2**29)  # those between belong to protobuf itself
+    yield from range(20_000, 2**29)  # the numbers between are reserved by protobuf
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def make_double_fields(names: tuple[str, ...]) -> tuple[NumericField, ...]:
-    """Fields of a message of `build_schema`."""
+    """Return the fields of a message of `build_schema`."""
     return tuple(
         NumericField(name, number)
         for number, name in zip(_iterate_field_numbers(), names, strict=False)
@@ -101,31 +99,33 @@ def make_double_fields(names: tuple[str, ...]) -> tuple[NumericField, ...]:
 
 
 def parse_flat_fields(schema: bytes, message: str) -> tuple[NumericField, ...] | None:
-    """Fields of a message that consists of floats only; None if it is of another kind."""
+    """Return the fields of a message that consists of floats only; else None."""
     try:
         files = FileDescriptorSet.FromString(schema).file
     except DecodeError:
         return None
     for file in files:
-        for found in file.message_type:
-            if f"{file.package}.{found.name}".lstrip(".") == message:
-                return _parse_flat_message(found)
+        for message_type in file.message_type:
+            if f"{file.package}.{message_type.name}".lstrip(".") == message:
+                return _parse_flat_message(message_type)
     return None
 
 
 def _parse_flat_message(message: DescriptorProto) -> tuple[NumericField, ...] | None:
-    single = all(one.label != FieldDescriptorProto.LABEL_REPEATED for one in message.field)
+    single = all(field.label != FieldDescriptorProto.LABEL_REPEATED for field in message.field)
     if not message.field or not single or not all(f.type in _WIRE_TYPES for f in message.field):
         return None
-    ordered = sorted(message.field, key=lambda one: one.number)
-    return tuple(NumericField(one.name, one.number, _WIRE_TYPES[one.type][1]) for one in ordered)
+    ordered = sorted(message.field, key=lambda field: field.number)
+    return tuple(
+        NumericField(field.name, field.number, _WIRE_TYPES[field.type][1]) for field in ordered
+    )
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def make_record_dtype(fields: tuple[NumericField, ...]) -> np.dtype[np.void]:
-    """One MCAP message record whose protobuf content writes every field, zeros too.
+    """Return the dtype of a message record whose protobuf content writes every field, zeros too.
 
-    ``tag0, value0, tag1, …`` follow the record's own fields; a tag is 1 to 5 bytes.
+    After the fields of the record follow ``tag0, value0, tag1, …``; a tag has 1 to 5 bytes.
     """
     parts: list[tuple[str, str]] = [
         ("opcode", "u1"),
@@ -142,13 +142,13 @@ def make_record_dtype(fields: tuple[NumericField, ...]) -> np.dtype[np.void]:
 
 
 def encode_tag_value(field: NumericField) -> int | bytes:
-    """The field's tag as it stands in a `make_record_dtype`: numbers compare faster than texts."""
+    """Encode a tag for `make_record_dtype`, as a number if possible: numbers compare faster."""
     tag = encode_tag(field)
     return tag[0] if len(tag) == 1 else tag
 
 
 def encode_tag(field: NumericField) -> bytes:
-    """The field's tag as protobuf writes it: number and wire type as a varint."""
+    """Encode a tag as protobuf writes it: field number and wire type as a varint."""
     value = field.number << 3 | (1 if field.wire == "<f8" else 5)
     encoded = bytearray()
     while value > 0x7F:
@@ -158,7 +158,7 @@ def encode_tag(field: NumericField) -> bytes:
 
 
 MAX_NESTING: Final = 4
-"""Messages inside messages are looked into down to this depth."""
+"""Depth to which nested messages are read."""
 
 TIME_MESSAGES: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 NumbersByName = Mapping[str, float]
@@ -166,7 +166,7 @@ MessageDecoder = Callable[[bytes], NumbersByName]
 
 
 class UnreadableMessages(Exception):
-    """Messages of a channel cannot be read; the text says why."""
+    """The messages of a channel cannot be read; the text says why."""
 
 
 class MessageSchema(NamedTuple):
@@ -178,7 +178,7 @@ class MessageSchema(NamedTuple):
 
 
 class FlatLayout:
-    """A record layout, and what must stand at its fixed places."""
+    """A record layout, and the constants at its fixed positions."""
 
     def __init__(self, channel: int, fields: tuple[NumericField, ...]) -> None:
         self.names = tuple(field.name for field in fields)
@@ -191,7 +191,7 @@ class FlatLayout:
         ]
 
     def parse_chunk(self, content: bytes) -> NDArray[np.void] | None:
-        """All messages of a chunk, if every one has this layout."""
+        """Return all messages of a chunk; None unless every one has this layout."""
         if not content or len(content) % self.dtype.itemsize:
             return None
         messages = np.frombuffer(content, self.dtype)
@@ -203,7 +203,7 @@ class FlatLayout:
 def find_flat_layout(
     channel: int, encoding: str, schema: MessageSchema | None
 ) -> FlatLayout | None:
-    """Layout of a channel's messages, if its schema is one of plain floats."""
+    """Return the layout of a channel's messages if its schema has plain floats only; else None."""
     if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         return None
     fields = parse_flat_fields(schema.data, schema.name)
@@ -211,12 +211,12 @@ def find_flat_layout(
 
 
 def choose_decoder(encoding: str, schema: MessageSchema | None) -> MessageDecoder:
-    """Return what decodes a channel's messages one by one.
+    """Return the decoder of a channel's messages.
 
     Raises
     ------
-    Unreadable
-        If messages of that encoding are not read, or the schema is of no use.
+    UnreadableMessages
+        If the encoding is not supported, or the schema is unusable.
     """
     if encoding == "json":
         return _decode_json
@@ -225,7 +225,9 @@ def choose_decoder(encoding: str, schema: MessageSchema | None) -> MessageDecode
             raise UnreadableMessages("its protobuf messages have no protobuf schema")
         return _make_protobuf_decoder(schema)
     if encoding == "cdr":
-        raise UnreadableMessages("its messages are ROS 2 CDR, which is not read: export it as CSV")
+        raise UnreadableMessages(
+            "its messages are ROS 2 CDR, which is not supported; export them as CSV"
+        )
     raise UnreadableMessages(
         f"its messages are encoded as {encoding[:40]!r}; need protobuf or json"
     )
@@ -233,27 +235,27 @@ def choose_decoder(encoding: str, schema: MessageSchema | None) -> MessageDecode
 
 def _decode_json(data: bytes) -> NumbersByName:
     try:
-        found = json.loads(data)
+        document = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise UnreadableMessages(f"a message is not JSON ({type(error).__name__})") from None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         raise UnreadableMessages("a message is not a JSON object")
-    return dict(_flatten_numbers(found, "", MAX_NESTING))
+    return dict(_flatten_numbers(document, "", MAX_NESTING))
 
 
 def _flatten_numbers(
-    found: Mapping[str, object], before: str, depth: int
+    document: Mapping[str, object], prefix: str, depth: int
 ) -> Iterator[tuple[str, float]]:
-    for name, value in found.items():
+    for name, value in document.items():
         if isinstance(value, bool | int | float):
             try:
-                yield before + name, float(value)
+                yield prefix + name, float(value)
             except OverflowError:
                 raise UnreadableMessages(
                     f"the value of {name!r} is too large for a double"
                 ) from None
         elif isinstance(value, dict) and depth > 1:
-            yield from _flatten_numbers(value, f"{before}{name}.", depth - 1)
+            yield from _flatten_numbers(value, f"{prefix}{name}.", depth - 1)
 
 
 def _make_protobuf_decoder(schema: MessageSchema) -> MessageDecoder:
@@ -261,8 +263,8 @@ def _make_protobuf_decoder(schema: MessageSchema) -> MessageDecoder:
         pool = DescriptorPool()
         for file in FileDescriptorSet.FromString(schema.data).file:
             pool.Add(file)
-        made = GetMessageClass(pool.FindMessageTypeByName(schema.name))
-        getters = dict(_iterate_field_paths(made.DESCRIPTOR, "", (), MAX_NESTING))
+        message_class = GetMessageClass(pool.FindMessageTypeByName(schema.name))
+        getters = dict(_iterate_field_paths(message_class.DESCRIPTOR, "", (), MAX_NESTING))
     except (DecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise UnreadableMessages(f"its schema cannot be used ({type(error).__name__})") from None
     if not getters:
@@ -270,7 +272,7 @@ def _make_protobuf_decoder(schema: MessageSchema) -> MessageDecoder:
 
     def decode(data: bytes) -> NumbersByName:
         try:
-            message = made.FromString(data)
+            message = message_class.FromString(data)
         except (DecodeError, RecursionError):
             raise UnreadableMessages("a message does not follow its schema") from None
         return {name: _get_number(message, path) for name, path in getters.items()}
@@ -279,30 +281,30 @@ def _make_protobuf_decoder(schema: MessageSchema) -> MessageDecoder:
 
 
 def _iterate_field_paths(
-    message: Descriptor, before: str, path: tuple[str, ...], depth: int
+    message: Descriptor, prefix: str, path: tuple[str, ...], depth: int
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     for field in message.fields:
         if field.is_repeated:
             continue
-        here = (*path, field.name)
+        field_path = (*path, field.name)
         if field.cpp_type == FieldDescriptor.CPPTYPE_MESSAGE:
             if depth > 1 and field.message_type.full_name not in TIME_MESSAGES:
                 yield from _iterate_field_paths(
-                    field.message_type, f"{before}{field.name}.", here, depth - 1
+                    field.message_type, f"{prefix}{field.name}.", field_path, depth - 1
                 )
         elif field.cpp_type != FieldDescriptor.CPPTYPE_STRING:
-            yield before + field.name, here
+            yield prefix + field.name, field_path
 
 
 def _get_number(message: Message, path: tuple[str, ...]) -> float:
-    found: object = message
+    value: object = message
     for name in path:
-        found = getattr(found, name)
-    return float(found)  # type: ignore[arg-type]
+        value = getattr(value, name)
+    return float(value)  # type: ignore[arg-type]
 
 
 class MessageColumns:
-    """Columns of one channel, as its messages come.
+    """Columns of one channel, collected from its messages.
 
     A name that a message lacks is missing (``nan``) there.
     """
@@ -334,7 +336,7 @@ class MessageColumns:
         return len(self._columns)
 
     def concatenate_blocks(self) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]]]:
-        """Return log times and columns of all messages, in the file's order."""
+        """Return log times and columns of all messages, in the order of the file."""
         self._close_block()
         names = list(dict.fromkeys(name for _, columns in self._blocks for name in columns))
         if not names:

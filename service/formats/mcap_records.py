@@ -1,10 +1,9 @@
 """One pass over the records of an MCAP file that may be damaged or hostile.
 
-Nothing is believed: not the lengths, not the summary, not that there is an end. Every length is
-held against what is left and against a limit before a byte is read; every checksum that is there
-is compared. See https://mcap.dev/spec for the format.
-
-Chunks of an MCAP file, decompressed to their declared size and never beyond.
+Nothing is trusted: neither the lengths, nor the summary, nor that there is an end. Every length is
+compared with the remaining bytes and with a limit before a byte is read. Every stored checksum is
+compared. A chunk is decompressed to its declared size and never beyond. See https://mcap.dev/spec
+for the format.
 """
 
 import struct
@@ -21,7 +20,7 @@ from service.formats.limits import UploadLimits
 from service.formats.mcap_writer import FOOTER_BODY, MCAP_MAGIC
 
 RECORD_HEAD: Final = struct.Struct("<BQ")
-_OPCODE_NAMES: Final = {int(one): one.name.lower().replace("_", " ") for one in Opcode}
+_OPCODE_NAMES: Final = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
 _SUMMARY_OPCODES: Final = {
     Opcode.SCHEMA,
     Opcode.CHANNEL,
@@ -35,7 +34,7 @@ _SUMMARY_OPCODES: Final = {
 
 
 class RawRecord(NamedTuple):
-    """A record's opcode, its place in the file, and its content without opcode and length."""
+    """A record's opcode, its position in the file, and its content without opcode and length."""
 
     opcode: int
     byte: int
@@ -43,7 +42,7 @@ class RawRecord(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the record is called."""
+        """Name of the kind of record."""
         return describe_opcode(self.opcode)
 
     def raise_invalid(self, what: str) -> NoReturn:
@@ -52,26 +51,26 @@ class RawRecord(NamedTuple):
 
 
 def describe_opcode(opcode: int) -> str:
-    """What a record of that opcode is called."""
+    """Return the name of a kind of record."""
     return _OPCODE_NAMES.get(opcode, f"unknown (0x{opcode:02x})")
 
 
 class RecordCursor:
-    """Reads the parts of one record; a length that goes past the record's end is its error."""
+    """Reads the parts of one record; raises if a length exceeds the end of the record."""
 
     def __init__(self, record: RawRecord) -> None:
         self._record, self._at = record, 0
 
     def read_u16(self) -> int:
-        """Two bytes."""
+        """Read two bytes."""
         return int.from_bytes(self.read_bytes(2), "little")
 
     def read_u32(self) -> int:
-        """Four bytes."""
+        """Read four bytes."""
         return int.from_bytes(self.read_bytes(4), "little")
 
     def read_u64(self) -> int:
-        """Eight bytes."""
+        """Read eight bytes."""
         return int.from_bytes(self.read_bytes(8), "little")
 
     def read_bytes(self, length: int) -> bytes:
@@ -79,32 +78,32 @@ class RecordCursor:
         body = self._record.body
         if length > len(body) - self._at:
             self._record.raise_invalid(
-                f"has an inner length of {length} bytes where {len(body) - self._at} are left"
+                f"declares an inner length of {length} bytes, but {len(body) - self._at} are left"
             )
         self._at += length
         return body[self._at - length : self._at]
 
     def read_text(self) -> str:
-        """Text with its length before it."""
+        """Read a text that is preceded by its length."""
         try:
             return self.read_bytes(self.read_u32()).decode()
         except UnicodeDecodeError:
             self._record.raise_invalid("has a text that is not UTF-8")
 
     def read_mapping(self) -> dict[str, str]:
-        """Texts by name, with the length of the whole before them."""
+        """Read texts by name, preceded by their total length."""
         end = self.read_u32() + self._at
-        found: dict[str, str] = {}
+        entries: dict[str, str] = {}
         while self._at < end:
             name = self.read_text()
-            found[name] = self.read_text()
+            entries[name] = self.read_text()
         if self._at != end:
             self._record.raise_invalid("has a map whose entries go past its length")
-        return found
+        return entries
 
 
 class _CheckedStream:
-    """The file as it is read: place, what is left, checksum since it was last reset."""
+    """The file as it is read: position, remaining bytes, checksum since the last reset."""
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
         self._stream, self.size, self.at, self.crc = stream, size, 0, 0
@@ -114,7 +113,8 @@ class _CheckedStream:
         data = self._stream.read(length) if length <= left else b""
         if len(data) != length:
             raise InvalidUpload(
-                f"the file ends inside {what} ({length} bytes needed, {left} left); it is cut off",
+                f"the file ends inside {what} ({length} bytes needed, {left} left); "
+                "it is truncated",
                 byte=self.at,
             )
         self.crc = zlib.crc32(data, self.crc)
@@ -123,12 +123,12 @@ class _CheckedStream:
 
 
 def iterate_records(binary: BinaryIO, size: int, limits: UploadLimits) -> Iterator[RawRecord]:
-    """Every record of the data section, in order, header first; then the end is checked.
+    """Yield every record of the data section, header first; then check the end.
 
     Raises
     ------
     InvalidUpload
-        With the byte, at the first record that cannot be right.
+        At the first invalid record; with the byte.
     """
     if size > limits.file_bytes:
         raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
@@ -191,23 +191,25 @@ def _check_end(stream: _CheckedStream, limits: UploadLimits) -> None:
         raise InvalidUpload("there are bytes after the end of the file's content", byte=stream.at)
 
 
-def _check_crc(record: RawRecord, stored: int, found: int, what: str) -> None:
-    if stored not in (0, found):  # 0: the writer made none
+def _check_crc(record: RawRecord, stored: int, computed: int, what: str) -> None:
+    if stored not in (0, computed):  # 0: the writer computed none
         record.raise_invalid(
-            f"has the checksum {stored:08x} for the {what}; it is {found:08x}: damaged"
+            f"has the checksum {stored:08x} for the {what}, but it is {computed:08x}: "
+            "the file is damaged"
         )
 
 
 def decompress_chunk(record: RawRecord, limits: UploadLimits) -> bytes:
-    """Content of a chunk record.
+    """Decompress the content of a chunk record.
 
     Raises
     ------
     InvalidUpload
-        If it is too large as declared or in truth, damaged, or compressed in an unknown way.
+        If its declared or actual size is too large, if it is damaged, or if the compression is
+        unknown.
     """
     fields = RecordCursor(record)
-    fields.read_u64(), fields.read_u64()  # first and last time: the messages say it themselves
+    fields.read_u64(), fields.read_u64()  # first and last time, which the messages repeat
     size, crc, compression = fields.read_u64(), fields.read_u32(), fields.read_text()
     if size > limits.record_bytes:
         record.raise_invalid(
@@ -215,11 +217,12 @@ def decompress_chunk(record: RawRecord, limits: UploadLimits) -> bytes:
         )
     content = _decompress(record, compression, fields.read_bytes(fields.read_u64()), size)
     if len(content) != size:
-        more = "more" if len(content) > size else f"{len(content)}"
-        record.raise_invalid(f"declares {size} bytes of content, but holds {more}")
+        actual = "more" if len(content) > size else f"{len(content)}"
+        record.raise_invalid(f"declares {size} bytes of content, but holds {actual}")
     if crc not in (0, zlib.crc32(content)):
         record.raise_invalid(
-            f"has the checksum {crc:08x}, its content {zlib.crc32(content):08x}: it is damaged"
+            f"has the checksum {crc:08x}, but its content has {zlib.crc32(content):08x}: "
+            "it is damaged"
         )
     return content
 
@@ -227,7 +230,7 @@ def decompress_chunk(record: RawRecord, limits: UploadLimits) -> bytes:
 def _decompress(record: RawRecord, compression: str, data: bytes, size: int) -> bytes:
     try:
         if compression == "zstd":
-            # The window is memory too, and a frame's header may ask for gigabytes of it.
+            # The window is memory too, and the header of a frame may request gigabytes of it.
             window = max(1 << 10, 1 << size.bit_length())
             reader = zstandard.ZstdDecompressor(max_window_size=max(window, 1 << 23))
             with reader.stream_reader(data) as stream:

@@ -1,7 +1,7 @@
-"""The MCAP file format, written: records of `mcap`, but chunks as NumPy arrays.
+"""Write the MCAP file format: records of `mcap`, but chunks as NumPy arrays.
 
-See https://mcap.dev/spec for the format. Each chunk holds the messages of one channel, all of one
-size because every field is written, zeros too; so a chunk is one structured array.
+See https://mcap.dev/spec for the format. Each chunk holds the messages of one channel. All have the
+same size, because every field is written, zeros too. So a chunk is one structured array.
 """
 
 import struct
@@ -51,7 +51,7 @@ _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
 class McapWriter:
-    """An MCAP file being written, front to back; `write` takes the bytes.
+    """Writes an MCAP file front to back; `write` takes the bytes.
 
     All checksums are written: of each chunk, of the data section, and of the summary.
     """
@@ -87,9 +87,9 @@ class McapWriter:
         data = build_schema(message, fields)
         schema = Schema(number, data, "protobuf", f"lagid.{message}")
         channel = Channel(number, path, "protobuf", {}, number)
-        for record, known in ((schema, self._schemas), (channel, self._channels)):
-            known.append(_encode_record(record))  # written again in the summary
-            self._put_bytes(known[-1])
+        for record, encoded in ((schema, self._schemas), (channel, self._channels)):
+            encoded.append(_encode_record(record))  # written again in the summary
+            self._put_bytes(encoded[-1])
         self._messages.add(message)
         self._fields.append(make_double_fields(tuple(fields)))
         self._counts[number] = 0
@@ -157,7 +157,7 @@ class McapWriter:
 
     def _put_chunk(self, channel: int, messages: NDArray[np.void], index: NDArray[np.void]) -> None:
         content = messages.tobytes()
-        first, last = (int(messages["log_time"][at]) for at in (0, -1))
+        first, last = (int(messages["log_time"][index_of]) for index_of in (0, -1))
         chunk = Chunk(
             compression="zstd",
             data=self._compressor.compress(content),
@@ -186,8 +186,8 @@ class McapWriter:
             )
         )
         self._counts[channel] += messages.size
-        known = self._span or (first, last)
-        self._span = min(known[0], first), max(known[1], last)
+        span = self._span or (first, last)
+        self._span = min(span[0], first), max(span[1], last)
 
     def _put_records(self, records: Sequence[McapRecord | bytes]) -> int:
         return sum(self._put_record(record) for record in records)

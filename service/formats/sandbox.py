@@ -1,8 +1,7 @@
-"""Uploads, read in a process of their own with a limit of memory and of time.
+"""Read uploads in a separate process with limits of memory and time.
 
-A file from outside reaches C code (decompressors, protobuf) before anything else can judge it.
-So it is read in a child process, which writes what it found anew with our writer; this process
-reads only that.
+An uploaded file reaches C code (decompressors, protobuf) before any check. So a child process reads
+it and writes its content again with our writer. This process reads only that copy.
 """
 
 import json
@@ -27,14 +26,14 @@ FileKind = Literal["csv", "mcap"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UploadedRecording:
-    """A recording as it was sent.
+    """An uploaded recording.
 
     Attributes
     ----------
     notes : tuple of str
-        What the user should know: missing values, irregular times, what was left out.
+        Notes for the user: missing values, irregular times, skipped topics.
     source_sha256 : str
-        Of the bytes that were sent.
+        Hash of the uploaded bytes.
     """
 
     recording: Recording
@@ -50,7 +49,7 @@ def read_untrusted(
     sample_time: float | None = None,
     segments: Sequence[str] = (),
 ) -> UploadedRecording:
-    """Read a file that a user sent.
+    """Read an uploaded file.
 
     Parameters
     ----------
@@ -60,7 +59,7 @@ def read_untrusted(
     Raises
     ------
     InvalidUpload
-        If the file cannot be used, for whatever reason.
+        If the file cannot be used for any reason.
     """
     source = Path(path)
     size = source.stat().st_size
@@ -83,7 +82,7 @@ def read_untrusted(
 
 
 def _run_child(task: dict[str, Any], limits: UploadLimits) -> "subprocess.CompletedProcess[str]":
-    # No secret of this process's environment goes to the child.
+    # The child gets no secret of this process's environment.
     environment = {
         "PATH": os.environ.get("PATH", ""),
         "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry) or os.getcwd(),
@@ -107,7 +106,7 @@ def _run_child(task: dict[str, Any], limits: UploadLimits) -> "subprocess.Comple
 def _parse_answer(
     child: "subprocess.CompletedProcess[str]", limits: UploadLimits
 ) -> tuple[str, ...]:
-    if child.returncode == -24:  # SIGXCPU: the child's own limit of processor time
+    if child.returncode == -24:  # SIGXCPU: the child reached its limit of processor time
         raise _build_timeout_error(limits)
     try:
         answer = json.loads(child.stdout)
@@ -121,7 +120,7 @@ def _parse_answer(
                 f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"
             ) from None
         raise InvalidUpload(
-            f"the file makes its reader stop (exit {child.returncode}: {reason[:200]})"
+            f"the file crashes its reader (exit code {child.returncode}: {reason[:200]})"
         ) from None
 
 

@@ -17,7 +17,7 @@ from sysid.data.records import Recording
 
 
 def main() -> int:
-    """Read the task's file and write it anew; answer with notes or with the error."""
+    """Read the file of the task and write it again; answer with notes or with the error."""
     task = json.load(sys.stdin)
     limits = UploadLimits(**task["limits"])
     _limit_resources(limits)
@@ -33,15 +33,15 @@ def main() -> int:
 
 def _limit_resources(limits: UploadLimits) -> None:
     seconds = ceil(limits.seconds)
-    for what, most in (
+    for limit, value in (
         (resource.RLIMIT_AS, limits.memory_bytes),
         (resource.RLIMIT_CPU, seconds),
         (resource.RLIMIT_FSIZE, limits.total_bytes),
         (resource.RLIMIT_CORE, 0),
     ):
-        _, hard = resource.getrlimit(what)
-        allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(what, (allowed, allowed if what != resource.RLIMIT_CPU else hard))
+        _, hard = resource.getrlimit(limit)
+        allowed = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        resource.setrlimit(limit, (allowed, allowed if limit != resource.RLIMIT_CPU else hard))
 
 
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
@@ -49,19 +49,19 @@ def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
         recording, notes = read_csv(
             Path(task["source"]), sample_time=task["sample_time"], segments=task["segments"]
         )
-        made = list(notes)
+        messages = list(notes)
     else:
         recording, notes = read_mcap_with_notes(task["source"], limits)
-        made = [*notes, *_check_finite_values(recording)]
+        messages = [*notes, *_check_finite_values(recording)]
     try:
         write_recording(recording, task["target"])
     except ValueError as error:
         raise InvalidUpload(str(error)) from None
-    return made
+    return messages
 
 
 def _check_finite_values(recording: Recording) -> list[str]:
-    """Refuse infinite values; return a note for each channel with missing ones."""
+    """Refuse infinite values; return a note for each channel with missing values."""
     notes = []
     for channel in recording.channels:
         infinite = np.flatnonzero(np.isinf(channel.values))
@@ -74,8 +74,8 @@ def _check_finite_values(recording: Recording) -> list[str]:
         if missing.size:
             notes.append(
                 f"channel {channel.name!r}: {missing.size} of {channel.values.size} values are "
-                f"missing (NaN), the first at t = {channel.times[missing[0]]:g} s; as an output "
-                "they are not scored, as an input the channel cannot be used"
+                f"missing (NaN), the first at t = {channel.times[missing[0]]:g} s. An output is "
+                "not scored at missing values. An input with missing values cannot be used."
             )
     return notes
 

@@ -1,11 +1,9 @@
-"""How a recording is laid out in a file: topics, fields, and the manifest that names them.
+"""Layout of a recording in an MCAP file: topics, fields, clocks, and the manifest that names them.
 
-Times of samples as MCAP's nanoseconds, such that the same bits come back.
-
-A file's clock counts whole nanoseconds. Of most recordings that is exact, because their times
-were printed with nine decimals or fewer (rule ``nanoseconds``); of computed times ``k·T`` the
-period is kept (rule ``regular``); of all others each message carries the time in a field of its
-own (rule ``field``).
+The clock of a file counts whole nanoseconds, and times must come back bit for bit. Three rules do
+this. Rule ``nanoseconds``: most times are printed with nine decimals or fewer, so the clock is
+exact. Rule ``regular``: for computed times ``k·T`` the period is stored. Rule ``field``: otherwise
+each message carries its time in a separate field.
 """
 
 import json
@@ -30,13 +28,13 @@ TIME_FIELD = "time_s"
 
 @dataclass(frozen=True, slots=True)
 class TopicClock:
-    """How the times of one topic come back from its file.
+    """How the times of one topic are recovered from its file.
 
     Attributes
     ----------
     rule : {"nanoseconds", "regular", "field"}
     epoch : int
-        Time (s) of the file's nanosecond 0: not 0 only when times are negative.
+        Time (s) of the file's nanosecond 0; not 0 only if times are negative.
     start, period : float
         First time and sampling period, for ``regular``.
     """
@@ -47,7 +45,7 @@ class TopicClock:
     period: float = 0.0
 
     def to_times(self, log_times: Nanoseconds, field: FloatArray | None) -> FloatArray:
-        """The times in s."""
+        """Return the times in s."""
         if self.rule == "field" and field is not None:
             return field
         if self.rule == "regular":
@@ -58,30 +56,30 @@ class TopicClock:
         return _to_seconds(log_times, self.epoch)
 
     def to_dict(self) -> dict[str, object]:
-        """The entry of the file's metadata."""
+        """Return the clock as an entry of the file's metadata."""
         return {"rule": self.rule, "epoch": self.epoch, "start": self.start, "period": self.period}
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, object]) -> "TopicClock":
-        """Return the inverse of `as_dict`; ValueError for an entry that is none."""
+        """Return the inverse of `to_dict`; ValueError for an invalid entry."""
         rule, epoch = entry.get("rule"), entry.get("epoch")
         start, period = entry.get("start"), entry.get("period")
         if rule not in ("nanoseconds", "regular", "field") or type(epoch) is not int:
-            raise ValueError(f"{entry!r} is not a rule of times")
+            raise ValueError(f"{entry!r} is not a clock rule")
         if not isinstance(start, int | float) or not isinstance(period, int | float):
-            raise ValueError(f"{entry!r} is not a rule of times")
+            raise ValueError(f"{entry!r} is not a clock rule")
         if not (-LATEST_S < epoch <= 0 and abs(start) < LATEST_S and 0 <= period < LATEST_S):
-            raise ValueError(f"{entry!r} goes beyond the clock of a file")
+            raise ValueError(f"{entry!r} exceeds the range of a file's clock")
         return cls(rule, epoch, float(start), float(period))
 
 
 def choose_clock(times: FloatArray) -> tuple[TopicClock, Nanoseconds]:
-    """Return the clock of times (s, not decreasing), and the times on it.
+    """Choose the clock of non-decreasing times (s), and return the times on it.
 
     Raises
     ------
     ValueError
-        If they span more than a file's clock can hold (292 years).
+        If the times exceed the range of a file's clock (292 years).
     """
     epoch = min(0, floor(float(times[0])))
     if epoch <= -LATEST_S or float(times[-1]) - epoch >= LATEST_S:
@@ -97,7 +95,7 @@ def choose_clock(times: FloatArray) -> tuple[TopicClock, Nanoseconds]:
 
 
 def _to_seconds(log_times: Nanoseconds, epoch: int) -> FloatArray:
-    # A quotient of whole numbers is correctly rounded, like the decimal number it stands for.
+    # A quotient of whole numbers is correctly rounded, like the decimal number that it equals.
     signed = log_times.astype(np.int64) + epoch * 10**9
     return np.asarray(signed / 1e9, dtype=np.float64)
 
@@ -111,7 +109,7 @@ def _propose_periods(times: FloatArray) -> Iterator[float]:
 
 
 DATASET_RECORD = "lagid.dataset"
-"""Name of the metadata record that says what a file of ours holds."""
+"""Name of the metadata record that describes a file written by lagid."""
 
 FORMAT_VERSION = "1"
 RESERVED_KEYS = ("format", "sample_time", "channels", "topics", "segments", "history")
@@ -121,7 +119,7 @@ RESERVED_KEYS = ("format", "sample_time", "channels", "topics", "segments", "his
 class Topic:
     """Channels that share their times: one MCAP channel, one protobuf field for each.
 
-    `extra` is the times themselves when the file's clock cannot hold them exactly.
+    `exact_times` holds the times themselves if the file's clock cannot represent them exactly.
     """
 
     path: str
@@ -133,7 +131,7 @@ class Topic:
 
     @property
     def columns(self) -> tuple[FloatArray, ...]:
-        """What is written for each of `all_fields`."""
+        """The values of each of `all_fields`."""
         return (*(channel.values for channel in self.channels), *self.exact_times)
 
     @property
@@ -143,7 +141,7 @@ class Topic:
 
 
 def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> Topic:
-    """Topic of channels with equal times; `names` are what its fields are to be called."""
+    """Make the topic of channels with equal times; `names` are the wanted names of its fields."""
     times = channels[0].times
     clock, log_times = choose_clock(times)
     extra = (times,) if clock.rule == "field" else ()
@@ -152,7 +150,7 @@ def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> 
 
 
 def group_into_topics(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]:
-    """Topics of a recording: `root` for the first channel and all that share its times."""
+    """Group the channels of a recording into topics; the first topic is `root`."""
     groups: list[list[Channel]] = []
     for channel in recording.channels:
         for group in groups:
@@ -163,19 +161,19 @@ def group_into_topics(recording: Recording, root: str = "/signals") -> tuple[Top
             groups.append([channel])
     paths = [root, *(f"{root}/{name}" for name in make_identifiers(g[0].name for g in groups[1:]))]
     return tuple(
-        make_topic(path, group, [one.name for one in group])
+        make_topic(path, group, [channel.name for channel in group])
         for path, group in zip(paths, groups, strict=True)
     )
 
 
 def group_history_topics(recording: Recording) -> tuple[Topic, ...]:
-    """Topics of what was recorded before the first samples; none where nothing was."""
-    known = tuple(
-        Channel(one.name, one.history.times, one.history.values, one.unit)
-        for one in recording.channels
-        if one.history is not None and one.history.times.size
+    """Group the samples before the start of the record into topics; empty if there are none."""
+    channels = tuple(
+        Channel(channel.name, channel.history.times, channel.history.values, channel.unit)
+        for channel in recording.channels
+        if channel.history is not None and channel.history.times.size
     )
-    return group_into_topics(Recording(known), "/history") if known else ()
+    return group_into_topics(Recording(channels), "/history") if channels else ()
 
 
 def _have_same_times(a: Channel, b: Channel) -> bool:
@@ -188,7 +186,7 @@ def build_manifest(
     metadata: Mapping[str, str],
     history: Sequence[Topic] = (),
 ) -> dict[str, str]:
-    """Content of the record `DATASET_RECORD`: everything that the messages themselves do not say.
+    """Build the content of the record `DATASET_RECORD`: all that the messages do not say.
 
     Raises
     ------
@@ -196,7 +194,7 @@ def build_manifest(
         If `metadata` uses a reserved key.
     """
     if taken := sorted(set(metadata) & set(RESERVED_KEYS)):
-        raise ValueError(f"the metadata keys {', '.join(taken)} are the file's own")
+        raise ValueError(f"the metadata keys {', '.join(taken)} are reserved")
     order = [channel.name for channel in recording.channels]
     entries = [
         {"name": c.name, "unit": c.unit, "hold": c.hold, "topic": topic.path, "field": field}
@@ -204,7 +202,7 @@ def build_manifest(
         for c, field in zip(topic.channels, topic.fields, strict=True)
     ]
     entries.sort(key=lambda entry: order.index(entry["name"]))
-    before = {
+    histories = {
         c.name: {"topic": topic.path, "field": field}
         for topic in history
         for c, field in zip(topic.channels, topic.fields, strict=True)
@@ -217,14 +215,14 @@ def build_manifest(
         "channels": json.dumps(entries),
         "topics": json.dumps(clocks),
         "segments": json.dumps([asdict(segment) for segment in recording.segments]),
-        "history": json.dumps(before),
+        "history": json.dumps(histories),
         **metadata,
     }
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelEntry:
-    """Where one channel of the recording stands in the file."""
+    """Position of one channel of the recording in the file."""
 
     name: str
     unit: str
@@ -235,7 +233,7 @@ class ChannelEntry:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """The record `DATASET_RECORD`, checked. `history`: topic and field of it, by channel."""
+    """The checked record `DATASET_RECORD`; `history` has topic and field of it, by channel."""
 
     channels: tuple[ChannelEntry, ...]
     clocks: Mapping[str, TopicClock]
@@ -249,7 +247,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
     Raises
     ------
     ValueError
-        If it is not what `build_manifest` writes; it may come from anyone.
+        If `build_manifest` could not have written it; the file may come from anyone.
     """
     try:
         if metadata["format"] != FORMAT_VERSION:
@@ -271,33 +269,33 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
-    names = {one.name for one in channels}
+    names = {channel.name for channel in channels}
     if not names or len(names) != len(channels):
         raise ValueError("its channels have no names, or the same name twice")
-    if any(one.topic not in manifest.clocks for one in channels):
+    if any(channel.topic not in manifest.clocks for channel in channels):
         raise ValueError("a channel names a topic that is not listed")
     for name, (topic, field) in history.items():
         is_text = isinstance(topic, str) and isinstance(field, str)
         if name not in names or not is_text or topic not in manifest.clocks:
-            raise ValueError(f"the history of {name!r} is of no channel, or in no topic")
+            raise ValueError(f"the history of {name!r} has no channel, or is in no topic")
     return manifest
 
 
 def _parse_channel(entry: Mapping[str, Any]) -> ChannelEntry:
-    made = ChannelEntry(**entry)
-    texts = (made.name, made.unit, made.topic, made.field)
-    if not all(isinstance(text, str) for text in texts) or made.hold not in HOLDS:
+    channel = ChannelEntry(**entry)
+    texts = (channel.name, channel.unit, channel.topic, channel.field)
+    if not all(isinstance(text, str) for text in texts) or channel.hold not in HOLDS:
         raise ValueError(f"{entry!r} is not the entry of a channel")
-    return made
+    return channel
 
 
 def _parse_segment(entry: Mapping[str, Any]) -> Segment:
-    made = Segment(**entry)
-    numbers = (made.start, made.stop, made.origin)
-    plain = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
-    labels = isinstance(made.labels, dict) and all(
-        isinstance(one, (str, *get_args(int | float))) for one in made.labels.values()
+    segment = Segment(**entry)
+    numbers = (segment.start, segment.stop, segment.origin)
+    plain = all(isinstance(number, int | float) and np.isfinite(number) for number in numbers)
+    labels = isinstance(segment.labels, dict) and all(
+        isinstance(label, (str, *get_args(int | float))) for label in segment.labels.values()
     )
-    if not plain or not labels or made.start > made.stop:
+    if not plain or not labels or segment.start > segment.stop:
         raise ValueError(f"{entry!r} is not a segment")
-    return made
+    return segment

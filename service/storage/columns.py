@@ -1,4 +1,4 @@
-"""Column types that mean the same on SQLite and on PostgreSQL."""
+"""Column types that behave the same on SQLite and on PostgreSQL."""
 
 import json
 from datetime import UTC, datetime
@@ -17,27 +17,30 @@ Document: TypeAlias = dict[str, Any]
 DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
 """JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
 OrderedJsonType = JSON(none_as_null=True)
-"""JSON as it was written: JSONB sorts keys, and a search draws parameters in their order."""
+"""JSON with its order of keys: JSONB sorts them, but a search draws parameters in that order."""
 
 _ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
 
 LargeInteger = BigInteger().with_variant(Integer(), "sqlite")
-"""64 bits on both: SQLite calls that INTEGER, and numbers rows by no other type."""
+"""64 bits on both: SQLite calls that INTEGER, and numbers rows with this type only."""
 
 
 def utc_now() -> datetime:
-    """The present, with its time zone."""
+    """Return the present time, with its time zone."""
     return datetime.now(UTC)
 
 
 class UtcDateTime(TypeDecorator[datetime]):
-    """A moment. It goes in with a time zone and comes out in UTC, on SQLite as well."""
+    """A moment that is stored with a time zone and read in UTC, on SQLite as well."""
 
     impl = DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """The moment in UTC; SQLite keeps no zone, so that all its texts compare as times."""
+        """Return the moment in UTC.
+
+        SQLite stores no zone, so that all its texts compare as times.
+        """
         if value is None:
             return None
         if value.tzinfo is None:
@@ -46,20 +49,20 @@ class UtcDateTime(TypeDecorator[datetime]):
         return moment.replace(tzinfo=None) if dialect.name == "sqlite" else moment
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """The stored moment, aware and in UTC."""
+        """Return the stored moment, aware and in UTC."""
         if value is None:
             return None
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
 class TextT(TypeDecorator[str]):
-    """A text that both databases can keep: no NUL, no half of a surrogate pair."""
+    """A text that both databases can store: no NUL, no half of a surrogate pair."""
 
     impl = String
     cache_ok = True
 
     def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
-        """The same text, once it is known to be storable."""
+        """Return the text, if it can be stored."""
         fault = None if value is None else find_text_fault(value)
         if fault is not None:
             raise UnstorableValue(fault)
@@ -67,11 +70,11 @@ class TextT(TypeDecorator[str]):
 
 
 def to_json(value: object) -> str:
-    """JSON text of a document, refused where PostgreSQL would refuse or alter it."""
+    """Return the JSON text of a document; refuse what PostgreSQL would refuse or alter."""
     try:
         text = _ENCODER.encode(value)
     except ValueError as error:
-        raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
+        raise UnstorableValue(f"a document contains NaN or an infinite number: {error}") from error
     fault = find_json_fault(text)
     if fault is not None:
         raise UnstorableValue(fault)
@@ -79,10 +82,10 @@ def to_json(value: object) -> str:
 
 
 def make_state_type(states: type[StrEnum]) -> Enum:
-    """Column type of a state: its text, without a database type that a migration must alter."""
+    """Make the column type of a state: a text, so that no migration must alter a type."""
     return Enum(
         states,
         native_enum=False,
         length=16,
-        values_callable=lambda kind: [one.value for one in kind],
+        values_callable=lambda kind: [state.value for state in kind],
     )

@@ -1,18 +1,18 @@
-"""Every error the storage raises on purpose.
+"""Every error that the storage raises on purpose.
 
 * StorageError
-    - NotFound             there is no such row, or it belongs to another project
-    - Conflict             the row's state does not allow the change
-        - KeyReused        an idempotency key came again with another request
-    - InvalidCursor        a list's cursor was not given out by that list
-    - UnstorableValue      a text or document holds what no database can keep
-    - LeaseLost            a dispatcher writes for a job that is no longer its own
-    - InvalidStoreUrl      a store's address is of an unknown kind
+    - RowNotFound          the row does not exist, or belongs to another project
+    - RowConflict          the state of the row does not allow the change
+        - KeyReused        an idempotency key was used before with another request
+    - InvalidCursor        the cursor does not belong to this list
+    - UnstorableValue      a text or document contains a value that no database can store
+    - LeaseLost            a dispatcher writes for a job whose lease it no longer holds
+    - InvalidStoreUrl      the address of an object store is of an unknown kind
     - ObjectMissing        the object store has no object of that hash
     - ObjectStoreFailed    the object store did not answer, refused, or is not writable
-    - DatabaseNotAtHead    the tables are not those of this version of the program
+    - DatabaseNotAtHead    the tables belong to another version of the program
 
-`status` is the HTTP status that fits when the error reaches a client.
+`status` is the HTTP status of the error when it reaches a client.
 """
 
 from typing import ClassVar
@@ -27,7 +27,7 @@ class StorageError(Exception):
 
 
 class RowNotFound(StorageError, LookupError):
-    """There is no such row, or it belongs to another project, or it was deleted."""
+    """The row does not exist, belongs to another project, or was deleted."""
 
     status = 404
 
@@ -37,58 +37,58 @@ class RowNotFound(StorageError, LookupError):
 
 
 class RowConflict(StorageError):
-    """The row's state does not allow the change."""
+    """The state of the row does not allow the change."""
 
     status = 409
 
 
 class KeyReused(RowConflict):
-    """An idempotency key came again with another request."""
+    """An idempotency key was used before with another request."""
 
     status = 422
 
     def __init__(self, key: str) -> None:
         super().__init__(
-            f"the Idempotency-Key {key!r} was used before with another request body; "
-            "send the same body, or a new key"
+            f"the Idempotency-Key {key!r} was used before with another request body. "
+            "Send the same body, or a new key."
         )
         self.key = key
 
 
 class InvalidCursor(StorageError, ValueError):
-    """A list's cursor was not given out by that list."""
+    """The cursor does not belong to this list."""
 
     status = 422
 
     def __init__(self, cursor: str) -> None:
-        super().__init__(f"{cursor!r} is not a cursor; use the `next` of the page before")
+        super().__init__(f"{cursor!r} is not a cursor; use the `next` of the previous page")
         self.cursor = cursor
 
 
 class UnstorableValue(StorageError, ValueError, DontWrapMixin):
-    """A text or document holds what no database can keep: NUL, half a surrogate, NaN."""
+    """A text or document contains NUL, half a surrogate or NaN, which no database can store."""
 
     status = 422
 
 
 class LeaseLost(StorageError):
-    """A dispatcher writes for a job that is no longer its own: it must stop at once."""
+    """A dispatcher writes for a job whose lease it no longer holds; it must stop at once."""
 
     status = 409
 
     def __init__(self, job_id: str, attempt: int) -> None:
         super().__init__(
-            f"attempt {attempt} of {job_id} no longer holds the lease; "
+            f"attempt {attempt} of {job_id} no longer holds the lease: "
             "it expired, or the job was cancelled or finished"
         )
         self.job_id, self.attempt = job_id, attempt
 
 
 class InvalidStoreUrl(StorageError, ValueError):
-    """A store's address is of an unknown kind."""
+    """The address of an object store is of an unknown kind."""
 
     def __init__(self, url: str, detail: str) -> None:
-        super().__init__(f"{url!r} is no object store: {detail}")
+        super().__init__(f"{url!r} is not the address of an object store: {detail}")
         self.url = url
 
 
@@ -109,13 +109,13 @@ class ObjectStoreFailed(StorageError):
 
 
 class DatabaseNotAtHead(StorageError):
-    """The tables are not those of this version of the program."""
+    """The tables belong to another version of the program."""
 
     status = 503
 
     def __init__(self, found: str | None, head: str | None) -> None:
         super().__init__(
-            f"the database is at revision {found or 'none'}, this program needs {head}; "
+            f"the database is at revision {found or 'none'}, but this program needs {head}; "
             "run `lagid db upgrade`"
         )
         self.found, self.head = found, head

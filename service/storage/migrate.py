@@ -1,8 +1,8 @@
-"""Bring a database to the tables of this version of the program, and tell whether it is there.
+"""Migrate a database to the tables of this version of the program, and check its revision.
 
-Processes that start at once take turns: PostgreSQL by an advisory lock, SQLite by the write lock
-that the transaction takes at its beginning. The later ones find nothing left to do. A migration
-that fails leaves the database as it was.
+Processes that start at once take turns. PostgreSQL uses an advisory lock, SQLite the write lock
+that a transaction takes at its start. The later processes find nothing left to do. A failed
+migration leaves the database unchanged.
 """
 
 from pathlib import Path
@@ -21,46 +21,46 @@ from service.storage.tables import Base
 
 _LOCK = 0x6C61_6769_64  # "lagid": the key of the advisory lock
 LOCK_WAIT_SECONDS = 900.0
-"""How long a process waits for another one that carries the rows of a large database over."""
+"""How long a process waits for another one that migrates a large database."""
 
 
 def upgrade_database(database: Database, revision: str = "head") -> None:
-    """Create or bring up to date every table."""
+    """Create all tables, or migrate them to a revision."""
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
         command.upgrade(_make_config(connection), revision)
 
 
 def downgrade_database(database: Database, revision: str = "base") -> None:
-    """Go back to an earlier revision. What only later ones can hold is lost."""
+    """Go back to an earlier revision; data that only later revisions can store is lost."""
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
         command.downgrade(_make_config(connection), revision)
 
 
 def find_head_revision() -> str | None:
-    """The revision this program needs."""
+    """Return the revision that this program needs."""
     return ScriptDirectory.from_config(_make_config()).get_current_head()
 
 
 def read_current_revision(database: Database) -> str | None:
-    """The revision the database is at; None before the first."""
+    """Return the revision of the database; None before the first migration."""
     with database.engine.connect() as connection:
         return MigrationContext.configure(connection).get_current_revision()
 
 
 def check_revision(database: Database) -> None:
-    """Nothing, when the database is at the head; else `DatabaseNotAtHead`."""
-    found, needed = read_current_revision(database), find_head_revision()
-    if found != needed:
-        raise DatabaseNotAtHead(found, needed)
+    """Raise `DatabaseNotAtHead` unless the database has the revision of this program."""
+    current, needed = read_current_revision(database), find_head_revision()
+    if current != needed:
+        raise DatabaseNotAtHead(current, needed)
 
 
 def list_differences(database: Database) -> list[str]:
-    """Where the database's tables differ from those of the program; empty when they agree."""
+    """List the differences between the tables of the database and those of the program."""
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
-        return [str(one) for one in compare_metadata(context, Base.metadata)]
+        return [str(difference) for difference in compare_metadata(context, Base.metadata)]
 
 
 def _lock_migrations(connection: Connection) -> None:

@@ -1,8 +1,8 @@
 """Content-addressed objects in a local folder or in an S3 bucket.
 
-An object's name is the SHA-256 of its bytes: ``sha256/ab/<hash>.mcap``. So it never changes, may
-be written twice without harm, and its hash is its ETag. Objects are written before the row that
-names them; those that no row names are garbage (`service.storage.garbage`).
+The name of an object is the SHA-256 of its bytes: ``sha256/ab/<hash>.mcap``. So it never changes,
+may be written twice without harm, and its hash is its ETag. Objects are written before the row that
+refers to them. Objects without a row are garbage (`service.storage.garbage`).
 """
 
 import hashlib
@@ -33,7 +33,7 @@ _ROOT = "sha256"
 _HASH = re.compile(r"[0-9a-f]{64}")
 _BLOCK = 1 << 20
 _SINGLE_PUT = 64 << 20
-"""Largest object that is sent in one request, and so held in memory."""
+"""Largest object in bytes that is sent in one request and thus held in memory."""
 _RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
 
 
@@ -47,7 +47,7 @@ class StoredObject:
 
 
 class ObjectStore(ABC):
-    """What a folder and a bucket have in common: everything but the last step of a write."""
+    """Base class of the stores: everything but the last step of a write."""
 
     def __init__(self, backend: Any, temporary: Path) -> None:
         self._backend, self._temporary = backend, temporary
@@ -58,7 +58,7 @@ class ObjectStore(ABC):
             return self.put_stream(_read_blocks(file))
 
     def put_stream(self, blocks: Iterable[bytes]) -> StoredObject:
-        """Store blocks of bytes as they come; they are never in memory all at once."""
+        """Store blocks of bytes as they arrive; they are never in memory all at once."""
         digest, size = hashlib.sha256(), 0
         with _translate_errors("write an object"), self._open_temporary_file() as file:
             for block in blocks:
@@ -71,12 +71,12 @@ class ObjectStore(ABC):
         return StoredObject(sha256, size)
 
     def get_bytes(self, sha256: str) -> bytes:
-        """A whole object; `ObjectMissing` when there is none."""
+        """Return a whole object; `ObjectMissing` if it does not exist."""
         with _translate_errors("read an object", sha256):
             return bytes(obstore.get(self._backend, _build_object_name(sha256)).bytes())
 
     def get_range(self, sha256: str, start: int, length: int) -> bytes:
-        """`length` bytes from `start`; fewer at the end of the object."""
+        """Return `length` bytes from `start`; fewer at the end of the object."""
         length = min(length, self.get_size(sha256) - start)
         if length <= 0:
             return b""
@@ -85,19 +85,19 @@ class ObjectStore(ABC):
             return bytes(obstore.get_range(self._backend, name, start=start, length=length))
 
     def get_stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
-        """The object's bytes from `start`, in blocks."""
+        """Yield the bytes of an object from `start`, in blocks."""
         end = self.get_size(sha256) if length is None else start + length
         while start < end and (block := self.get_range(sha256, start, min(_BLOCK, end - start))):
             yield block
             start += len(block)
 
     def get_size(self, sha256: str) -> int:
-        """Size in bytes; `ObjectMissing` when there is none."""
+        """Return the size in bytes; `ObjectMissing` if the object does not exist."""
         with _translate_errors("look up an object", sha256):
             return int(obstore.head(self._backend, _build_object_name(sha256))["size"])
 
     def exists(self, sha256: str) -> bool:
-        """Whether there is such an object."""
+        """Return whether an object exists."""
         try:
             self.get_size(sha256)
         except ObjectMissing:
@@ -105,12 +105,12 @@ class ObjectStore(ABC):
         return True
 
     def delete(self, sha256: str) -> None:
-        """Delete an object; nothing when there is none."""
+        """Delete an object; do nothing if it does not exist."""
         with suppress(ObjectMissing), _translate_errors("delete an object", sha256):
             obstore.delete(self._backend, _build_object_name(sha256))
 
     def list_objects(self) -> Iterator[StoredObject]:
-        """Every object, in no order."""
+        """Yield every object, in no particular order."""
         with _translate_errors("list the objects"):
             for chunk in obstore.list(self._backend, prefix=_ROOT):
                 for entry in chunk:
@@ -120,31 +120,31 @@ class ObjectStore(ABC):
 
     @abstractmethod
     def check_writable(self) -> None:
-        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+        """Raise `ObjectStoreFailed` unless an object could be written now."""
 
     @abstractmethod
     def _publish(self, source: Path, name: str, size: int) -> None:
-        """Make a finished, synced file an object, without replacing one of the same name."""
+        """Turn a finished, synced file into an object; never replace one of the same name."""
 
     @contextmanager
     def _open_temporary_file(self) -> Iterator[BinaryIO]:
         with tempfile.NamedTemporaryFile(
             dir=self._temporary, prefix=temporary.make_temporary_prefix()
         ) as file:
-            yield file  # type: ignore[misc]  # the wrapper has all of BinaryIO, undeclared
+            yield file  # type: ignore[misc]  # the wrapper has all methods of BinaryIO
 
 
 @final
 class FolderStore(ObjectStore):
-    """Objects as files.
+    """Objects as files of a folder.
 
-    A power cut leaves whole objects or none: a file is synced before it is linked into place,
-    and the folders after it.
+    A power cut leaves whole objects or none: a file is synced before it is linked into place, and
+    then its folders are synced.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.absolute()
-        self._synced: set[Path] = set()  # folders that this process has seen on the disk
+        self._synced: set[Path] = set()  # folders that this process has synced
         unfinished = self._folder / "tmp"
         with _translate_errors("create its folder"):
             unfinished.mkdir(parents=True, exist_ok=True)
@@ -152,17 +152,17 @@ class FolderStore(ObjectStore):
             super().__init__(LocalStore(self._folder), unfinished)
 
     def check_writable(self) -> None:
-        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+        """Raise `ObjectStoreFailed` unless an object could be written now."""
         with _translate_errors("write"), self._open_temporary_file() as file:
             file.write(b"probe")
 
     def _publish(self, source: Path, name: str, size: int) -> None:
         target = self._folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError):  # the same bytes, by another writer
+        with suppress(FileExistsError):  # another writer stored the same bytes
             os.link(source, target)
         _sync_folder(target.parent)
-        if target.parent not in self._synced:  # whoever made it may not have synced its parents
+        if target.parent not in self._synced:  # its creator may not have synced its parents
             for folder in (target.parent.parent, self._folder):
                 _sync_folder(folder)
             self._synced.add(target.parent)
@@ -183,26 +183,26 @@ class BucketStore(ObjectStore):
         super().__init__(backend, Path(tempfile.gettempdir()))
 
     def check_writable(self) -> None:
-        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+        """Raise `ObjectStoreFailed` unless an object could be written now."""
         with _translate_errors("write"):
             obstore.put(self._backend, "probe", b"probe")
             obstore.delete(self._backend, "probe")
 
     def _publish(self, source: Path, name: str, size: int) -> None:
         if size <= _SINGLE_PUT:
-            with suppress(AlreadyExistsError):  # the same bytes, by another writer
+            with suppress(AlreadyExistsError):  # another writer stored the same bytes
                 obstore.put(self._backend, name, source, mode="create", use_multipart=False)
         elif not self.exists(Path(name).stem):
-            # In parts there is no create-only put; a rival writes the same bytes to this name.
+            # A multipart put cannot be create-only; a rival writes the same bytes to this name.
             obstore.put(self._backend, name, source, use_multipart=True)
 
 
 def open_store(url: str, **options: Any) -> ObjectStore:
-    """The store at ``file:///folder`` or ``s3://bucket/prefix``."""
+    """Open the store at ``file:///folder`` or ``s3://bucket/prefix``."""
     parts = urlsplit(url)
     if parts.scheme == "file":
         if parts.netloc not in ("", "localhost") or not parts.path.startswith("/"):
-            raise InvalidStoreUrl(url, "write file:// and an absolute path, as file:///data")
+            raise InvalidStoreUrl(url, "use file:// and an absolute path, such as file:///data")
         return FolderStore(Path(unquote(parts.path)))
     if parts.scheme == "s3":
         return BucketStore(url, **options)
@@ -221,19 +221,19 @@ def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
 
 
 @contextmanager
-def _translate_errors(doing: str, sha256: str = "") -> Iterator[None]:
+def _translate_errors(action: str, sha256: str = "") -> Iterator[None]:
     try:
         yield
     except (NotFoundError, FileNotFoundError) as error:
         if not sha256:
-            raise ObjectStoreFailed(_describe_failure(doing, error)) from error
+            raise ObjectStoreFailed(_describe_failure(action, error)) from error
         raise ObjectMissing(sha256) from error
     except (BaseError, OSError) as error:
-        raise ObjectStoreFailed(_describe_failure(doing, error)) from error
+        raise ObjectStoreFailed(_describe_failure(action, error)) from error
 
 
-def _describe_failure(doing: str, error: Exception) -> str:
-    return f"the object store cannot {doing}: {_take_first_line(error)}"
+def _describe_failure(action: str, error: Exception) -> str:
+    return f"the object store cannot {action}: {_take_first_line(error)}"
 
 
 def _take_first_line(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Opening the database and the object store, for the web process; imports no web framework."""
+"""Open the database and the object store for the web process; imports no web framework."""
 
 import tempfile
 from pathlib import Path
@@ -11,7 +11,10 @@ from service.storage.sessions import Database
 
 
 def open_storage(settings: Settings) -> tuple[Database, ObjectStore]:
-    """Open both, making the data folder and the tables where needed; clears what the dead left.
+    """Open the database and the object store.
+
+    The data folder and the tables are created if needed. Temporary files of ended processes are
+    removed.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A database may be away for a while: restarted, unreachable, or its disk full."""
+"""Retry while the database is unavailable: restarted, unreachable, or its disk full."""
 
 import logging
 import sqlite3
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 TRANSIENT_ERRORS = (OperationalError, InterfaceError)
-"""What SQLAlchemy raises when the database is to blame, and by some drivers for mistakes too."""
+"""Errors of SQLAlchemy for a failing database; some drivers raise them for mistakes too."""
 
 _SQLITE_CODES = frozenset(
     (
@@ -27,17 +27,17 @@ _SQLITE_CODES = frozenset(
     )
 )
 _POSTGRESQL_STATES = ("08", "40", "53", "55P03", "57", "58")
-"""Connection, deadlock, resources such as disk and memory, a lock not got, shutdown, I/O."""
+"""Connection, deadlock, resources such as disk and memory, lock timeout, shutdown, I/O."""
 
 PAUSE_SECONDS = 0.3
 GIVE_UP_SECONDS = 60.0
 
 
 def is_transient(error: DBAPIError) -> bool:
-    """Whether an error of the database may pass by itself; a mistake in a statement does not.
+    """Return whether an error of the database may pass by itself, unlike a mistake in a statement.
 
-    SQLite calls both an operational error, and tells them apart by its result code; PostgreSQL by
-    SQLSTATE, which an error of the connection itself does not have.
+    SQLite calls both an operational error and distinguishes them by the result code. PostgreSQL
+    distinguishes them by SQLSTATE, which an error of the connection itself does not have.
     """
     if not isinstance(error, TRANSIENT_ERRORS):
         return False
@@ -50,30 +50,30 @@ def is_transient(error: DBAPIError) -> bool:
 
 
 def retry_transient(work: Callable[[], T]) -> T:
-    """Do work that may be done again from its beginning, until the database lets it.
+    """Repeat work until the database carries it out; the work must be repeatable.
 
-    A transaction that failed has left nothing; one whose commit was not answered may have been
-    made, so the work must bear being done twice: states, results, counts and checkpoints do, and
-    the end of a job, whose second time raises LeaseLost; a line of the log may be told twice.
+    A failed transaction leaves nothing. A transaction whose commit was not answered may have been
+    committed, so the work may be done twice. States, results, counts and checkpoints allow that.
+    The end of a job raises LeaseLost the second time. A line of the log may appear twice.
 
     Raises
     ------
     OperationalError, InterfaceError
         After `GIVE_UP_SECONDS`.
     """
-    begun = time.monotonic()
-    is_told = False
+    start = time.monotonic()
+    is_logged = False
     while True:
         try:
-            done = work()
+            result = work()
         except TRANSIENT_ERRORS as error:
-            if not is_transient(error) or time.monotonic() - begun > GIVE_UP_SECONDS:
+            if not is_transient(error) or time.monotonic() - start > GIVE_UP_SECONDS:
                 raise
-            if not is_told:
+            if not is_logged:
                 _log.warning("the database does not answer: %s", str(error).splitlines()[0])
-            is_told = True
+            is_logged = True
             time.sleep(PAUSE_SECONDS)
         else:
-            if is_told:
-                _log.info("the database was back after %.1f s", time.monotonic() - begun)
-            return done
+            if is_logged:
+                _log.info("the database answers again after %.1f s", time.monotonic() - start)
+            return result

@@ -21,11 +21,11 @@ _BUSY_OPTION = "lagid_busy_seconds"
 
 
 class Database:
-    """The way into SQL.
+    """Access to the SQL database.
 
-    ``with database.write() as session`` commits at the end, or rolls back on an error. On SQLite
-    a writing session begins with ``BEGIN IMMEDIATE``: it waits for its turn at the start, and
-    never meets a deadlock later. A reading session sees one state and cannot write.
+    ``with database.write_session() as session`` commits at the end, or rolls back on an error. On
+    SQLite a writing session begins with ``BEGIN IMMEDIATE``. So it waits for the lock at its start
+    and never meets a deadlock later. A reading session sees one consistent state and cannot write.
     """
 
     def __init__(self, url: str, **options: Any) -> None:
@@ -37,34 +37,36 @@ class Database:
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether this is SQLite (else PostgreSQL)."""
+        """Whether the database is SQLite (else PostgreSQL)."""
         return self.engine.dialect.name == "sqlite"
 
     @contextmanager
     def write_session(self, busy_seconds: float | None = None) -> Iterator[Session]:
-        """A session that commits when the block ends well.
+        """Open a session that commits when its block ends without an error.
 
         Parameters
         ----------
         busy_seconds : float, optional
-            How long it waits for what others have locked; by default `BUSY_SECONDS` on SQLite,
-            and on PostgreSQL until they let go. A longer time than the default is not waited.
+            How long to wait for locks of others, `BUSY_SECONDS` at most. By default that time on
+            SQLite, and on PostgreSQL until the locks are released.
         """
-        make = self._write
+        factory = self._write
         if busy_seconds is not None:
-            hasty = self.engine.execution_options(**{_BUSY_OPTION: min(busy_seconds, BUSY_SECONDS)})
-            make = sessionmaker(hasty, expire_on_commit=False)
-        with make.begin() as session:
+            impatient = self.engine.execution_options(
+                **{_BUSY_OPTION: min(busy_seconds, BUSY_SECONDS)}
+            )
+            factory = sessionmaker(impatient, expire_on_commit=False)
+        with factory.begin() as session:
             yield session
 
     @contextmanager
     def read_session(self) -> Iterator[Session]:
-        """A session that only reads."""
+        """Open a session that only reads."""
         with self._read.begin() as session:
             yield session
 
     def get_waiting_engine(self, seconds: float) -> Engine:
-        """The engine for transactions that wait so long (s) for what others have locked."""
+        """Return an engine whose transactions wait `seconds` for locks of others."""
         return self.engine.execution_options(**{_BUSY_OPTION: seconds})
 
     def dispose(self) -> None:
@@ -73,7 +75,7 @@ class Database:
 
 
 def make_sqlite_url(path: Path) -> str:
-    """The address of a SQLite file."""
+    """Return the address of a SQLite file."""
     return f"sqlite:///{path.absolute()}"
 
 
@@ -98,7 +100,7 @@ def _create_engine(url: str, **options: Any) -> Engine:
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
     assert isinstance(connection, sqlite3.Connection)
-    connection.isolation_level = None  # sqlite3 must not begin transactions of its own kind
+    connection.isolation_level = None  # sqlite3 must not begin transactions by itself
     connection.execute(f"PRAGMA busy_timeout = {int(1000 * BUSY_SECONDS)}")
     _enable_wal(connection)
     connection.execute("PRAGMA synchronous = NORMAL")
@@ -106,9 +108,9 @@ def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) ->
 
 
 def _enable_wal(connection: sqlite3.Connection) -> None:
-    """Switch the file to a write-ahead log, unless it is one already.
+    """Switch the file to a write-ahead log, unless it has one already.
 
-    The switch does not honour the busy timeout when two processes open a new file at once.
+    The switch ignores the busy timeout when two processes open a new file at once.
     """
     deadline = time.monotonic() + BUSY_SECONDS
     while connection.execute("PRAGMA journal_mode").fetchone()[0] not in ("wal", "memory"):

@@ -1,9 +1,8 @@
-"""Statements that the repositories share.
+"""Statements and identifiers that the repositories share.
 
-Sortable, prefixed identifiers: ``job_`` and 26 characters of Crockford's base 32.
-
-48 bits of milliseconds since 1970 and 80 random bits, as in a ULID. Within a process each
-identifier is greater than the one before, also when the clock stands still or goes back.
+An identifier is a prefix and 26 characters of Crockford's base 32, such as ``job_…``. It encodes 48
+bits of milliseconds since 1970 and 80 random bits, as in a ULID. Within a process each identifier
+is greater than the previous one, even if the clock stands still or goes back.
 """
 
 import secrets
@@ -27,47 +26,47 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 CHUNK_ROWS = 1000
-"""Rows of one bulk statement: below PostgreSQL's 65,535 parameters for every table here."""
+"""Rows of one bulk statement; no table exceeds PostgreSQL's 65,535 parameters with it."""
 
 _ID_PARAMETER = "key_of_row"
 
 RETURNING_OPTIONS = {"synchronize_session": False, "populate_existing": True}
-"""For UPDATE … RETURNING: the rows come back as the database has them."""
+"""Options of UPDATE … RETURNING: the rows are loaded as the database stores them."""
 
 
 @dataclass(frozen=True, slots=True)
 class RowPage(Generic[T]):
-    """Some of a list. `next` is the cursor of the page after it; None at the end."""
+    """A part of a list; `next` is the cursor of the next page, None at the end."""
 
     items: tuple[T, ...]
     next: str | None
 
 
 def split_chunks(rows: Iterable[T], size: int = CHUNK_ROWS) -> Iterable[list[T]]:
-    """The same rows in lists of `size`, the last one shorter."""
+    """Split rows into lists of `size`; the last one may be shorter."""
     left = iter(rows)
     while chunk := list(islice(left, size)):
         yield chunk
 
 
-def make_page(found: Sequence[T], limit: int, cursor: Iterable[object]) -> RowPage[T]:
-    """A page of at most `limit` of the rows found by a query that asked for one more.
+def make_page(rows: Sequence[T], limit: int, cursor: Iterable[object]) -> RowPage[T]:
+    """Make a page of at most `limit` rows from a query that asked for one more.
 
-    `cursor` are the cursors of the found rows, in their order.
+    `cursor` are the cursors of these rows, in their order.
     """
-    if len(found) <= limit:
-        return RowPage(tuple(found), None)
-    return RowPage(tuple(found[:limit]), str(list(cursor)[limit - 1]))
+    if len(rows) <= limit:
+        return RowPage(tuple(rows), None)
+    return RowPage(tuple(rows[:limit]), str(list(cursor)[limit - 1]))
 
 
 def insert_missing(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Insert rows in bulk; those whose key is there already stay as they are."""
+    """Insert rows in bulk; rows whose key exists already stay unchanged."""
     for chunk in split_chunks(rows):
         _execute_bulk(session, table, _build_insert(session, table).on_conflict_do_nothing(), chunk)
 
 
 def upsert(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Insert rows in bulk; those whose primary key is there already are replaced."""
+    """Insert rows in bulk; rows whose primary key exists already are replaced."""
     keys = [column.name for column in table.__table__.primary_key]
     for chunk in split_chunks(rows):
         statement = _build_insert(session, table)
@@ -77,7 +76,7 @@ def upsert(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]
 
 
 def update_by_id(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Change rows in bulk, each found by its `id`; all rows name the same columns."""
+    """Update rows in bulk by their `id`; all rows name the same columns."""
     target = cast(Table, table.__table__)
     for chunk in split_chunks(rows):
         statement = update_of(target).where(target.c.id == bindparam(_ID_PARAMETER))
@@ -94,10 +93,11 @@ def _execute_bulk(
     statement: "sqlite.Insert | postgresql.Insert | Update",
     rows: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Carry a statement out for many rows of the same columns.
+    """Execute a statement for many rows with the same columns.
 
-    SQLAlchemy makes a dictionary of each row, then the driver's; a thousand rows of a history are
-    a tenth of a run's time. Here the columns' own conversions are applied column by column.
+    SQLAlchemy makes a dictionary of each row, then one for the driver. For a thousand rows of a
+    history this takes a tenth of the time of a run. Here the conversions of the columns are applied
+    column by column.
     """
     session.flush()
     connection = session.connection()
@@ -106,7 +106,9 @@ def _execute_bulk(
     compiled = statement.compile(
         dialect=dialect, column_keys=[name for name in names if name != _ID_PARAMETER]
     )
-    if compiled.insert_prefetch or compiled.update_prefetch:  # defaults that are made row by row
+    if (
+        compiled.insert_prefetch or compiled.update_prefetch
+    ):  # defaults that are computed row by row
         session.execute(statement, rows)
         return
     values = []
@@ -114,18 +116,18 @@ def _execute_bulk(
         kind = columns["id" if name == _ID_PARAMETER else name].type.dialect_impl(dialect)
         convert = kind.bind_processor(dialect)
         column = [row[name] for row in rows]
-        values.append(column if convert is None else [convert(one) for one in column])
+        values.append(column if convert is None else [convert(value) for value in column])
     if compiled.positional:
         order = [names.index(name) for name in compiled.positiontup or ()]
-        given: Any = list(zip(*(values[i] for i in order), strict=True))
+        parameters: Any = list(zip(*(values[i] for i in order), strict=True))
     else:
-        given = [dict(zip(names, row, strict=True)) for row in zip(*values, strict=True)]
-    connection.exec_driver_sql(str(compiled), given)
+        parameters = [dict(zip(names, row, strict=True)) for row in zip(*values, strict=True)]
+    connection.exec_driver_sql(str(compiled), parameters)
 
 
 def _build_insert(session: Session, table: type[Base]) -> "sqlite.Insert | postgresql.Insert":
     # The two dialects share ON CONFLICT, but SQLAlchemy has no common form of it.
-    # The table, not the class: the ORM's way through bulk rows costs more than the database.
+    # The table, not the class: bulk rows through the ORM cost more than the database.
     name = session.get_bind().dialect.name
     target = cast(Table, table.__table__)
     return sqlite.insert(target) if name == "sqlite" else postgresql.insert(target)
@@ -139,14 +141,14 @@ _LENGTH = 26
 
 
 class _IdSequence:
-    """Strictly increasing 128-bit numbers, led by the time."""
+    """Strictly increasing 128-bit numbers that begin with the time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._last = 0
 
     def take_numbers(self, n: int) -> range:
-        """The next `n` numbers, consecutive from the second on."""
+        """Take the next `n` numbers; they are consecutive."""
         with self._lock:
             fresh = time.time_ns() // 1_000_000 << _RANDOM_BITS | secrets.randbits(_RANDOM_BITS)
             first = max(fresh, self._last + 1)
@@ -158,12 +160,12 @@ _id_sequence = _IdSequence()
 
 
 def new_id(prefix: IdPrefix) -> str:
-    """A new identifier, greater than every one this process made before."""
+    """Make a new identifier, greater than every previous one of this process."""
     return new_ids(prefix, 1)[0]
 
 
 def new_ids(prefix: IdPrefix, n: int) -> list[str]:
-    """`n` new identifiers, ascending."""
+    """Make `n` new identifiers, ascending."""
     return [f"{prefix}_{_encode_base32(number)}" for number in _id_sequence.take_numbers(n)]
 
 

@@ -1,4 +1,4 @@
-"""The tables. Times are UTC, identifiers sort by time, and what a user owns names its project."""
+"""The tables. Times are UTC, identifiers sort by time, and rows of users name their project."""
 
 from datetime import datetime
 from typing import Any
@@ -43,7 +43,7 @@ class Base(DeclarativeBase):
 
 
 class Project(Base):
-    """Owner of everything a user makes."""
+    """Owner of everything that a user creates."""
 
     __tablename__ = "projects"
 
@@ -53,7 +53,7 @@ class Project(Base):
 
 
 class ApiKey(Base):
-    """A key to a project; only its digest is kept."""
+    """A key to a project; only its digest is stored."""
 
     __tablename__ = "api_keys"
 
@@ -68,11 +68,11 @@ class ApiKey(Base):
 
 
 class Dataset(Base):
-    """A stored recording: what is in it, and the hash of the object that holds it.
+    """A stored recording: a description of its content, and the hash of its object.
 
-    `sha256` names the MCAP object; `source_key` is a hash of what it was made from (the uploaded
-    bytes and how they were read, or the derivation), so that the same source gives the same
-    dataset. `sample_time` is None where the channels are irregular.
+    `sha256` names the MCAP object. `source_key` is a hash of the source: the uploaded bytes and how
+    they were read, or the derivation. So the same source gives the same dataset. `sample_time` is
+    None if a channel is sampled irregularly.
     """
 
     __tablename__ = "datasets"
@@ -106,7 +106,7 @@ class Dataset(Base):
 
 
 class LineageEdge(Base):
-    """`child` was made from `parent`; the prefix of each identifier says what it is."""
+    """`child` was made from `parent`; the prefix of an identifier tells its kind."""
 
     __tablename__ = "lineage_edges"
 
@@ -118,7 +118,7 @@ class LineageEdge(Base):
 
 
 class ModelVersion(Base):
-    """One version of a user's own model document."""
+    """One version of a user's model document."""
 
     __tablename__ = "models"
     __table_args__ = (UniqueConstraint("project_id", "name", "version"),)
@@ -134,19 +134,19 @@ class ModelVersion(Base):
 
 
 class Job(Base):
-    """What a user submitted: one or more runs, and the lease of the dispatcher that has them.
+    """A submitted job: one or more runs, and the lease of its dispatcher.
 
-    `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers
-    that fell silent; at `max_attempts` of them the job fails. `evaluations`, `generation` and
-    `seconds_left` are progress over all runs, `best_rms` the smallest of any run so far. `n_reused`
-    runs were taken over from others. `floors` is what `service.dispatch.cramer_rao` makes of a job
-    with noise.
+    `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers that
+    stopped without progress; at `max_attempts` of them the job fails. `evaluations`, `generation`
+    and `seconds_left` are the progress over all runs. `best_rms` is the smallest RMS of any run so
+    far. `n_reused` counts the runs taken over from other jobs. `floors` is the document that
+    `service.dispatch.cramer_rao` computes for a job with noise.
     """
 
     __tablename__ = "jobs"
     __table_args__ = (
         Index("ix_jobs_project_id_id", "project_id", "id"),
-        # These two hold all that a dispatcher's looks and claims ask for.
+        # These two hold all columns that a dispatcher reads to poll and to claim.
         Index("ix_jobs_queue", "state", "priority", "id", "project_id", "n_runs"),
         Index("ix_jobs_owned", "lease_owner", "state", "cancel_requested", "id"),
     )
@@ -180,14 +180,14 @@ class Job(Base):
 
 
 class Run(Base):
-    """One identification: one cell of a job's sweep, and what it gave.
+    """One identification: one cell of the sweep of a job, and its result.
 
-    `number` is the cell's place in the sweep, `spec_hash` names what is computed. `result` is the
-    document of the run result; `estimates` repeats {name: {"value", "stderr"}} of it for summaries
-    over many runs. `rms_noise_free` is the RMS against the records before noise was added.
-    `kills` is how often a worker died over it alone since it last went on. `signals_sha256` names
-    the object of its fitted signals; where several runs share one, its own file is `signals_size`
-    bytes of it from `signals_start`.
+    `number` is the position of the cell in the sweep, `spec_hash` identifies the computation.
+    `result` is the result document. `estimates` repeats {name: {"value", "stderr"}} of it for
+    summaries over many runs. `rms_noise_free` is the RMS against the records before noise was
+    added. `kills` counts how often in a row a worker died in this run alone without progress.
+    `signals_sha256` names the object of its fitted signals. If several runs share an object, the
+    file of this run is `signals_size` bytes of it from `signals_start`.
     """
 
     __tablename__ = "runs"
@@ -231,10 +231,10 @@ class Run(Base):
 
 
 class RunHistory(Base):
-    """Some of the better champions of a run's islands, packed by `service.repositories.history`.
+    """Improved champions of the islands of a run, packed by `service.repositories.history`.
 
-    `digest` is the hash of `points`. `generation` and `evaluations` are the largest in it, `rms`
-    the least.
+    `digest` is the hash of `points`. `generation` and `evaluations` are the largest of these
+    points, `rms` the smallest.
     """
 
     __tablename__ = "run_history"
@@ -249,7 +249,7 @@ class RunHistory(Base):
 
 
 class MigrationLog(Base):
-    """Some of a run's migrants, packed by `service.repositories.history`; `digest` is a hash."""
+    """Migrants of a run, packed by `service.repositories.history`; `digest` is their hash."""
 
     __tablename__ = "migrations_log"
 
@@ -259,7 +259,7 @@ class MigrationLog(Base):
 
 
 class Checkpoint(Base):
-    """Where an unfinished run can go on; only the last one is kept."""
+    """State from which an unfinished run can continue; only the last one is stored."""
 
     __tablename__ = "checkpoints"
 
@@ -272,12 +272,12 @@ class Checkpoint(Base):
 
 
 class Event(Base):
-    """Something that happened to a job; numbered in the order in which it can be seen."""
+    """An event of a job, numbered in the order in which events become visible."""
 
     __tablename__ = "events"
     __table_args__ = (
         Index("ix_events_job_id_id", "job_id", "id"),
-        {"sqlite_autoincrement": True},  # a number is never used twice, so no event is missed
+        {"sqlite_autoincrement": True},  # no number is reused, so no event is missed
     )
 
     id: Mapped[int] = mapped_column(LargeInteger, primary_key=True)
@@ -288,7 +288,7 @@ class Event(Base):
 
 
 class AcceptedReference(Base):
-    """A run that was accepted as the reference of a name; the latest `number` is the one in use."""
+    """A run accepted as the reference of a name; the latest `number` is in use."""
 
     __tablename__ = "accepted_references"
 
@@ -302,7 +302,7 @@ class AcceptedReference(Base):
 
 
 class IdempotencyKey(Base):
-    """A submission that was made under a client's key."""
+    """A job submitted under a client's idempotency key."""
 
     __tablename__ = "idempotency_keys"
 
@@ -314,7 +314,7 @@ class IdempotencyKey(Base):
 
 
 class DispatcherHeartbeat(Base):
-    """A dispatcher that has shown itself, so that health can say whether one is alive."""
+    """Heartbeat of a dispatcher, so that the health check can report whether one is alive."""
 
     __tablename__ = "dispatchers"
 

@@ -252,6 +252,7 @@ def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> N
         "channels": '[{"name":"u","unit":"V","hold":"first","topic":"/a","field":"x"}]',
         "topics": '{"/a": {"rule": "nanoseconds", "epoch": 0, "start": 0, "period": 0}}',
         "segments": "[]",
+        "history": "{}",
     }
     later = replace(MESSAGE, log_time=10)
     good = file_of(Metadata("lagid.dataset", manifest), CHANNEL, MESSAGE, later)

@@ -15,7 +15,7 @@ from workers.errors import ClusterUnavailable
 LEAVE = """
 import sys
 from service.core import temporary_files
-open(sys.argv[1] + temporary_files.prefix(), "w")
+open(sys.argv[1] + temporary_files.make_temporary_prefix(), "w")
 """
 ELSEWHERE = "another boot pid:[4026531836]"
 
