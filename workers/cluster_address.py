@@ -1,6 +1,6 @@
-"""What can be known about a Ray cluster before it is joined, and why joining failed.
+"""Check the address of a Ray cluster before joining it, and explain why joining failed.
 
-Ray waits a minute and more for an address where nobody listens, and says of a wrong token only
+Ray waits a minute and more for an address where nobody listens. For a wrong token it reports only
 that it could not connect. Nothing here imports Ray.
 """
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from workers.errors import ClusterUnavailable
 
 CONNECT_SECONDS = 5.0
-"""A cluster that cannot be connected to within that time is not there."""
+"""Time limit of a connection to a cluster."""
 
 TOKEN_HINT = (
     "set RAY_AUTH_TOKEN (or RAY_AUTH_TOKEN_PATH) to the cluster's token, "
@@ -20,12 +20,12 @@ TOKEN_HINT = (
 
 
 def check_address(address: str) -> None:
-    """Refuse an address of the wrong form, or where nobody listens, or without a token for it.
+    """Refuse an address of the wrong form, without a listener, or without a token.
 
     Raises
     ------
     ClusterUnavailable
-        With what is wrong and what would be right, in one line.
+        The message says in one line what is wrong and what would be right.
     """
     if address == "auto":
         return
@@ -54,7 +54,7 @@ def check_address(address: str) -> None:
 
 
 def has_token() -> bool:
-    """Whether Ray will find a token, or is told that none is needed."""
+    """Whether Ray will find a token, or is configured to need none."""
     if os.environ.get("RAY_AUTH_MODE", "token").lower() != "token":
         return True
     if os.environ.get("RAY_AUTH_TOKEN"):
@@ -64,7 +64,7 @@ def has_token() -> bool:
 
 
 def explain_failure(address: str | None, error: BaseException) -> str:
-    """Why Ray could not be started (`address` None) or joined, in one line."""
+    """Explain in one line why Ray could not be started (`address` None) or joined."""
     text = " ".join(str(error).split())
     if address is None:
         return f"Ray could not be started: {text}"

@@ -1,20 +1,20 @@
-"""Every error the workers raise on purpose.
+"""Errors of the workers.
 
 * WorkersError
     - ClusterUnavailable   Ray could not be started or joined
     - ClusterLost          Ray does not answer any more: the process should end and be restarted
-    - RecordsUnavailable   a run's records cannot be had
+    - RecordsUnavailable   a run's records cannot be loaded
     - PackLost             a pack of work was not finished
         - WorkerDied           its process was killed or ran out of memory
-        - PackCancelled        it was cancelled, as asked
+        - PackCancelled        it was cancelled on request
         - PackFailed           a programming error, with the worker's traceback
 
-What is wrong with a run itself (`sysid.core.errors`) is no error here but its outcome.
+An error in a run itself (`sysid.core.errors`) is not raised here; it is the outcome of the run.
 """
 
 
 class WorkersError(Exception):
-    """Base class of the errors that the workers raise on purpose."""
+    """Base class of the errors of the workers."""
 
 
 class ClusterUnavailable(WorkersError):
@@ -26,7 +26,7 @@ class ClusterLost(WorkersError):
 
 
 class RecordsUnavailable(WorkersError):
-    """A run's records cannot be had; the message is a sentence for its user."""
+    """A run's records cannot be loaded; the message is a sentence for its user."""
 
 
 class PackLost(WorkersError):
@@ -38,7 +38,7 @@ class WorkerDied(PackLost):
 
 
 class PackCancelled(PackLost):
-    """The pack was cancelled, as asked."""
+    """The pack was cancelled on request."""
 
 
 class PackFailed(PackLost):

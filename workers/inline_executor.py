@@ -1,4 +1,4 @@
-"""A crew of one: this process. The plain loop that a cluster must equal bit for bit."""
+"""Executor in this process: the plain loop that a cluster must equal bit for bit."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from workers.tasks import process_pack
 
 
 class InlineExecutor:
-    """Computes each pack when it is waited for; implements `workers.protocol.Executor`."""
+    """Computes each pack on the call that waits for it; a `workers.protocol.Executor`."""
 
     def __init__(self, slots: int = 1) -> None:
         self.slots = slots
@@ -22,7 +22,7 @@ class InlineExecutor:
         self._next = 0
 
     def share_records(self, records: Records) -> Records:
-        """Nothing to do: everybody is here."""
+        """Return the records unchanged: nothing needs to be sent."""
         return records
 
     def submit_pack(
@@ -35,7 +35,7 @@ class InlineExecutor:
         return self._next
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
-        """Compute the next pack, whatever time it takes."""
+        """Compute the next pack, however long it takes."""
         if not self._waiting:
             return ()
         handle = self._waiting.popleft()
@@ -45,7 +45,7 @@ class InlineExecutor:
         return (handle,)
 
     def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
-        """What the pack gave.
+        """Return the results of a pack.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class InlineExecutor:
         return self._results.pop(handle)
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
-        """Compute nothing of that pack."""
+        """Drop the items of a pack."""
         self._packs[handle] = ((), (), ())
 
     def check_cluster_alive(self) -> None:

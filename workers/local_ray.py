@@ -1,7 +1,7 @@
-"""Start a Ray on this machine: as early as can be, and as little of it as is needed.
+"""Start Ray on this machine: as early as possible, and only the programs that are needed.
 
-It is what a recovery waits for. So this module imports nothing heavy, and a process can read the
-rest of the program while Ray starts.
+A recovery waits for Ray. So this module imports nothing heavy, and a process can import the rest of
+the program while Ray starts.
 """
 
 import logging
@@ -18,11 +18,11 @@ from workers.errors import ClusterUnavailable
 from workers.ray_folders import clear_dead_dispatchers, get_ray_folder
 
 OBJECT_STORE_BYTES = 200 * 2**20
-"""Records are small; the default of Ray, 30 % of the memory, is not."""
+"""Records are small; Ray's default is 30 % of the memory."""
 INIT_ARGUMENTS = {"log_to_driver": False, "logging_level": logging.ERROR}
-"""Arguments of `ray.init`, whichever Ray it is."""
+"""Arguments of `ray.init` for a local and for a joined Ray."""
 INIT_ERRORS = (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError)
-"""What `ray.init` raises."""
+"""Errors that `ray.init` raises."""
 ONE_THREAD_ENVIRONMENT = {
     "NUMBA_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -34,7 +34,7 @@ RAY_ENVIRONMENT = {
     "RAY_task_events_report_interval_ms": "0",  # else the GCS keeps 3-4 kB for each task
     "RAY_memory_monitor_refresh_ms": "0",  # it kills the youngest task, not the largest
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # tomorrow's default; silences a warning
-    # Behind the service itself, but not behind everything else on the machine, as its 15 would be.
+    # Lower priority than the service, but not than everything else, as Ray's default of 15.
     "RAY_worker_niceness": "5",
 }
 _UNUSED_STARTS = ("start_monitor", "start_log_monitor", "start_api_server")
@@ -42,25 +42,25 @@ _UNUSED_STARTS = ("start_monitor", "start_log_monitor", "start_api_server")
 
 
 class LocalRay:
-    """A Ray that ends with this process, in a folder of its own.
+    """Ray in a folder of its own, which ends with this process.
 
     Parameters
     ----------
     cpus : int or None
-        Its cores; None: all.
+        Number of cores; None: all.
     meanwhile : callable, optional
-        Called once Ray is imported, before it starts, which is mostly waiting.
+        Called after Ray is imported and before it starts. The start is mostly waiting.
 
     Attributes
     ----------
     module
-        `ray`: it reads its environment when it is imported, and so is imported here.
+        `ray`. It reads its environment at import, so it is imported here.
     folder : Path
 
     Raises
     ------
     ClusterUnavailable
-        If it cannot be started.
+        If Ray cannot be started.
     """
 
     def __init__(
@@ -82,28 +82,28 @@ class LocalRay:
             raise ClusterUnavailable(explain_failure(None, error)) from error
 
     def close(self) -> None:
-        """End it in order."""
+        """Shut Ray down and remove its folder."""
         self.module.shutdown()
         self.remove_folder()
 
     def remove_folder(self) -> None:
-        """Remove its folder."""
+        """Remove the folder of Ray."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def make_folder() -> Path:
-    """Make Ray's folder for this process; what dispatchers that are gone have left is cleared.
+    """Make Ray's folder for this process, and clear the remains of dead dispatchers.
 
     Raises
     ------
     ClusterUnavailable
-        If it cannot be made, or somebody else has made it.
+        If the folder cannot be made, or if another process made it.
     """
     clear_dead_dispatchers()
     folder = get_ray_folder(os.getpid())
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        folder.mkdir(mode=0o700)  # fails for whatever is there, so that it is ours and new
+        folder.mkdir(mode=0o700)  # fails if the path exists, so the folder is new and ours
     except OSError as error:
         raise ClusterUnavailable(
             f"Ray's folder {folder} cannot be made ({error.strerror}). Remove it if it exists, "
@@ -126,9 +126,9 @@ def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:
 
 @contextmanager
 def _skip_unused_programs() -> Iterator[None]:
-    """Ray starts three programs that nobody here uses, a fifth of what its start costs.
+    """Skip three programs of Ray that are not used here, a fifth of the cost of its start.
 
-    There is no setting for it. A version of Ray that has other methods starts them as before.
+    Ray has no setting for this. A version of Ray with other methods starts them as before.
     """
     from ray._private.node import Node
 
@@ -143,4 +143,4 @@ def _skip_unused_programs() -> Iterator[None]:
 
 
 def _start_nothing(_node: Any, *_arguments: Any, **_settings: Any) -> None:
-    """In the place of a method of `Node`."""
+    """Replace a method of `Node`."""

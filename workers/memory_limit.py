@@ -1,7 +1,7 @@
-"""How much memory a worker may use, so that a run that wants too much harms only itself.
+"""Memory limit of a worker, so that a run that needs too much harms only itself.
 
-Without a limit the machine runs full, and whom the kernel or Ray kills then is not always who
-took the memory: Ray kills the youngest task first.
+Without a limit the memory of the machine fills up. The kernel or Ray then kills a process, and not
+always the one that took the memory: Ray kills the youngest task first.
 """
 
 import contextlib
@@ -15,11 +15,11 @@ from workers.protocol import ItemResult, Records, WorkItem
 from workers.tasks import process_pack
 
 MEMORY_SHARE = 0.8
-"""Of the machine's memory, for all workers together."""
+"""Share of the machine's memory for all workers together."""
 
 
 def compute_worker_memory(workers: int) -> int:
-    """What each of so many workers on this machine may use, in bytes."""
+    """Compute the memory limit of each of `workers` workers on this machine, in bytes."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
         total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
@@ -29,7 +29,7 @@ def compute_worker_memory(workers: int) -> int:
 def process_pack_within(
     limit: int | None, pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
 ) -> tuple[ItemResult, ...]:
-    """`workers.tasks.process_pack`, in a process that may use `limit` bytes beyond its program."""
+    """Process a pack in a process that may use `limit` bytes in addition to its program."""
     if limit is not None:
         _limit_memory(limit)
     return process_pack(pack, keys, *shared)
@@ -37,7 +37,7 @@ def process_pack_within(
 
 @cache
 def _limit_memory(limit: int) -> None:
-    """Once in a process: what it holds already is Ray's and the program's."""
+    """Limit this process once; memory in use by then belongs to Ray and the program."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     allowed = _read_used_memory() + limit
     if hard == resource.RLIM_INFINITY or allowed < hard:

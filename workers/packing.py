@@ -1,7 +1,7 @@
-"""How work is cut and grouped: pure functions of measured cost.
+"""Division of work into tasks, by pure functions of measured cost.
 
-A task should last 0.2 to 1 s: shorter, and Ray's millisecond a task shows; longer, and progress,
-cancellation and fairness suffer. Results never depend on any of this.
+A task should last 0.2 to 1 s. If it is shorter, Ray's overhead of a millisecond a task shows. If it
+is longer, progress, cancellation and fairness suffer. Results never depend on this.
 """
 
 from collections.abc import Sequence
@@ -9,42 +9,42 @@ from dataclasses import dataclass
 from math import ceil
 
 PACK_SECONDS = 0.5
-"""Compute time a task aims at."""
+"""Target compute time of a task."""
 
 FIRST_SLICE_SECONDS = 0.15
-"""First slice of a run, shorter so that its progress is seen at once."""
+"""First slice of a run; it is shorter, so that progress is visible at once."""
 
 PACKS_PER_CPU = 2
-"""Packs in flight for each core: one computes, one waits beside it."""
+"""Packs in flight for each core: one computes, one waits."""
 
 WORTH_SPREADING_SECONDS = 0.02
-"""An island's epoch that takes less is not worth a task of its own."""
+"""An island's epoch that takes less gets no task of its own."""
 
 PACK_TOLERANCE = 1.5
-"""A run so many times as long as the mean of its job still fits into a pack that is not cut."""
+"""A run this many times longer than the mean of its job still fits into an uncut pack."""
 
 PREVIOUS_WEIGHT = 0.7
-"""Weight of what was known when a new cost is measured."""
+"""Weight of the previous mean when a new cost is measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeanCost:
-    """Running mean of what one item of a job costs; `seconds` is None before the first."""
+    """Running mean of the cost of one item of a job; `seconds` is None before the first."""
 
     seconds: float | None = None
 
     def add_measurement(self, seconds: float) -> "MeanCost":
-        """The mean after one more item."""
+        """Return the mean after one more item."""
         if self.seconds is None:
             return MeanCost(seconds)
         return MeanCost(PREVIOUS_WEIGHT * self.seconds + (1 - PREVIOUS_WEIGHT) * seconds)
 
 
 def choose_pack_size(cost: MeanCost, waiting: int, slots: int) -> int:
-    """How many of `waiting` equal items go into the next task.
+    """Choose how many of `waiting` equal items go into the next task.
 
-    One while the cost is unknown; never more than an even share of what waits, so that the end of
-    a sweep keeps every core busy.
+    One while the cost is unknown. Never more than an equal share of the waiting items, so that
+    every core is busy at the end of a sweep.
     """
     if cost.seconds is None:
         return min(1, waiting)
@@ -54,9 +54,9 @@ def choose_pack_size(cost: MeanCost, waiting: int, slots: int) -> int:
 
 
 def choose_slice_seconds(slices: int, cost: MeanCost | None = None) -> float:
-    """Length of a run's next time slice after `slices` of them.
+    """Choose the length of a run's next time slice after `slices` of them.
 
-    Where `cost` tells that such a run fits into a pack, it is not cut: each cut is a task more.
+    If by `cost` the run fits into a pack, it is not cut: each cut is one task more.
     """
     if (
         cost is not None
@@ -73,7 +73,7 @@ def is_worth_spreading(epoch_seconds: float, islands: int, idle: int) -> bool:
     Parameters
     ----------
     epoch_seconds : float
-        What one epoch of all islands costs on one core.
+        Cost of one epoch of all islands on one core.
     islands, idle : int
         Islands of the run; cores without work.
     """
@@ -81,7 +81,7 @@ def is_worth_spreading(epoch_seconds: float, islands: int, idle: int) -> bool:
 
 
 def balance_packs(costs: Sequence[float], bins: int) -> tuple[tuple[int, ...], ...]:
-    """Indices dealt over at most `bins` packs of about equal cost (longest first)."""
+    """Distribute indices over at most `bins` packs of about equal cost (longest first)."""
     count = min(bins, len(costs))
     packs: list[list[int]] = [[] for _ in range(count)]
     loads = [0.0] * count

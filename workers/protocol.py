@@ -1,4 +1,4 @@
-"""What goes into the workers and what comes out: values, and two small protocols."""
+"""Messages to and from the workers, and the protocols of executor, observer and source."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,25 +19,25 @@ from sysid.search.state import Improvement, Migrant
 
 Records: TypeAlias = tuple[Record, ...]
 WarmStartValues: TypeAlias = tuple[Mapping[str, float], ...]
-"""Parameter vectors of earlier results, to seed part of a population with."""
+"""Parameter vectors of earlier results that seed part of a population."""
 PackHandle: TypeAlias = Any
-"""Names a pack in flight; only the crew that gave it knows more."""
+"""Identifies a pack in flight; its content is private to the executor."""
 
 
 @dataclass(frozen=True)
 class ProblemSpec:
-    """What is fitted to what.
+    """Model, records and settings of a fit.
 
     Attributes
     ----------
     model : Mapping
         Model document.
     records : str
-        Key under which the crew shares the records; equal keys mean equal records.
+        Key under which the executor shares the records; equal keys mean equal records.
     validation : str or None
-        Key of the records kept for validation.
+        Key of the records for validation.
     validation_fraction : float or None
-        Else the last fraction of each record that is kept for it.
+        Otherwise, the last fraction of each record that is used for validation.
     noise : Noise
         Added to the records that the model is fitted to.
     """
@@ -51,15 +51,14 @@ class ProblemSpec:
 
     @cached_property
     def cache_key(self) -> str:
-        """Equal for equal specifications; names a built problem in a worker's cache."""
+        """Key of a built problem in a worker's cache; equal for equal specifications."""
         return blake2b(f"{self.noise_free_key}{self.noise}".encode(), digest_size=16).hexdigest()
 
     @cached_property
     def noise_free_key(self) -> str:
-        """Equal for specifications that differ in their noise only.
+        """Key that is equal for specifications that differ in their noise only.
 
-        What is written in another order is another one: the parameters' order is that in which a
-        search draws them.
+        The order of the parameters matters, because a search draws them in that order.
         """
         parts = {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "noise"
@@ -74,13 +73,13 @@ class ProblemSpec:
 
 
 def _to_json_value(value: Any) -> dict[str, Any]:
-    """A part that JSON does not know."""
+    """Convert a value that JSON cannot represent."""
     return dict(value) if isinstance(value, Mapping) else asdict(value)
 
 
 @dataclass(frozen=True, slots=True)
 class RunSpec:
-    """One identification, complete: the same specification gives the same bits anywhere."""
+    """Complete specification of one identification; it gives the same bits anywhere."""
 
     problem: ProblemSpec
     algorithm: GeneticAlgorithm
@@ -89,7 +88,7 @@ class RunSpec:
 
     @property
     def reuse_key(self) -> str | None:
-        """Equal for runs of equal results; None where the clock has a say in the result."""
+        """Key that is equal for runs of equal results; None if the result depends on the clock."""
         if self.algorithm.stop.seconds is not None:
             return None
         parts = (
@@ -129,14 +128,14 @@ WorkItem: TypeAlias = AdvanceRun | EvolveIsland
 
 @dataclass(frozen=True, slots=True)
 class RunProgress:
-    """The run goes on from here."""
+    """State from which the run continues."""
 
     state: RunState
 
 
 @dataclass(frozen=True, slots=True)
 class IslandProgress:
-    """The island has got to the border `target`, or rests before it."""
+    """An island that reached the border `target`, or came to rest before it."""
 
     island: Island
     target: int
@@ -150,7 +149,7 @@ class RunConclusion:
     rms_noise_free: float | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Improvements and migrants as plain tuples: named ones cost several times as much."""
+        """Pickle improvements and migrants as plain tuples: named ones cost several times more."""
         identification = self.identification
         histories = [[tuple(item) for item in island] for island in identification.history]
         migrants = [tuple(item) for item in identification.migrations]
@@ -171,9 +170,9 @@ def _rebuild_conclusion(
 
 @dataclass(frozen=True, slots=True)
 class RunFailure:
-    """The run cannot be carried out; `reason` is a sentence for its user.
+    """The run failed; `reason` is a sentence for its user.
 
-    `evaluations` are those of a search that was carried out to its end.
+    `evaluations` are those of a search that was completed.
     """
 
     reason: str
@@ -186,7 +185,7 @@ Outcome: TypeAlias = RunProgress | IslandProgress | RunConclusion | RunFailure
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ItemResult:
-    """What became of one item, and the compute time it took; None: its turn did not come."""
+    """Outcome of one item and its compute time in s; None: it was not processed."""
 
     run: str
     outcome: Outcome | None
@@ -194,12 +193,12 @@ class ItemResult:
 
 
 class Executor(Protocol):
-    """Those who compute packs: a Ray cluster, or this process."""
+    """Computes packs: a Ray cluster, or this process."""
 
     slots: int
 
     def share_records(self, records: Records) -> Any:
-        """Make records known once; the reference travels instead of them."""
+        """Share records once; afterwards only the reference is sent."""
 
     def submit_pack(
         self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
@@ -207,52 +206,52 @@ class Executor(Protocol):
         """Send a pack; `keys` name the shared records in order."""
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
-        """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
+        """Return handles of packs that ended; wait at most `timeout` seconds for the first."""
 
     def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
-        """What a finished pack gave; raises `PackLost`."""
+        """Return the results of a finished pack, or raise `PackLost`."""
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Interrupt a pack, or kill its worker."""
 
     def check_cluster_alive(self) -> None:
-        """Raise `ClusterLost` if the crew shows no sign of life; never waits."""
+        """Raise `ClusterLost` if the cluster does not respond; never waits."""
 
     def close(self) -> None:
-        """Let the crew go."""
+        """Release the workers."""
 
 
 class RunObserver(Protocol):
-    """Who is told about the runs of one job."""
+    """Receives the events of the runs of one job."""
 
     def record_start(self, run: str) -> None:
-        """The run was given to a worker for the first time, from its checkpoint or the start."""
+        """The run was sent to a worker for the first time, from its checkpoint or the start."""
 
     def record_worker_death(self, run: str, kills: int) -> None:
-        """The worker died over this run alone, `kills` times by now; 0: it has gone on since."""
+        """The worker died on this run alone, `kills` times so far; 0: it made progress since."""
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
-        """The run can go on from `state` after `seconds` of compute time."""
+        """The run can continue from `state` after `seconds` of compute time."""
 
     def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         """The run is complete."""
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
-        """The run cannot be carried out."""
+        """The run failed."""
 
     def record_reuse(self, run: str, source: str) -> None:
-        """The run need not be computed: it is what the run `source` was."""
+        """The run need not be computed: it equals the run `source`."""
 
     def should_stop(self) -> bool:
-        """Whether the job was cancelled or lost: asked between packs."""
+        """Whether the job was cancelled or lost; called between packs."""
 
 
 @dataclass(frozen=True, slots=True)
 class QueuedRun:
-    """A run that waits for its turn.
+    """A run that waits for a worker.
 
-    `state` is its checkpoint, if there is one; `kills` is how often its worker died over it, and
-    over no other run, since it last went on.
+    `state` is its checkpoint, if there is one. `kills` counts how often a worker died on it alone
+    since its last progress.
     """
 
     run: str
@@ -271,7 +270,7 @@ class InvalidRun:
 
 @dataclass(frozen=True, slots=True)
 class ReusedRun:
-    """A run whose specification has been carried out before, by the run `source`."""
+    """A run whose specification was computed before, by the run `source`."""
 
     run: str
     source: str
@@ -279,17 +278,17 @@ class ReusedRun:
 
 @dataclass(frozen=True, slots=True)
 class RunNotReady:
-    """The next run waits for the result of one that is not over; ask again."""
+    """The next run waits for the result of an unfinished one; ask again."""
 
 
 JobEntry: TypeAlias = QueuedRun | InvalidRun | ReusedRun | RunNotReady
 
 
 class JobSource(Protocol):
-    """Where a job's runs and records come from, asked for as they are needed."""
+    """Source of a job's runs and records, read as they are needed."""
 
     def iterate_runs(self) -> Iterable[JobEntry]:
-        """The runs, in order; the iterable is read lazily."""
+        """Return the runs, in order; the iterable is read lazily."""
 
     def load_records(self, key: str) -> Records:
         """Return the records of that key, or raise `RecordsUnavailable`."""

@@ -1,4 +1,4 @@
-"""Ray's folder of each dispatcher, and what a dispatcher that is gone leaves in it and running.
+"""Ray's folder of each dispatcher; clean-up of folders and processes of dead dispatchers.
 
 Imports neither Ray nor NumPy.
 """
@@ -14,11 +14,11 @@ import psutil
 
 from sysid.core.machine import make_machine_tag
 
-_MAX_BASE_LENGTH = 22  # what Ray's names and numbers of seven digits leave of a socket's path
+_MAX_BASE_LENGTH = 22  # rest of a socket's path, after Ray's names and numbers of seven digits
 
 
 def get_ray_folder(pid: int) -> Path:
-    """Ray's folder for the dispatcher of that number.
+    """Return Ray's folder for the dispatcher of this process number.
 
     Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
     """
@@ -26,9 +26,9 @@ def get_ray_folder(pid: int) -> Path:
 
 
 def find_folder_processes(pid: int) -> tuple[int, ...]:
-    """Processes of Ray whose arguments name the folder of that dispatcher.
+    """Find processes of Ray whose arguments name the folder of this dispatcher.
 
-    Workers hide theirs, but end by themselves when their raylet does.
+    Workers hide their arguments, but end by themselves when their raylet ends.
     """
     mark = f"{get_ray_folder(pid)}/"
     return tuple(
@@ -47,15 +47,15 @@ def kill_processes(pids: Iterable[int]) -> None:
 
 
 def clear_ray_remains(pid: int) -> None:
-    """Kill what the Ray of a dispatcher that is gone has left running, and remove its folder."""
+    """Kill the remaining Ray processes of a dead dispatcher, and remove its folder."""
     kill_processes(find_folder_processes(pid))
     shutil.rmtree(get_ray_folder(pid), ignore_errors=True)
 
 
 def clear_dead_dispatchers() -> None:
-    """Do so for every dispatcher of this machine that is gone.
+    """Clear the remains of every dead dispatcher of this machine.
 
-    Folders of others are left alone: in another PID namespace the number is somebody else's.
+    Folders of other machines are left alone: in another PID namespace the number differs.
     """
     for folder in _choose_base_folder().glob(f"{_make_folder_prefix()}*"):
         owner = folder.name.removeprefix(_make_folder_prefix())

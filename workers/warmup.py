@@ -1,4 +1,4 @@
-"""Compile, or load from the cache, every loop that a run needs, before the first run comes."""
+"""Compile, or load from the cache, every loop that a run needs, before the first run."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ from sysid.simulation.problem import Problem
 
 
 def warm_up_worker() -> str:
-    """A run of a few generations by each method, on a record of a few samples.
+    """Run a few generations of each method on a record of a few samples.
 
     Returns
     -------
     str
-        Names the program that this process runs, as `sysid.identification.fingerprint` does.
+        Fingerprint of the program of this process (`sysid.identification.fingerprint`).
     """
     times: FloatArray = np.arange(40, dtype=np.float64) * 0.5
     values = 1.0 - np.exp(-times)

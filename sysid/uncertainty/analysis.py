@@ -1,23 +1,25 @@
-"""How sure an estimate is: covariance, intervals, correlation, identifiability.
+"""Uncertainty of an estimate: covariance, intervals, correlation, identifiability.
 
-All from the sensitivities S = ∂ŷ/∂p at the estimate, where p are the places in [0, 1] of the free
-parameters, so that columns are comparable: a unit of p is the parameter's whole range (on a log
-scale: of its logarithm).
+All follow from the sensitivities S = ∂ŷ/∂p at the estimate. The free parameters are in unit
+coordinates p in [0, 1], so that columns are comparable. A unit of p is the parameter's whole range
+(on a log scale: of its logarithm).
 
 With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the soft-l1 loss it is that of an
-M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
-K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly. Where
-residuals of a free run are clearly not white, both are that of coloured ones
-(`sysid.residuals.coloured`), and where those of outputs are clearly correlated, that of a common
-noise (`sysid.residuals.correlated_outputs`). Under a noise model e and S are whitened first
+M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹. Here ψ = e/√(1 + (e/s)²) and
+K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly.
+
+If residuals of a free run are clearly not white, the covariance of coloured residuals is used
+(`sysid.residuals.coloured`). If residuals of outputs are clearly correlated, that of a common noise
+is used (`sysid.residuals.correlated_outputs`). Under a noise model, e and S are whitened first
 (`sysid.identification.generalised_least_squares`).
 
-Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
-nothing tells where in it the parameter lies: w²/12 is added to its variance, and the interval is
-around the plateau's middle, wherever on it the search has ended.
+A time lag that is rounded to whole samples has plateaus of width w on which the output does not
+change. The position on a plateau is undetermined. So w²/12 is added to the variance, and the
+interval is centred on the plateau.
 
-What no data tell follows from the form of the equations (`sysid.identifiability.scaling`) and is
-taken out of S exactly; what these data do not tell, from its singular values. Both give groups
+Directions that no data identify follow from the form of the equations
+(`sysid.identifiability.scaling`); they are removed from S exactly. Directions that these data do
+not identify follow from the singular values of S. Both give groups
 (`sysid.identifiability.combinations`).
 """
 
@@ -66,9 +68,9 @@ class Analysis:
     estimates : tuple of Estimate
         All parameters, fixed and tied ones too.
     uncertainty : Uncertainty or None
-        None when there are no more samples than parameters.
+        None if there are no more samples than parameters.
     possible_gain : float
-        Part of the loss that one least-squares step promises to remove; near 0 at an optimum.
+        Share of the loss that one least-squares step would remove; near 0 at an optimum.
     evaluations : int
     criteria : Criteria
     """
@@ -81,13 +83,13 @@ class Analysis:
     active_bounds: tuple[ActiveBound, ...] = ()
     """Bounds to widen together, the costliest first."""
     linear_model: LinearOutputModel | None = None
-    """None where there is no uncertainty or the loss is not that of squares."""
+    """None if there is no uncertainty, or if the loss is not that of squares."""
     exchanges: ExchangeGroups = ()
-    """Parameters that can change places."""
+    """Parameters that can exchange their values."""
     is_cut_short: bool = False
-    """Whether minima beside the estimate were not looked for because the time was over."""
+    """Whether the time limit prevented the search for minima near the estimate."""
     residuals_and_sensitivities: tuple[FloatArray, FloatArray] | None = None
-    """Residuals (n,) and sensitivities (n, D) that are not whitened."""
+    """Residuals (n,) and sensitivities (n, D), not whitened."""
 
 
 def analyse_estimate(
@@ -96,10 +98,10 @@ def analyse_estimate(
     max_simulations: int | None = None,
     whitening: Whitening | None = None,
 ) -> Analysis:
-    """Standard errors, correlations and identifiability at an estimate (D,).
+    """Compute standard errors, correlations and identifiability at an estimate (D,).
 
-    With no more than `most` simulations; where they do not suffice there are no standard errors.
-    With a whitening all is of the whitened residuals and sensitivities.
+    At most `max_simulations` simulations are used. If they do not suffice, there are no standard
+    errors. With a whitening, residuals and sensitivities are whitened first.
     """
     try:
         sensitivities = compute_sensitivities(problem, theta, max_simulations)
@@ -121,9 +123,9 @@ def analyse_estimate(
 def _analyse_without_sensitivities(
     problem: Problem, theta: FloatArray, spent: BudgetSpentError, whitening: Whitening | None
 ) -> Analysis:
-    """What is known without a look at the neighbours of the estimate.
+    """Analyse an estimate without sensitivities.
 
-    With nothing left it is that of the simulation that a result shows: no budget counts it.
+    If no simulation is left, one is run in addition: a result shows it, and no budget counts it.
     """
     error = spent.residuals
     if error is None:
@@ -175,7 +177,7 @@ def _analyse_sensitivities(
     inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
     colour = estimate_joint_covariance(problem, influence, columns)
     covariance, noise = _estimate_covariance(error, columns, inverse, problem.loss_scale, colour)
-    # A factor that is 0 is not moved by what scales it: the others are, without any effect.
+    # A scaling does not move a factor that is 0. It moves the others, without any effect.
     moved = _find_moved_parameters(powers * theta) | _find_moved_parameters(shifts)
     directions = classify_directions(singular, rows, ~retained, moved, covariance, noise)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
@@ -225,7 +227,7 @@ def _analyse_sensitivities(
 
 
 def _find_moved_parameters(directions: FloatArray) -> BoolArray:
-    """Which parameters (D,) any of some directions (m, D) moves."""
+    """Find the parameters (D,) that any of the directions (m, D) moves."""
     return np.asarray(np.any(directions != 0.0, axis=0))
 
 
@@ -243,10 +245,10 @@ def _find_active_bounds(
 def compute_criteria(
     error: FloatArray, parameters: int, whitening: Whitening | None = None
 ) -> Criteria:
-    """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae.
+    """Compute information criteria from the weighted residuals (n,); formulas in `Criteria`.
 
-    Of whitened residuals the likelihood is still that of the outputs, so that criteria with and
-    without a noise model compare; correlation times count as parameters.
+    With whitened residuals the likelihood is still that of the outputs. So criteria with and
+    without a noise model can be compared. Correlation times count as parameters.
     """
     n, counted = (
         error.size,
@@ -263,9 +265,10 @@ def compute_criteria(
 
 
 def remove_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
-    """Sensitivities that do not change at all along the directions (k, D), and their number.
+    """Remove the directions (k, D) without effect from the sensitivities; count them.
 
-    By differences they would change a little, and where friction breaks away more than that.
+    By differences, the output would change slightly along them, and more where friction breaks
+    away.
     """
     if not directions.size:
         return columns, 0
@@ -280,7 +283,7 @@ def remove_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Floa
 def _correct_for_jumps(
     problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
 ) -> tuple[Estimate, ...]:
-    """Estimates of parameters whose output changes in jumps only."""
+    """Correct the estimates of parameters with which the output changes in jumps only."""
     names = problem.free_names
     blind = {name for name, one in zip(names, one_sided, strict=True) if one}
     moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
@@ -291,15 +294,15 @@ def _correct_for_jumps(
 
 
 def _remove_stderr(estimate: Estimate) -> Estimate:
-    """An estimate whose slope is not known because the output jumps on one side of it only."""
+    """Remove the standard error if the output jumps on one side of the estimate only."""
     reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
 
 
 def _centre_on_plateau(estimate: Estimate, aside: float) -> Estimate:
-    """An estimate whose interval is around the middle of its plateau, which lies so far above it.
+    """Centre the interval of an estimate on its plateau, whose middle is `aside` above it.
 
-    On a plateau the loss is the same, so where on it the search ended says nothing.
+    The loss is constant on a plateau, so the position where the search ended has no meaning.
     """
     if estimate.interval95 is None:
         return estimate
@@ -308,10 +311,10 @@ def _centre_on_plateau(estimate: Estimate, aside: float) -> Estimate:
 
 
 def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
-    """Part of Σψ² in the span of those sensitivities along which the parameters may move.
+    """Share of Σψ² in the span of the sensitivities along which the parameters may move.
 
-    It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds
-    may not move: there the bound is what holds it, and the estimate is optimal inside it.
+    It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds may
+    not move. Then the bound holds it, and the estimate is optimal inside its bounds.
     """
     total = float(influence @ influence)
     downhill = -(columns.T @ influence)
@@ -330,7 +333,7 @@ def _estimate_covariance(
     scale: float,
     colour: ColouredCovariance | None,
 ) -> tuple[FloatArray, float]:
-    """Covariance of the places, and the standard deviation of the noise."""
+    """Estimate the covariance in unit coordinates, and the standard deviation of the noise."""
     n, d = columns.shape
     widening = n / (n - d) if colour is None else colour.equivalent_samples / colour.degrees
     if scale == 0.0:
@@ -350,9 +353,10 @@ def _estimate_covariance(
 def _compute_degrees_of_freedom(
     n: int, inverse: FloatArray, colour: ColouredCovariance | None, whitening: Whitening | None
 ) -> FloatArray:
-    """Degrees of freedom of the intervals (D,): of whitened samples too, what a mean would have.
+    """Compute the degrees of freedom (D,) of the intervals; `inverse` (D, D) is (SᵀS)⁻¹.
 
-    The correlation time is estimated from no more than that. `inverse` (D, D) is (SᵀS)⁻¹.
+    Whitened samples have at most the degrees of freedom of a mean, because the correlation time is
+    estimated from no more.
     """
     d = len(inverse)
     degrees = np.full(d, float(n - d))
@@ -379,11 +383,11 @@ def _classify_parameters(
     is_pulled: BoolArray,
     is_combined: BoolArray,
 ) -> tuple[EstimateStatus, ...]:
-    """What the data say of each parameter: see `EstimateStatus`.
+    """Classify each parameter: see `EstimateStatus`.
 
-    `combined` (D,) are those in a combination; one in none is untold by itself, whatever moves the
-    others. Of one that they pull beyond its bound they say something, however large a residual the
-    bound leaves and standard errors with it.
+    `is_combined` (D,) marks parameters in a combination. An unidentified parameter in none is
+    unidentifiable by itself. If the data pull a parameter beyond its bound, they contain
+    information about it, even if the bound leaves large residuals and standard errors.
     """
     statuses: list[EstimateStatus] = ["identified"] * place.size
     for d in np.flatnonzero(np.logical_or(*is_at_bounds(place))):
@@ -396,7 +400,7 @@ def _classify_parameters(
 
 
 def compute_physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
-    """∂θ/∂p: the range, or on a log scale θ ln(upper/lower)."""
+    """Compute ∂θ/∂p: the range, or on a log scale θ ln(upper/lower)."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     ratio = np.where(problem.evaluator.is_log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
     return np.asarray(np.where(problem.evaluator.is_log > 0, theta * np.log(ratio), upper - lower))
@@ -413,7 +417,7 @@ def _to_correlation(covariance: FloatArray) -> FloatArray:
 def _make_estimates_without_stderr(
     problem: Problem, theta: FloatArray, reason: str
 ) -> tuple[Estimate, ...]:
-    """Estimates of which nothing more is known than their values."""
+    """Make estimates that have values only."""
     d = theta.size
     statuses: list[EstimateStatus] = ["unidentifiable"] * d
     lacks_stderr = np.ones(d, dtype=np.bool_)

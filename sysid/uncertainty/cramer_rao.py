@@ -1,15 +1,14 @@
-"""The Cramér–Rao floor: how exact an unbiased estimate can be under white Gaussian noise.
+"""Cramér–Rao bound: least error of an unbiased estimate under white Gaussian noise.
 
-With S = ∂ŷ/∂θ at the true parameters and noise of deviation σ on every scored sample, no unbiased
-estimate of θ has a covariance below σ²(SᵀS)⁻¹ (Cramér 1946; Rao 1945). An estimate that reaches it
-moves the response by σ√(r/n) in RMS, r the number of directions that the data tell. Both grow in
-proportion to σ, so they are given for σ = 1. Bounds on the parameters hold estimates below the
-floor where σ is large: it knows no bounds.
+Let S = ∂ŷ/∂θ at the true parameters, and let every scored sample have noise of deviation σ. Then no
+unbiased estimate of θ has a covariance below σ²(SᵀS)⁻¹ (Cramér 1946; Rao 1945). An estimate that
+reaches the bound moves the response by σ√(r/n) in RMS, where r is the number of identifiable
+directions. Both grow in proportion to σ, so they are computed for σ = 1. If σ is large, limits on
+the parameters can keep estimates below the bound, which ignores such limits.
 
-It is the floor of the noise that a job adds, which `sysid.data.noise` draws for each output by
-itself: outputs are independent there, whatever noise a measured record has of its own. That one,
-which outputs may have in common (`sysid.residuals.correlated_outputs`), is in the standard errors
-and not in the floor.
+The bound applies to the noise that a job adds. `sysid.data.noise` draws it independently for each
+output. A measured record may have noise of its own, also correlated between outputs
+(`sysid.residuals.correlated_outputs`). That noise is in the standard errors, not in the bound.
 """
 
 from dataclasses import dataclass
@@ -36,10 +35,10 @@ class CramerRaoBound:
     names : tuple of str
         The D free parameters.
     stderr : FloatArray, shape (D,)
-        In each parameter's unit by that of the output; ``inf`` where these data tell nothing of
-        the parameter by itself, or the output moves with it in jumps only.
-    response : float
-        RMS by which the response then differs from the true one: √(r/n), without unit.
+        In each parameter's unit per unit of the output. ``inf`` if the data do not identify the
+        parameter by itself, or if the output changes with it in jumps only.
+    response_rms : float
+        RMS difference between the response and the true one: √(r/n), without unit.
     samples : int
         n scored samples.
     """
@@ -51,9 +50,9 @@ class CramerRaoBound:
 
 
 def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
-    """The floor at true parameters (D,), inside their bounds.
+    """Compute the bound at true parameters (D,), inside their limits.
 
-    The problem must weigh every output with 1, since the noise is the same on each.
+    The problem must weigh every output with 1, because the noise is the same on each.
 
     Raises
     ------

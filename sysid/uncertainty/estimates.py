@@ -17,7 +17,7 @@ class Estimate:
     Attributes
     ----------
     stderr : float or None
-        Standard error, in `unit`; None when there is none, and `reason` says why.
+        Standard error, in `unit`. If it is None, `reason` says why.
     interval95 : tuple of float or None
         95 % interval by the t distribution.
     """
@@ -35,10 +35,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Criteria:
-    """Information criteria, smaller is better: only models fitted to the same samples compare.
+    """Information criteria, smaller is better; compare only models of the same samples.
 
-    The log-likelihood is that of independent Gaussian residuals whose one variance is estimated
-    with the parameters: ln ℓ = -n/2 (ln(2π Σe²/n) + 1), e weighted. With κ = D + 1 (the variance
+    The log-likelihood is that of independent Gaussian residuals. Their variance is estimated with
+    the parameters: ln ℓ = -n/2 (ln(2π Σe²/n) + 1), e weighted. With κ = D + 1 (the variance
     counts): AIC = 2κ - 2 ln ℓ, AICc = AIC + 2κ(κ + 1)/(n - κ - 1), BIC = κ ln n - 2 ln ℓ
     (Akaike 1974; Hurvich and Tsai 1989; Schwarz 1978).
 
@@ -47,7 +47,7 @@ class Criteria:
     aic, bic : float
         Minus infinity where the residuals vanish.
     aicc : float or None
-        None where there are not more samples than κ + 1.
+        None if there are not more samples than κ + 1.
     samples, parameters : int
         n scored samples and D free parameters.
     """
@@ -63,9 +63,10 @@ class Criteria:
 class Uncertainty:
     """Local analysis at the estimate; rows and columns are the free parameters `names`.
 
-    `noise_colour` tells what the covariance takes the residuals for. Where they drift over the
-    whole record, it is a lower bound. `correlation` is of this covariance, `alike` that of
-    (SᵀS)⁻¹: how alike the sensitivities S are, whatever the colour of the residuals.
+    `noise_colour` is the colour of residuals that the covariance assumes. If they drift over the
+    whole record, the covariance is a lower bound. `correlation` belongs to this covariance.
+    `sensitivity_correlation` belongs to (SᵀS)⁻¹: it compares the sensitivities S, for residuals of
+    any colour.
     """
 
     names: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The linear model of the output around an estimate: by what part Σe² grows for a move."""
+"""Linear model of the output around an estimate: relative growth of Σe² for a move."""
 
 from dataclasses import dataclass
 
@@ -13,22 +13,22 @@ _RANDOM_STREAM = 2**63
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearOutputModel:
-    """The sum of squares that linear outputs would have around an estimate.
+    """Sum of squares around an estimate, if the outputs are linear.
 
-    A parameter on a plateau is held: from plateau to plateau the outputs are no line.
+    A parameter on a plateau is held, because the outputs jump from plateau to plateau.
 
     Attributes
     ----------
     covariance : FloatArray, shape (D, D)
-        s²(SᵀS)⁻¹, whatever the colour of the residuals; 0 for those held.
-    root : FloatArray, shape (k, D)
+        s²(SᵀS)⁻¹, for residuals of any colour; 0 for parameters held.
+    information_root : FloatArray, shape (k, D)
         With abs(root · move)² = abs(S · move)².
-    slope : FloatArray, shape (D,)
-        Sᵀe of those at a bound that the data pull beyond it; 0 for the others.
-    error : float
+    outward_slope : FloatArray, shape (D,)
+        Sᵀe of parameters that the data pull beyond a bound; 0 for the others.
+    sum_of_squares : float
         Σe².
-    share : FloatArray, shape (D,)
-        Variance by s²(SᵀS)⁻¹ over the one stated; nan for those held and for those not told.
+    variance_ratio : FloatArray, shape (D,)
+        Variance by s²(SᵀS)⁻¹ over the reported one; nan for parameters held or without variance.
     """
 
     covariance: FloatArray
@@ -38,7 +38,7 @@ class LinearOutputModel:
     variance_ratio: FloatArray
 
     def predict_relative_increase(self, moves: FloatArray) -> FloatArray:
-        """By what part of itself the sum grows for moves (P, D) of the parameters, (P,)."""
+        """Predict the relative growth (P,) of the sum for moves (P, D) of the parameters."""
         turned = moves @ self.information_root.T
         gains = np.einsum("pk,pk->p", turned, turned) + 2.0 * moves @ self.outward_slope
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -46,10 +46,10 @@ class LinearOutputModel:
 
 
 def factor_covariance(covariance: FloatArray) -> FloatArray:
-    """R (D, D) of RRᵀ, the covariance: R times standard normal numbers are moves with it.
+    """Factor a covariance RRᵀ; R (D, D) times standard normal numbers gives such moves.
 
-    By the eigenvalues of the correlation: of parameters whose units differ by many decades those
-    of the covariance would be rounding in all directions but the largest.
+    The eigenvalues of the correlation are used. If units differ by many decades, eigenvalues of
+    the covariance would be rounding in all directions but the largest.
     """
     variance = np.diag(covariance)
     deviation = np.sqrt(np.where(variance > 0, variance, 1.0))
@@ -58,7 +58,7 @@ def factor_covariance(covariance: FloatArray) -> FloatArray:
 
 
 def make_move_generator(seed: int) -> np.random.Generator:
-    """Numbers for moves around an estimate: others than those that noise of that seed is made of.
+    """Make a random generator for moves, independent of the noise of the same seed.
 
     `sysid.data.noise` numbers its streams by channels.
     """
@@ -75,23 +75,24 @@ def linearise_outputs(
     inverse: FloatArray,
     root: FloatArray,
 ) -> LinearOutputModel:
-    """The linear model in the parameters' units.
+    """Make the linear model in the parameters' units.
 
     Parameters
     ----------
     error : FloatArray, shape (n,)
         Weighted residuals.
     columns : FloatArray, shape (n, D)
-        Their slopes over the places.
-    held : BoolArray, shape (D,)
-        On a plateau.
+        Their slopes in unit coordinates p.
+    on_plateau : BoolArray, shape (D,)
+        Parameters that are held.
     place : FloatArray, shape (D,)
+        The estimate in unit coordinates.
     stated : FloatArray, shape (D,)
-        Variances of the places, without the width of a plateau.
+        Reported variances in unit coordinates, without the width of a plateau.
     scale : FloatArray, shape (D,)
         ∂θ/∂p.
     inverse : FloatArray, shape (D, D)
-        (SᵀS)⁻¹ over what moves the output.
+        (SᵀS)⁻¹ in the directions that move the output.
     root : FloatArray, shape (k, D)
         R of SᵀS = RᵀR.
     """
@@ -116,7 +117,7 @@ def linearise_outputs(
 
 
 def _remove_parameters(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """The same without the parameters held."""
+    """Remove the parameters held from (SᵀS)⁻¹ and its root."""
     root = np.where(held, 0.0, root)
     _, singular, rows, retained = truncated_svd(root)
     return (rows[retained].T / singular[retained] ** 2) @ rows[retained], root

@@ -1,21 +1,21 @@
 """Profile likelihood: how far a parameter may move while all others follow it.
 
-For each value v of the parameter the others are estimated anew. With Gaussian noise of unknown
-variance the likelihood ratio against the estimate is n ln(S(v)/S₀), S the sum of squares; the
-interval is where it stays below the 95 % quantile of χ² with one degree of freedom (Venzon and
-Moolgavkar 1988; Raue et al. 2009). Where the model is linear in its parameters this is the
-interval of the t distribution, but for a part of order 1/n. Where it is not, the profile shows
-what the covariance cannot: ends that are open, more than one valley, a bound.
+For each value v of the parameter the others are estimated again. With Gaussian noise of unknown
+variance the likelihood ratio against the estimate is n ln(S(v)/S₀), where S is the sum of squares.
+The interval is where the ratio stays below the 95 % quantile of χ² with one degree of freedom
+(Venzon and Moolgavkar 1988; Raue et al. 2009). For a model that is linear in its parameters this is
+the interval of the t distribution, except for a part of order 1/n. For other models the profile
+shows what the covariance cannot: open ends, more than one valley, a bound.
 
-With the soft-l1 loss its sum R stands in place of S, and the ratio is scaled so that it is again
-one of χ²: by R₀ ΣK / (n Σψ²), ψ and K as in `sysid.uncertainty.analysis` (the ratio test of an
-M-estimator, Hampel et al. 1986, ch. 7), which is 1 where no residual is an outlier.
+With the soft-l1 loss, its sum R replaces S. The ratio is scaled by R₀ ΣK / (n Σψ²) to follow χ²
+again, with ψ and K as in `sysid.uncertainty.analysis` (the ratio test of an M-estimator, Hampel et
+al. 1986, ch. 7). The scale is 1 if no residual is an outlier.
 
-Where the residuals are coloured the ratio is divided by how much wider that makes the square of the
-interval (`sysid.residuals.coloured`), so that profile and standard error mean the same noise.
+If the residuals are coloured, the ratio is divided by the factor by which this widens the square of
+the interval (`sysid.residuals.coloured`). So profile and standard error assume the same noise.
 
-The others are found by least squares from a neighbour: a lag that is rounded to samples, whose
-output moves in jumps only, stays as it is while another parameter is profiled.
+The others are estimated by least squares from a neighbouring value. A time lag that is rounded to
+samples changes the output in jumps only, so it is held while another parameter is profiled.
 """
 
 from collections.abc import Callable
@@ -34,14 +34,12 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_SPAN_FACTOR = 1.5  # of the half width that the covariance promises: where the outermost value lies
-_STEP_GROWTH = 1.3  # growth of a step that does not reach the threshold, and how often
+_SPAN_FACTOR = 1.5  # of the half width by the covariance: position of the outermost value
+_STEP_GROWTH = 1.3  # growth of a step that does not reach the threshold
 _MAX_STEPS, _MIN_POINTS = 40, 3
 _ROUNDING_RMS = 1e-9  # of the outputs' size: residuals that are rounding
-_OWN_SLOPE_TOLERANCE = (
-    1e-14  # of the square of a slope: below, nothing of it is the parameter's own
-)
-_MIN_RANGE = 1e-6  # of the range: what is left to a parameter that another one holds at its bound
+_OWN_SLOPE_TOLERANCE = 1e-14  # of the square of a slope: a smaller rest is rounding
+_MIN_RANGE = 1e-6  # of the range: least range of a parameter that another one limits
 _MAX_BISECTIONS = 6  # halvings of the gap in which the ratio crosses the threshold
 
 
@@ -53,20 +51,20 @@ class Profile:
     ----------
     name, unit : str
     values : FloatArray, shape (V,)
-        Rising; the estimate among them.
-    ratio : FloatArray, shape (V,)
-        n ln(S(v)/S₀), scaled, S₀ the least sum of all; 0 at the best value. ``inf``: it diverges.
+        In rising order, including the estimate.
+    likelihood_ratio : FloatArray, shape (V,)
+        n ln(S(v)/S₀), scaled; S₀ is the least sum of all. 0 at the best value; ``inf``: diverged.
     rms : FloatArray, shape (V,)
     others : FloatArray, shape (V, D - 1)
         The other free parameters, in the problem's order.
     interval : tuple of (float or None)
-        Ends of the 95 % interval; None where the ratio stays below the threshold up to the bound
-        or as far as was looked.
+        Ends of the 95 % interval. None if the ratio stays below the threshold up to the bound, or
+        up to the last value.
     estimate : float
         The best value.
     evaluations : int
     is_complete : bool
-        False if `should_stop` ended it.
+        False if `should_stop` ended the profile.
     """
 
     name: str
@@ -88,14 +86,14 @@ def compute_profile(
     points: int = 21,
     should_stop: Callable[[], bool] | None = None,
 ) -> Profile:
-    """Profile of a free parameter from an estimate (D,), which is refined first.
+    """Compute the profile of a free parameter from an estimate (D,), which is refined first.
 
     Parameters
     ----------
     points : int
-        About how many values, 3 or more; every one takes a least-squares search.
+        Approximate number of values, 3 or more; each takes a least-squares search.
     should_stop : callable
-        Asked before each of them.
+        Called before each of them.
 
     Raises
     ------
@@ -103,7 +101,7 @@ def compute_profile(
         If there is no such free parameter, or there are fewer than 3 points.
     InvalidRecord
         If there are not more samples than parameters, if the simulation diverges, or if it equals
-        the records but for rounding.
+        the records up to rounding.
     """
     names = problem.free_names
     if name not in names:
@@ -113,8 +111,8 @@ def compute_profile(
     if problem.loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
-            f"profiles are of plain squares, not of the noise model {problem.loss.noise_model}. Fit "
-            "with the noise model 'white', or use the standard errors.",
+            f"profiles are of plain squares, not of the noise model {problem.loss.noise_model}. "
+            "Fit with the noise model 'white', or use the standard errors.",
         )
     if points < _MIN_POINTS:
         raise InvalidSettings("/points", f"found {points}; need {_MIN_POINTS} or more")
@@ -131,7 +129,7 @@ def compute_profile(
 
 
 def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
-    """The optimum beside an estimate, if intervals can be measured from it."""
+    """Refine an estimate to the optimum, and check that intervals can be computed there."""
     samples, free = problem.n_scored, len(problem.free_parameters)
     if samples <= free:
         raise InvalidRecord(f"{samples} samples are not more than {free} parameters; need more")
@@ -146,7 +144,7 @@ def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
 
 
 class _ProfileSearch:
-    """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
+    """Values of one parameter in unit coordinates, with the others estimated again at each."""
 
     def __init__(
         self,
@@ -168,7 +166,7 @@ class _ProfileSearch:
         self.half_width = self._predict_half_width(theta)
 
     def extend_side(self, step: float, count: int) -> None:
-        """Walk from the estimate to one side, until the threshold is passed or a bound is met."""
+        """Extend the profile to one side, until the threshold is passed or a bound is reached."""
         place, taken = self._place, 0
         while taken < _MAX_STEPS and not self._is_side_complete(place, taken, count):
             nearer, place = place, min(max(place + step, 0.0), 1.0)
@@ -179,7 +177,7 @@ class _ProfileSearch:
             step *= _STEP_GROWTH if taken >= count else 1.0
 
     def find_interval_end(self, side: float) -> float | None:
-        """Place at which the ratio crosses the threshold; None if it does not."""
+        """Find the coordinate at which the ratio crosses the threshold; None if it does not."""
         inside = min(self._fits, key=lambda place: self._fits[place][1])
         places = sorted((p for p in self._fits if side * (p - inside) > 0), key=lambda p: side * p)
         for outside in places:
@@ -189,7 +187,7 @@ class _ProfileSearch:
         return None
 
     def to_profile(self, low: float | None, high: float | None) -> Profile:
-        """What was found, in the parameter's unit."""
+        """Return the profile in the parameter's unit."""
         parameter = self._problem.free_parameters[self._d]
         order = sorted(self._fits)
         thetas = np.array([self._fits[place][0] for place in order])
@@ -211,7 +209,7 @@ class _ProfileSearch:
         )
 
     def _predict_half_width(self, theta: FloatArray) -> float:
-        """What the covariance promises, at most the range and at least what can be told apart."""
+        """Predict the half width by the covariance: at most the range, at least resolvable."""
         columns, error = (
             (sensed := compute_sensitivities(self._problem, theta)).columns,
             sensed.residuals,
@@ -224,7 +222,7 @@ class _ProfileSearch:
             made_up = np.linalg.lstsq(others, columns[:, self._d], rcond=1e-7)[0]
             direction[np.arange(direction.size) != self._d] = -made_up
         own_slope = columns @ direction
-        # What the others make up for but for rounding has no direction of its own.
+        # A slope that the others compensate up to rounding has no direction of its own.
         norm = float(own_slope @ own_slope)
         if norm <= _OWN_SLOPE_TOLERANCE * float(columns[:, self._d] @ columns[:, self._d]):
             norm = 0.0
@@ -236,7 +234,7 @@ class _ProfileSearch:
     def _compute_ratio_scale(
         self, error: FloatArray, columns: FloatArray, direction: FloatArray, norm: float
     ) -> float:
-        """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
+        """Compute the factor that makes n ln(R/R₀) follow χ², also for coloured residuals."""
         scale = self._problem.loss_scale
         influence = compute_influence(error, scale)
         colour = estimate_joint_covariance(self._problem, influence, columns)
@@ -252,7 +250,7 @@ class _ProfileSearch:
         return self.is_stopped or (taken >= count and self._compute_ratio(place) > CHI_SQUARE_95)
 
     def _fit_others(self, place: float, nearer: float) -> None:
-        """Estimate the others at a place, beginning with what they were at a nearer one."""
+        """Estimate the others at a coordinate, starting from their values at a nearer one."""
         d, start = self._d, self._fits[nearer][0].copy()
         start[d] = self._to_parameter_value(place)
         fixed = _fix_parameter(self._restrict_exchanges(float(start[d])), d, float(start[d]))
@@ -267,9 +265,9 @@ class _ProfileSearch:
         self._fits[place] = (np.insert(others, d, start[d]), rms)
 
     def _restrict_exchanges(self, value: float) -> Problem:
-        """The problem with what can be exchanged with the parameter on its side of a value.
+        """Restrict exchangeable parameters to their side of a value.
 
-        Beyond, the profile would be that of the other copy of the estimate.
+        Otherwise the profile would continue into the other copy of the estimate.
         """
         if not self._larger and not self._smaller:
             return self._problem
@@ -283,7 +281,7 @@ class _ProfileSearch:
         return replace(self._problem, evaluator=evaluator._replace(lower=lower, upper=upper))
 
     def _find_crossing(self, inside: float, outside: float) -> float:
-        """Where the ratio, nearly a parabola, reaches the threshold."""
+        """Find where the ratio, nearly a parabola, reaches the threshold."""
         for _ in range(_MAX_BISECTIONS):
             if self.is_stopped or abs(outside - inside) < 1e-3 * self.half_width:
                 break
@@ -318,7 +316,7 @@ class _ProfileSearch:
 
 
 def _compute_robust_factor(error: FloatArray, scale: float) -> float:
-    """What makes n ln(R/R₀) a ratio of χ²: 1 for squares."""
+    """Compute the factor that makes n ln(R/R₀) follow χ²: 1 for squares."""
     if scale == 0.0:
         return 1.0
     root = 1.0 + (error / scale) ** 2
@@ -327,7 +325,7 @@ def _compute_robust_factor(error: FloatArray, scale: float) -> float:
 
 
 def _fix_parameter(problem: Problem, d: int, value: float) -> Problem:
-    """The problem with one free parameter held at a value; nothing else changes."""
+    """Make the same problem with one free parameter fixed at a value."""
     old = problem.evaluator
     template = old.template.copy()
     template[old.free_rows[d]] = value
