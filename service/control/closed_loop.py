@@ -84,11 +84,13 @@ def simulate_closed_loop(
         loop = close_loop(model, used, step)
     except InvalidSettings as error:
         raise InvalidRequest.from_fault(f"/control{error.pointer}", error.detail) from None
-    found = loop.simulate([replace(reference, name=loop.reference), *inputs], values, times=times)
+    simulated = loop.simulate(
+        [replace(reference, name=loop.reference), *inputs], values, times=times
+    )
     margins = _compute_margins(identified, used)
-    outputs = [found.channel(one.name) for one in model.outputs]
+    outputs = [simulated.channel(signal.name) for signal in model.outputs]
     _check_loop_finite(outputs, times, used.gain, step, margins, is_tuned=tuning is not None)
-    command = found.channel(loop.command)
+    command = simulated.channel(loop.command)
     metrics = _compute_step_metrics(times, outputs, control)
     notes = [] if tuning is None or used.has_derivative_action else list(_describe_tuning(tuning))
     if loop.controller_delay_steps:
@@ -96,21 +98,21 @@ def simulate_closed_loop(
             f"the output responds without delay. The controller therefore acts {step:.4g} s late, "
             "as a sampled controller does"
         )
-    told = _to_controller_out(used, command.values)
+    controller = _to_controller_out(used, command.values)
     notes += [
         *_describe_start(times, outputs, control),
-        *_describe_stability(metrics, margins, told),
+        *_describe_stability(metrics, margins, controller),
     ]
     return LoopResponse(
-        outputs, found.channel(loop.input), command, notes, metrics, told, tuning, margins
+        outputs, simulated.channel(loop.input), command, notes, metrics, controller, tuning, margins
     )
 
 
 def find_control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
     """Report unknown signals, and a controller that is set both by hand and by a tuning rule."""
     for role, name, signals in (
-        ("input", control.input, [one.name for one in model.inputs]),
-        ("output", control.output, [one.name for one in model.outputs]),
+        ("input", control.input, [signal.name for signal in model.inputs]),
+        ("output", control.output, [signal.name for signal in model.outputs]),
     ):
         if name not in signals:
             detail = f"the model has no {role} {name!r}{suggest_name(name, signals)}"
@@ -143,9 +145,9 @@ def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedM
     from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
     from sysid.simulation.simulate import complete_values
 
-    known = complete_values(model, values)
+    complete = complete_values(model, values)
     return IdentifiedModel(
-        model, tuple(IdentifiedValue(name, value) for name, value in known.items())
+        model, tuple(IdentifiedValue(name, value) for name, value in complete.items())
     )
 
 
@@ -161,9 +163,9 @@ def _build_controller(
         control.integral_time,
         control.derivative_time,
     )
-    told = None
+    chosen = None
     if control.tuning is not None:
-        gain, integral_time, derivative_time, told = _tune_controller(
+        gain, integral_time, derivative_time, chosen = _tune_controller(
             identified, control, control.tuning, transport
         )
     assert gain is not None
@@ -182,7 +184,7 @@ def _build_controller(
         upper=control.upper,
         anti_windup=control.anti_windup,
         tracking_time=control.tracking_time,
-    ), told
+    ), chosen
 
 
 def _tune_controller(
@@ -193,7 +195,7 @@ def _tune_controller(
 ) -> tuple[float, float, float, TuningOut]:
     from sysid.control.tuning import tune_controller
 
-    found = tune_controller(
+    result = tune_controller(
         identified,
         control.input,
         control.output,
@@ -202,15 +204,15 @@ def _tune_controller(
         closed_loop_time_constant=tuning.closed_loop_time_constant,
         transport=transport,
     )
-    process = found.process
-    told = TuningOut.from_source(
-        found,
+    process = result.process
+    answer = TuningOut.from_source(
+        result,
         process_gain=process.gain,
         process_delay=process.delay,
         process_time_constant=process.time_constant,
         process_second_time_constant=process.second_time_constant,
     )
-    return found.gain, found.integral_time, found.derivative_time, told
+    return result.gain, result.integral_time, result.derivative_time, answer
 
 
 def _compute_margins(identified: "IdentifiedModel", control: "PidControl") -> MarginsOut | None:
@@ -284,11 +286,11 @@ def _compute_step_metrics(
     step = control.reference
     if step.amplitude == 0 or np.count_nonzero(times >= step.time) < 2:
         return None
-    [output] = [one for one in outputs if one.name == control.output]
-    found = measure_step_response(
+    [output] = [channel for channel in outputs if channel.name == control.output]
+    metrics = measure_step_response(
         times, output.values, at=step.time, before=step.offset, after=step.offset + step.amplitude
     )
-    return StepMetricsOut.from_source(found, output=output.name, unit=output.unit)
+    return StepMetricsOut.from_source(metrics, output=output.name, unit=output.unit)
 
 
 def _describe_tuning(tuning: TuningOut) -> Iterator[str]:
@@ -303,7 +305,7 @@ def _describe_start(
     if not isinstance(control.reference, StepInput):
         return
     step = control.reference
-    [output] = [one for one in outputs if one.name == control.output]
+    [output] = [channel for channel in outputs if channel.name == control.output]
     band, earlier = _REST_TOLERANCE * abs(step.amplitude), output.values[times < step.time]
     if earlier.size:
         if np.ptp(earlier[-max(earlier.size // 4, 2) :]) > band:

@@ -68,29 +68,31 @@ def simulate_run(
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
     with database.read_session() as session:
-        asked = _read_request(session, store, run_id, body)
-    loop = _simulate_loop(asked, body.control) if body.control else None
-    found = _SimulationResult(
-        outputs=_simulate_open_loop(asked) if loop is None else loop.outputs,
-        inputs=[_sample_channel(one, asked.times) for one in asked.inputs]
+        request = _read_request(session, store, run_id, body)
+    loop = _simulate_loop(request, body.control) if body.control else None
+    result = _SimulationResult(
+        outputs=_simulate_open_loop(request) if loop is None else loop.outputs,
+        inputs=[_sample_channel(channel, request.times) for channel in request.inputs]
         + _list_plant_inputs(loop),
-        notes=[*asked.notes, *(loop.notes if loop else ())],
+        notes=[*request.notes, *(loop.notes if loop else ())],
     )
-    reference = None if asked.reference is None else _sample_channel(asked.reference, asked.times)
+    reference = (
+        None if request.reference is None else _sample_channel(request.reference, request.times)
+    )
     dataset = (
-        _store_simulation(database, store, run_id, body, asked, found, reference)
+        _store_simulation(database, store, run_id, body, request, result, reference)
         if body.store
         else None
     )
     return RunSimulationOut.from_source(
         loop,
         id=run_id,
-        parameters=asked.values,
-        outputs=[to_series(one, max_points) for one in found.outputs],
-        inputs=[to_series(one, max_points) for one in found.inputs],
+        parameters=request.values,
+        outputs=[to_series(channel, max_points) for channel in result.outputs],
+        inputs=[to_series(channel, max_points) for channel in result.inputs],
         reference=None if reference is None else to_series(reference, max_points),
         command=to_series(loop.command, max_points) if loop else None,
-        notes=found.notes,
+        notes=result.notes,
         dataset=dataset,
     )
 
@@ -109,24 +111,26 @@ def _read_request(
     check_transport_delay(body.control, float(times[-1]))
     signals = InputSignals(session, store, times)
     inputs = [
-        signals.build_channel(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
-        for one in model.inputs
-        if one.name in body.inputs
+        signals.build_channel(
+            f"/inputs/{signal.name}", signal.name, signal.unit, body.inputs[signal.name]
+        )
+        for signal in model.inputs
+        if signal.name in body.inputs
     ]
     reference = None
     if body.control is not None:
         unit = next((o.unit for o in model.outputs if o.name == body.control.output), "1")
-        at = "/control/reference"
-        reference = signals.build_channel(at, "reference", unit, body.control.reference)
+        pointer = "/control/reference"
+        reference = signals.build_channel(pointer, "reference", unit, body.control.reference)
     values = _collect_values(stored, body.parameters)
-    given = inputs if reference is None else [*inputs, reference]
-    notes = [*notes, *_describe_early_inputs(model, given, period)]
+    channels = inputs if reference is None else [*inputs, reference]
+    notes = [*notes, *_describe_early_inputs(model, channels, period)]
     return _SimulationRequest(model, values, times, inputs, reference, signals.parents, notes)
 
 
-def _describe_early_inputs(model: Model, given: Sequence[Channel], period: float) -> list[str]:
+def _describe_early_inputs(model: Model, signals: Sequence[Channel], period: float) -> list[str]:
     """Report signals from before t = 0. The solver begins where the first of them begins."""
-    first = min(given, key=lambda one: float(one.times[0]), default=None)
+    first = min(signals, key=lambda channel: float(channel.times[0]), default=None)
     if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
         return []
     return [
@@ -140,30 +144,30 @@ def _choose_sample_time(
 ) -> tuple[float, list[str]]:
     """Choose the sampling period in s, with notes about it."""
     try:
-        known = DatasetRepository(session).get(stored.body["datasets"][0]).sample_time
+        recorded = DatasetRepository(session).get(stored.body["datasets"][0]).sample_time
     except StorageError:  # deleted since; the run can still be simulated
-        known = None
-    period = body.sample_time or known
+        recorded = None
+    period = body.sample_time or recorded
     if period is None:
         raise InvalidRequest.from_fault(
             "/sample_time", "is missing, and the run's data do not give one. Give it in s"
         )
     form = stored.model.form
-    if form == "differential" or known is None or abs(period / known - 1) < 1e-3:
+    if form == "differential" or recorded is None or abs(period / recorded - 1) < 1e-3:
         return period, []
     if form == "polynomial":
         raise InvalidRequest.from_fault(
             "/sample_time",
-            f"found {period:g} s, but the terms of this polynomial are samples at {known:g} s. "
+            f"found {period:g} s, but the terms of this polynomial are samples at {recorded:g} s. "
             "Leave it out",
         )
     return period, [
-        f"the model is a recursion identified at a sample time of {known:.6g} s. At "
+        f"the model is a recursion identified at a sample time of {recorded:.6g} s. At "
         f"{period:.6g} s it is another approximation"
     ]
 
 
-def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
+def _collect_values(stored: StoredRun, changes: Mapping[str, float]) -> dict[str, float]:
     """Collect the values of all parameters and of all initial states that the model leaves open."""
     model = stored.model
     rest = {
@@ -171,28 +175,30 @@ def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, 
         for state, start in zip(model.states, model.initial, strict=True)
         if not isinstance(start, FixedInitial)
     }
-    own = {parameter.name for parameter in model.parameters}
-    found = {p["name"]: p["value"] for p in stored.estimates if p["name"] in own}
+    names = {parameter.name for parameter in model.parameters}
+    estimates = {p["name"]: p["value"] for p in stored.estimates if p["name"] in names}
     # A tied parameter follows its expression, unless the request gives it a value.
-    tied = {p["name"] for p in stored.estimates if p["status"] == "tied"} if given else set()
+    tied = {p["name"] for p in stored.estimates if p["status"] == "tied"} if changes else set()
     by_document = {p.name for p in model.parameters if p.tied is not None}
-    kept = {name: value for name, value in found.items() if name not in tied & by_document}
-    return {**rest, **kept, **given}
+    untied = {name: value for name, value in estimates.items() if name not in tied & by_document}
+    return {**rest, **untied, **changes}
 
 
-def _simulate_open_loop(asked: _SimulationRequest) -> list[Channel]:
+def _simulate_open_loop(request: _SimulationRequest) -> list[Channel]:
     # This imports the compiler, which most requests never need.
     from sysid.simulation.simulate import simulate as simulated
 
-    found = simulated(asked.model, asked.inputs, asked.values, times=asked.times).channels
-    check_finite_outputs(found, asked.times)
-    return list(found)
+    channels = simulated(
+        request.model, request.inputs, request.values, times=request.times
+    ).channels
+    check_finite_outputs(channels, request.times)
+    return list(channels)
 
 
-def _simulate_loop(asked: _SimulationRequest, control: ControlIn) -> LoopResponse:
-    assert asked.reference is not None
+def _simulate_loop(request: _SimulationRequest, control: ControlIn) -> LoopResponse:
+    assert request.reference is not None
     return simulate_closed_loop(
-        asked.model, asked.values, asked.times, asked.reference, asked.inputs, control
+        request.model, request.values, request.times, request.reference, request.inputs, control
     )
 
 
@@ -209,64 +215,64 @@ def _store_simulation(
     store: ObjectStore,
     run_id: str,
     body: RunSimulateIn,
-    asked: _SimulationRequest,
-    found: _SimulationResult,
+    resolved: _SimulationRequest,
+    result: _SimulationResult,
     reference: Channel | None,
 ) -> DatasetOut:
     """Store the simulation as a dataset of its run. The same request gives the same dataset."""
     request = body.model_dump(mode="json", exclude={"name", "store"})
-    key = hash_source({"run": run_id, "simulation": request, "values": asked.values})
+    key = hash_source({"run": run_id, "simulation": request, "values": resolved.values})
     with database.read_session() as session:
-        known = DatasetRepository(session).find_by_source(key)
-    if known is not None:
-        return to_out(known)
-    channels = [*found.inputs, *found.outputs]
+        existing = DatasetRepository(session).find_by_source(key)
+    if existing is not None:
+        return to_out(existing)
+    channels = [*result.inputs, *result.outputs]
     taken = {channel.name for channel in channels}
     if reference is not None and reference.name not in taken:
         channels.append(reference)
     details = {
         "run": run_id,
         "simulation": request,
-        "true_parameters": asked.values,
-        "warnings": found.notes,
+        "true_parameters": resolved.values,
+        "warnings": result.notes,
     }
     stored = add_recording(
         database,
         store,
         Recording(tuple(channels)),
-        name=body.name or f"{asked.model.name}, simulated with {run_id}",
+        name=body.name or f"{resolved.model.name}, simulated with {run_id}",
         kind="simulate",
         key=key,
         details=details,
-        parents=[run_id, *asked.parents],
+        parents=[run_id, *resolved.parents],
         relation="simulated",
     )
     return to_out(stored.dataset)
 
 
 def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> Iterator[FieldError]:
-    known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
+    names = [*(p.name for p in model.parameters), *(f"{state.name}(0)" for state in model.states)]
     for name in values:
-        if name not in known:
-            detail = f"the model has no parameter {name!r}{suggest_name(name, known)}"
+        if name not in names:
+            detail = f"the model has no parameter {name!r}{suggest_name(name, names)}"
             yield FieldError(f"/parameters/{name}", detail)
 
 
 def _find_input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
-    known = [one.name for one in model.inputs]
+    inputs = [signal.name for signal in model.inputs]
     controlled = body.control.input if body.control else None
     if body.control is not None:
-        found = list(find_control_faults(model, body.control))
-        yield from found
-        if found:  # the missing inputs are unknown then
+        faults = list(find_control_faults(model, body.control))
+        yield from faults
+        if faults:  # the missing inputs are unknown then
             return
     for name in body.inputs:
-        if name not in known:
-            detail = f"the model has no input {name!r}{suggest_name(name, known)}"
+        if name not in inputs:
+            detail = f"the model has no input {name!r}{suggest_name(name, inputs)}"
             yield FieldError(f"/inputs/{name}", detail)
         elif name == controlled:
             yield FieldError(f"/inputs/{name}", "the controller computes this input. Leave it out")
-    for name in known:
+    for name in inputs:
         if name not in body.inputs and name != controlled:
             yield FieldError(
                 f"/inputs/{name}",

@@ -54,12 +54,12 @@ class BackgroundJobs(Generic[Key]):
         if self._thread is None:
             self._thread = threading.Thread(target=self._run_jobs, name="aside", daemon=True)
             self._thread.start()
-        self._making[key] = one = _BackgroundJob(make())
-        self._queue.put(one)
+        self._making[key] = job = _BackgroundJob(make())
+        self._queue.put(job)
 
     def list_done(self) -> tuple[Key, ...]:
         """List the keys of finished documents."""
-        return tuple(key for key, one in self._making.items() if one.future.done())
+        return tuple(key for key, job in self._making.items() if job.future.done())
 
     def take_result(self, key: Key) -> Document | None:
         """Take the finished document. An error of its steps is raised here."""
@@ -67,9 +67,9 @@ class BackgroundJobs(Generic[Key]):
 
     def cancel_job(self, key: Key) -> None:
         """Cancel a document."""
-        one = self._making.pop(key, None)
-        if one is not None:
-            one.future.cancel()
+        job = self._making.pop(key, None)
+        if job is not None:
+            job.future.cancel()
 
     def stop(self) -> None:
         """Stop the thread."""
@@ -79,23 +79,23 @@ class BackgroundJobs(Generic[Key]):
             self._thread.join(STOP_SECONDS)
 
     def _run_jobs(self) -> None:
-        while (one := self._queue.get()) is not None and not self._ending.is_set():
-            if one.future.cancelled():
+        while (job := self._queue.get()) is not None and not self._ending.is_set():
+            if job.future.cancelled():
                 continue
             try:
-                one.latest = next(one.steps)
+                job.latest = next(job.steps)
             except StopIteration:
-                _set_outcome(one, None)
+                _set_outcome(job, None)
             except Exception as error:  # noqa: BLE001 - border of the thread: `take_result` raises it
-                _set_outcome(one, error)
+                _set_outcome(job, error)
             else:
-                self._queue.put(one)
+                self._queue.put(job)
 
 
-def _set_outcome(one: _BackgroundJob, error: Exception | None) -> None:
-    if not one.future.set_running_or_notify_cancel():
+def _set_outcome(job: _BackgroundJob, error: Exception | None) -> None:
+    if not job.future.set_running_or_notify_cancel():
         return
     if error is None:
-        one.future.set_result(one.latest)
+        job.future.set_result(job.latest)
     else:
-        one.future.set_exception(error)
+        job.future.set_exception(error)

@@ -99,13 +99,13 @@ class _BoundsMaker:
             for axis in self._job.spec["sweep"]["axes"]
             if not axis["path"].startswith(IRRELEVANT_FIELDS)
         ]
-        found = retry_transient(partial(self._group_runs, axes))
-        cells = [dict(zip(axes, one.key, strict=True)) for one in found[:MOST_PROBLEMS]]
+        groups = retry_transient(partial(self._group_runs, axes))
+        cells = [dict(zip(axes, group.key, strict=True)) for group in groups[:MOST_PROBLEMS]]
         problems = []
         for cell in cells:
             problems.append(self._describe_problem(cell))
             yield None
-        left_out = len(found) > MOST_PROBLEMS
+        left_out = len(groups) > MOST_PROBLEMS
         yield {"axes": axes, "problems": problems, "note": LEFT_OUT_NOTE if left_out else ""}
 
     def _group_runs(self, axes: list[str]) -> list[RunGroup]:
@@ -147,7 +147,7 @@ class _BoundsMaker:
         run: Run | None = find_quietest_run(session, self._job.id, cell, self._job.project_id)
         if run is None:
             return None
-        values = {name: one["value"] for name, one in (run.estimates or {}).items()}
+        values = {name: estimate["value"] for name, estimate in (run.estimates or {}).items()}
         return {"kind": "estimate", "run": run.id, "sigma": run.sigma, "values": values}
 
     def _compute_bounds(self, spec: ProblemSpec, values: Mapping[str, float]) -> Document:
@@ -174,14 +174,18 @@ class _BoundsMaker:
             return _to_bounds_document(cramer_rao_bound(problem, theta))
 
 
-def _to_bounds_document(found: CramerRaoBound) -> Document:
+def _to_bounds_document(bound: CramerRaoBound) -> Document:
     stderr = {
         name: to_finite(value)
-        for name, value in zip(found.names, found.stderr.tolist(), strict=True)
+        for name, value in zip(bound.names, bound.stderr.tolist(), strict=True)
     }
-    untold = [name for name, value in stderr.items() if value is None]
-    note = f"no Cramér–Rao bound: the data do not determine {', '.join(untold)}" if untold else ""
-    return {"stderr": stderr, "rms": to_finite(found.response_rms), "note": note}
+    undetermined = [name for name, value in stderr.items() if value is None]
+    note = (
+        f"no Cramér–Rao bound: the data do not determine {', '.join(undetermined)}"
+        if undetermined
+        else ""
+    )
+    return {"stderr": stderr, "rms": to_finite(bound.response_rms), "note": note}
 
 
 def _widen_bounds(

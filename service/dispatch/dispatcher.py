@@ -149,7 +149,7 @@ class Dispatcher:
         return Admission(SHORT_RUNS, min(self._priorities.values()))
 
     def _list_held_recorders(self) -> list[RunRecorder]:
-        return [one for lease, one in self._recorders.items() if lease not in self._lost]
+        return [recorder for lease, recorder in self._recorders.items() if lease not in self._lost]
 
     def _listen_for_wakeups(self) -> None:
         with open_notifier(self._database, self.stopping) as waker:
@@ -196,7 +196,7 @@ class Dispatcher:
 
     def _list_ready_to_conclude(self) -> list[Lease]:
         """List jobs whose bounds are ready, or are no longer wanted."""
-        stopped = [one for one in self._aside.pending_keys if self._recorders[one].is_stopped]
+        stopped = [key for key in self._aside.pending_keys if self._recorders[key].is_stopped]
         for lease in stopped:
             self._aside.cancel_job(lease)
         return [*stopped, *self._aside.list_done()]

@@ -118,11 +118,11 @@ class JobRuns:
 
     def _iterate_chains(self, chains: OpenChains) -> Iterator[list[Run]]:
         """Iterate over ready runs of many chains. Yields no rows while all remaining runs wait."""
-        made = retry_transient(self._count_made_runs)
+        n_created = retry_transient(self._count_made_runs)
         while not chains.is_exhausted:
-            numbers = chains.take_ready(MOST_READY_RUNS, made)
+            numbers = chains.take_ready(MOST_READY_RUNS, n_created)
             if not numbers and chains.has_ready and retry_transient(self._make_runs):
-                made = retry_transient(self._count_made_runs)
+                n_created = retry_transient(self._count_made_runs)
             rows = retry_transient(partial(self._read_unfinished, numbers)) if numbers else []
             for row in rows:
                 self._warm.register_run(row)
@@ -136,13 +136,13 @@ class JobRuns:
             retry_transient(partial(self._build_queued_run, row, state)) for row, state in rows
         ]
         sources = retry_transient(partial(self._find_computed_runs, queued))
-        for one in queued:
-            source = sources.get(one.run)
+        for run in queued:
+            source = sources.get(run.run)
             if source is not None:
-                retry_transient(partial(self._warm.record_reuse, one.run, source))
-            elif isinstance(one, QueuedRun):
-                self._problems[one.run] = one.spec.problem
-            yield one if source is None else ReusedRun(one.run, source)
+                retry_transient(partial(self._warm.record_reuse, run.run, source))
+            elif isinstance(run, QueuedRun):
+                self._problems[run.run] = run.spec.problem
+            yield run if source is None else ReusedRun(run.run, source)
 
     def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
         """Build the specification of one cell's run, with its warm start.
@@ -155,11 +155,13 @@ class JobRuns:
         body = build_run_body(self._job.spec, cell)
         model = load_stored_model(body["model"])
         validation = body["validation"] or {}
-        kept = validation.get("datasets")
+        validation_datasets = validation.get("datasets")
         problem = ProblemSpec(
             model=dict(model.document),
             records=self._register_data(body["datasets"], body, model),
-            validation=None if kept is None else self._register_data(kept, body, model),
+            validation=None
+            if validation_datasets is None
+            else self._register_data(validation_datasets, body, model),
             validation_fraction=validation.get("fraction"),
             settings=fit_settings_of(body),
             noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
@@ -202,7 +204,7 @@ class JobRuns:
         with self._database.read_session() as session:
             return DatasetRepository(session, self._job.project_id).get_all(datasets)
 
-    def save_signals(self, run: str, found: Identification) -> StoredSignals | None:
+    def save_signals(self, run: str, identification: Identification) -> StoredSignals | None:
         """Write the file of a run's fitted signals, to be stored with those of other runs.
 
         Raises
@@ -210,13 +212,15 @@ class JobRuns:
         ObjectStoreFailed
             If it cannot be written.
         """
-        self._warm.record_success(run, found)
+        self._warm.record_success(run, identification)
         problem = self._problems.pop(run)
         records = {key: self.load_records(key) for key in problem.record_keys}
         fit_records = prepare_run_records(problem, records)
-        parts: list[FittedPart] = [("estimation", fit_records.estimation, found.simulated)]
+        parts: list[FittedPart] = [("estimation", fit_records.estimation, identification.simulated)]
         if fit_records.validation is not None:
-            parts.append(("validation", fit_records.validation, found.simulated_validation))
+            parts.append(
+                ("validation", fit_records.validation, identification.simulated_validation)
+            )
         return add_fitted_signals(self._shelf, run, parts)
 
     def note_failure(self, run: str) -> None:
@@ -240,12 +244,14 @@ class JobRuns:
 
         The database counts the created runs, so that any dispatcher can continue.
         """
-        made = self._count_made_runs()
-        if made >= self._job.n_runs:
+        n_created = self._count_made_runs()
+        if n_created >= self._job.n_runs:
             return False
         if self._groups is None:
             self._groups = read_axis_groups(self._job.spec)
-        cells = list(islice(build_stored_cells(self._job.spec, self._groups, made), CHUNK_ROWS))
+        cells = list(
+            islice(build_stored_cells(self._job.spec, self._groups, n_created), CHUNK_ROWS)
+        )
         with self._database.write_session() as session:
             RunWriter(session, self._lease).create_runs(cells)
         return bool(cells)
@@ -278,16 +284,16 @@ class JobRuns:
     def _find_computed_runs(self, queued: list[QueuedRun | InvalidRun]) -> dict[str, str]:
         """Find earlier runs with the same specification, and write all hashes."""
         hashes = {
-            one.run: key
-            for one in queued
-            if isinstance(one, QueuedRun) and (key := one.spec.reuse_key) is not None
+            entry.run: key
+            for entry in queued
+            if isinstance(entry, QueuedRun) and (key := entry.spec.reuse_key) is not None
         }
         with self._database.write_session() as session:
             write_hashes(session, self._lease, hashes)
             if not self._job.spec["reuse"]:
                 return {}
-            known = find_computed_runs(session, set(hashes.values()), self._job.project_id)
-        return {run: known[one] for run, one in hashes.items() if one in known}
+            sources = find_computed_runs(session, set(hashes.values()), self._job.project_id)
+        return {run: sources[key] for run, key in hashes.items() if key in sources}
 
     def _register_data(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:
         channels = map_channels(model, body["channels"], body["hold"])

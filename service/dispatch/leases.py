@@ -67,8 +67,12 @@ class HeldLeases:
 
     def start_heartbeat(self, details: dict[str, object]) -> None:
         """Register the dispatcher and start the heartbeat."""
-        told = {LEASE_SECONDS_KEY: self._length.total_seconds(), **describe_process(), **details}
-        retry_transient(partial(self._announce_dispatcher, told))
+        description = {
+            LEASE_SECONDS_KEY: self._length.total_seconds(),
+            **describe_process(),
+            **details,
+        }
+        retry_transient(partial(self._announce_dispatcher, description))
         self._thread.start()
 
     def _announce_dispatcher(self, details: Document) -> None:
@@ -163,7 +167,7 @@ class HeldLeases:
         with self._database.write_session(self._heartbeat_seconds) as session:
             DispatcherRepository(session, self._clock).record_heartbeat(self.owner)
             held = LeaseQueue(session, self._clock).renew_leases(before, self._length)
-        renewed = {one.lease for one in held}
+        renewed = {claim.lease for claim in held}
         with self._lock:
             for lease in before:
                 if lease not in renewed:

@@ -126,19 +126,19 @@ class RunRecorder:
     def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         """Record the result of a complete run."""
         self._waiting.pop(run, None)
-        found, live = concluded.identification, self._live.pop(run, None)
-        self._collect_history(run, found.history, found.migrations, live)
+        identification, live = concluded.identification, self._live.pop(run, None)
+        self._collect_history(run, identification.history, identification.migrations, live)
         try:
-            signals = self._save_signals(run, found)
+            signals = self._save_signals(run, identification)
         except (ObjectStoreFailed, RecordsUnavailable) as error:
             self._report_unstored_signals([run], error)
             signals = None
         if signals is not None:
             self._pending.signals[run] = signals
         self._pending.outcomes.append(to_run_outcome(run, concluded, seconds))
-        self._evaluations += found.evaluations
-        self._generation = max(self._generation, found.generations)
-        self._best = min(self._best, found.rms)
+        self._evaluations += identification.evaluations
+        self._generation = max(self._generation, identification.generations)
+        self._best = min(self._best, identification.rms)
         self._n_done += 1
         self._news = True
 
@@ -235,12 +235,12 @@ class RunRecorder:
         return JobProgress(
             evaluations=self._evaluations
             + sum(self._waiting.values())
-            + sum(one.evaluations for one in self._taken)
+            + sum(outcome.evaluations for outcome in self._taken)
             + sum(state.evaluations for state in states),
             generation=max(
                 [
                     self._generation,
-                    *(one.generations for one in self._taken),
+                    *(outcome.generations for outcome in self._taken),
                     *(state.generation for state in states),
                 ]
             ),
@@ -301,8 +301,10 @@ class RunRecorder:
             self._report_unstored_signals(runs, reason)
         self._pending.signals = {}
         self._pending.outcomes = [
-            one if one.run_id not in places else _add_signals_location(one, places[one.run_id])
-            for one in self._pending.outcomes
+            outcome
+            if outcome.run_id not in places
+            else _add_signals_location(outcome, places[outcome.run_id])
+            for outcome in self._pending.outcomes
         ]
 
     def _write_rows(self, session: Session, *, tell: bool, keep: bool) -> None:
@@ -328,8 +330,10 @@ class RunRecorder:
 
     def _mark_written(self, now: float, *, tell: bool, keep: bool) -> None:
         self._pending, self._wrote = _PendingWrites(), now
-        self._evaluations += sum(one.evaluations for one in self._taken)
-        self._generation = max([self._generation, *(one.generations for one in self._taken)])
+        self._evaluations += sum(outcome.evaluations for outcome in self._taken)
+        self._generation = max(
+            [self._generation, *(outcome.generations for outcome in self._taken)]
+        )
         self._best = min([self._best, *_list_rms(self._taken)])
         self._taken = []
         if tell:
@@ -343,11 +347,14 @@ class RunRecorder:
                 live.changed = False
 
 
-def _add_signals_location(one: RunOutcome, place: SignalsLocation) -> RunOutcome:
+def _add_signals_location(outcome: RunOutcome, location: SignalsLocation) -> RunOutcome:
     return replace(
-        one, signals_sha256=place.sha256, signals_start=place.start, signals_size=place.size
+        outcome,
+        signals_sha256=location.sha256,
+        signals_start=location.start,
+        signals_size=location.size,
     )
 
 
 def _list_rms(outcomes: list[RunOutcome]) -> list[float]:
-    return [one.best_rms for one in outcomes if one.best_rms is not None]
+    return [outcome.best_rms for outcome in outcomes if outcome.best_rms is not None]

@@ -14,18 +14,18 @@ from workers.protocol import RunConclusion
 
 def to_run_outcome(run: str, concluded: RunConclusion, seconds: float) -> RunOutcome:
     """Build the row of a run that succeeded, without its signals."""
-    found, without = concluded.identification, to_finite(concluded.rms_noise_free)
+    identification, rms_noise_free = concluded.identification, to_finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
         state=JobState.SUCCEEDED,
-        result={**to_result_document(found, seconds), "rms_noise_free": without},
-        valid=found.valid,
-        best_rms=to_finite(found.rms),
-        rms_noise_free=without,
-        fit_estimation=to_finite(found.fit_percent),
-        fit_validation=to_finite(found.fit_percent_validation),
-        evaluations=found.evaluations,
-        generations=found.generations,
+        result={**to_result_document(identification, seconds), "rms_noise_free": rms_noise_free},
+        valid=identification.valid,
+        best_rms=to_finite(identification.rms),
+        rms_noise_free=rms_noise_free,
+        fit_estimation=to_finite(identification.fit_percent),
+        fit_validation=to_finite(identification.fit_percent_validation),
+        evaluations=identification.evaluations,
+        generations=identification.generations,
         seconds=seconds,
     )
 
@@ -36,17 +36,17 @@ def to_history_points(
     """Iterate over improvements beyond the first `written` of each island."""
     for island, improvements in enumerate(history):
         first = written.get(island, 0)
-        for number, one in enumerate(improvements[first:], start=first):
-            if math.isfinite(one.rms):
+        for number, improvement in enumerate(improvements[first:], start=first):
+            if math.isfinite(improvement.rms):
                 yield HistoryPoint(
                     run,
                     island,
                     number,
-                    one.generation,
-                    one.evaluations,
-                    one.rms,
-                    one.phase,
-                    one.parameters,
+                    improvement.generation,
+                    improvement.evaluations,
+                    improvement.rms,
+                    improvement.phase,
+                    improvement.parameters,
                 )
 
 
@@ -54,6 +54,6 @@ def to_migrant_points(
     run: str, migrants: tuple[Migrant, ...], written: int
 ) -> Iterator[MigrantPoint]:
     """Iterate over migrants beyond the first `written`."""
-    for number, one in enumerate(migrants[written:], start=written):
-        if math.isfinite(one.fitness):
-            yield MigrantPoint(run, number, *one)
+    for number, migrant in enumerate(migrants[written:], start=written):
+        if math.isfinite(migrant.fitness):
+            yield MigrantPoint(run, number, *migrant)

@@ -81,32 +81,32 @@ class OpenChains:
         """Whether a run may begin. One that `take_ready` did not return is not created yet."""
         return bool(self._free)
 
-    def take_ready(self, limit: int, made: int) -> list[int]:
+    def take_ready(self, limit: int, n_created: int) -> list[int]:
         """Take at most `limit` numbers below `made` of runs that may begin, each once."""
         self._open_chains(limit)
-        found: list[int] = []
+        numbers: list[int] = []
         for _ in range(len(self._free)):
             key = self._free.popleft()
-            one = self._open[key]
-            if len(found) < limit and one.numbers[one.position] < made:
-                found.append(self._take_next(one))
-            if self._is_ready(one):
+            chain = self._open[key]
+            if len(numbers) < limit and chain.numbers[chain.position] < n_created:
+                numbers.append(self._take_next(chain))
+            if self._is_ready(chain):
                 self._free.append(key)
-        return found
+        return numbers
 
     def end_run(self, number: int, values: Mapping[str, float] | None = None) -> None:
         """End a run; `values` are its estimates if it succeeded. Repeated calls are harmless."""
         key = self._chain.find_chain(number)
-        one = self._open.get(key)
-        if one is None or number not in one.running:
+        chain = self._open.get(key)
+        if chain is None or number not in chain.running:
             return
-        was_free = self._is_ready(one)
-        one.running.discard(number)
-        if values is not None and number > one.last_success:
-            one.values, one.last_success = values, number
-        if one.position == len(one.numbers) and not one.running:
+        was_free = self._is_ready(chain)
+        chain.running.discard(number)
+        if values is not None and number > chain.last_success:
+            chain.values, chain.last_success = values, number
+        if chain.position == len(chain.numbers) and not chain.running:
             del self._open[key]
-        elif self._is_ready(one) and not was_free:
+        elif self._is_ready(chain) and not was_free:
             self._free.append(key)
 
     def find_previous_values(
@@ -116,42 +116,42 @@ class OpenChains:
 
         `stored` finds it, with its number, among runs that an earlier attempt has ended.
         """
-        one = self._open[self._chain.find_chain(number)]
-        if one.has_skipped:
-            found = stored(one.numbers[: one.numbers.index(number)])
-            if found is not None and found[0] > one.last_success:
-                one.last_success, one.values = found
-            one.has_skipped = False
-        return one.values
+        chain = self._open[self._chain.find_chain(number)]
+        if chain.has_skipped:
+            last = stored(chain.numbers[: chain.numbers.index(number)])
+            if last is not None and last[0] > chain.last_success:
+                chain.last_success, chain.values = last
+            chain.has_skipped = False
+        return chain.values
 
-    def _open_chains(self, wanted: int) -> None:
+    def _open_chains(self, n_runs: int) -> None:
         room = MOST_OPEN_CHAINS - len(self._open)
-        while len(self._free) < wanted and room > 0 and self._opened < self._n_chains:
+        while len(self._free) < n_runs and room > 0 and self._opened < self._n_chains:
             key, self._opened = self._opened, self._opened + 1
-            one = _OpenChain(self._chain.list_runs(key))
-            self._skip_ended(one)
-            if one.position < len(one.numbers):
-                self._open[key] = one
+            chain = _OpenChain(self._chain.list_runs(key))
+            self._skip_ended(chain)
+            if chain.position < len(chain.numbers):
+                self._open[key] = chain
                 self._n_unfinished += 1
                 self._free.append(key)
                 room -= 1
 
-    def _take_next(self, one: _OpenChain) -> int:
-        number = one.numbers[one.position]
-        one.running.add(number)
-        one.position += 1
-        self._skip_ended(one)
-        self._n_unfinished -= one.position == len(one.numbers)
+    def _take_next(self, chain: _OpenChain) -> int:
+        number = chain.numbers[chain.position]
+        chain.running.add(number)
+        chain.position += 1
+        self._skip_ended(chain)
+        self._n_unfinished -= chain.position == len(chain.numbers)
         return number
 
-    def _skip_ended(self, one: _OpenChain) -> None:
-        while one.position < len(one.numbers) and one.numbers[one.position] in self._ended:
-            one.position, one.has_skipped = one.position + 1, True
+    def _skip_ended(self, chain: _OpenChain) -> None:
+        while chain.position < len(chain.numbers) and chain.numbers[chain.position] in self._ended:
+            chain.position, chain.has_skipped = chain.position + 1, True
 
-    def _is_ready(self, one: _OpenChain) -> bool:
-        if one.position == len(one.numbers):
+    def _is_ready(self, chain: _OpenChain) -> bool:
+        if chain.position == len(chain.numbers):
             return False
-        return not one.running or not self._waits(one.numbers[one.position])
+        return not chain.running or not self._waits(chain.numbers[chain.position])
 
 
 WARM_START_PATH = "/warm_start"
@@ -179,7 +179,7 @@ class WarmStarts:
         with self._database.read_session() as session:
             query = select(Run.number).where(
                 Run.job_id == self._job.id,
-                Run.state.in_([one for one in JobState if one not in OPEN_STATES]),
+                Run.state.in_([state for state in JobState if state not in OPEN_STATES]),
             )
             ended = set(session.scalars(query))
         self._chains = OpenChains(chain, self._job.n_runs, waits, ended)
@@ -206,9 +206,11 @@ class WarmStarts:
         values = self._chains.find_previous_values(row.number, self._read_last_success)
         return () if values is None else (values,)
 
-    def record_success(self, run: str, found: Identification) -> None:
+    def record_success(self, run: str, identification: Identification) -> None:
         """Record that a run of the job has succeeded."""
-        self._end_run(run, {one.name: float(one.value) for one in found.estimates})
+        self._end_run(
+            run, {estimate.name: float(estimate.value) for estimate in identification.estimates}
+        )
 
     def record_reuse(self, run: str, source: str) -> None:
         """Record that a run takes over the result of `source`."""
@@ -234,8 +236,8 @@ class WarmStarts:
             (Run.number - before.start) % before.step == 0,
         )
         with self._database.read_session() as session:
-            found = session.execute(query.order_by(Run.number.desc()).limit(1)).one_or_none()
-        return None if found is None else (found[0], _to_values(found[1]))
+            row = session.execute(query.order_by(Run.number.desc()).limit(1)).one_or_none()
+        return None if row is None else (row[0], _to_values(row[1]))
 
     def _read_estimates(self, run: str) -> Mapping[str, float]:
         if run not in self._earlier:
@@ -252,8 +254,8 @@ class _WaitRule:
         groups = read_axis_groups(job.spec)
         self._lengths = [len(steps) for steps in groups]
         swept = [
-            (place, values)
-            for place, steps in enumerate(groups)
+            (group, values)
+            for group, steps in enumerate(groups)
             for _, axis, values in steps.columns
             if axis.path == WARM_START_PATH
         ]
@@ -266,10 +268,10 @@ class _WaitRule:
     def __call__(self, number: int) -> bool:
         if self._swept is None:
             return self.any
-        place, values = self._swept
-        waits: bool = values[locate_cell(number, self._lengths)[place]] == PREVIOUS
+        group, values = self._swept
+        waits: bool = values[locate_cell(number, self._lengths)[group]] == PREVIOUS
         return waits
 
 
 def _to_values(estimates: Mapping[str, Any] | None) -> Mapping[str, float]:
-    return {name: float(one["value"]) for name, one in (estimates or {}).items()}
+    return {name: float(estimate["value"]) for name, estimate in (estimates or {}).items()}

@@ -95,11 +95,11 @@ def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> I
 
 def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:
     """Find the position of a cell in each of the crossed groups. The last group varies fastest."""
-    found = []
+    positions = []
     for length in reversed(lengths):
         number, position = divmod(number, length)
-        found.append(position)
-    return found[::-1]
+        positions.append(position)
+    return positions[::-1]
 
 
 def count_values(axis: SweepAxis) -> int:
@@ -139,31 +139,31 @@ def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
     lengths: dict[str, int] = {}
     seen: set[str] = set()
     for number, axis in enumerate(job.sweep.axes):
-        place = f"/sweep/axes/{number}"
+        pointer = f"/sweep/axes/{number}"
         detail = _describe_unknown_path(document, axis.path)
         if axis.path in seen:
             detail = f"{axis.path!r} is already an axis of this sweep"
         if detail:
-            yield FieldError(f"{place}/path", detail)
+            yield FieldError(f"{pointer}/path", detail)
         seen.add(axis.path)
         detail = _describe_bad_spacing(axis)
         if detail:
-            yield FieldError(f"{place}/{'log' if axis.log else 'range'}", detail)
+            yield FieldError(f"{pointer}/{'log' if axis.log else 'range'}", detail)
             continue
         n = count_values(axis)
         if axis.labels is not None and len(axis.labels) != n:
-            found = f"found {len(axis.labels)} labels for {n} values; need one label per value"
-            yield FieldError(f"{place}/labels", found)
-        yield from _find_axis_label_faults(axis, place)
+            message = f"found {len(axis.labels)} labels for {n} values; need one label per value"
+            yield FieldError(f"{pointer}/labels", message)
+        yield from _find_axis_label_faults(axis, pointer)
         if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
             yield FieldError(
-                f"{place}/zip",
+                f"{pointer}/zip",
                 f"axes of zip {axis.zip!r} step together, but have {lengths[axis.zip]} and {n} "
                 "values; need equal numbers",
             )
 
 
-def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]:
+def _find_axis_label_faults(axis: SweepAxis, pointer: str) -> Iterator[FieldError]:
     """Report label names that a database cannot look up in a document, which would merge groups."""
     for position, labels in enumerate(axis.labels or ()):
         for name in labels:
@@ -173,7 +173,7 @@ def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]
                 or set(name) & {*'"\\'}
             ):
                 yield FieldError(
-                    f"{place}/labels/{position}",
+                    f"{pointer}/labels/{position}",
                     f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable "
                     "characters without quotation marks and backslashes",
                 )
@@ -200,12 +200,12 @@ def _describe_unknown_path(document: Mapping[str, Any], path: str) -> str | None
         return None  # the check of each value reports unknown signals
     if parts[0] == "parameters" and len(parts) in (2, 3):
         return None
-    here: Any = document
+    value: Any = document
     for part in parts:
-        known = _list_children(here)
-        if part not in known:
-            return f"the job has no field {path!r}{suggest_name(part, known)}"
-        here = here[int(part)] if isinstance(here, list) else here[part]
+        children = _list_children(value)
+        if part not in children:
+            return f"the job has no field {path!r}{suggest_name(part, children)}"
+        value = value[int(part)] if isinstance(value, list) else value[part]
     return None
 
 

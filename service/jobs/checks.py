@@ -48,31 +48,31 @@ class JobChecker:
         """`unstored` are datasets that already have identifiers but are not stored yet."""
         self._session = session
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
-        self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
+        self._datasets: dict[str, Dataset | str] = {dataset.id: dataset for dataset in unstored}
 
     def find_faults(self, body: JobBody) -> list[FieldError]:
         """List every fault of a body in its normal form."""
-        found = [*find_setting_conflicts(body), *self._find_missing_datasets(body)]
-        known = self.resolve_model(body["model"])
-        if isinstance(known, list):
-            return found + known
-        model = known[0]
+        faults = [*find_setting_conflicts(body), *self._find_missing_datasets(body)]
+        resolved = self.resolve_model(body["model"])
+        if isinstance(resolved, list):
+            return faults + resolved
+        model = resolved[0]
         parameters = override_by_request(
-            found, self._list_parameters(body, model), body["parameters"]
+            faults, self._list_parameters(body, model), body["parameters"]
         )
-        own = parameters[: len(model.parameters)]
-        tied = apply_ties(model, collect_faults(resolve_ties, found, model, parameters) or {})
-        collect_faults(check_delays, found, tied, own)
-        found += _find_freedom_faults(parameters, body["algorithm"]["population"])
-        found += self._find_term_count_faults(body, model)
-        found += _find_unused_parameters(tied, own, body["weights"])
-        found += self._find_repeated_recordings(body)
-        found += self._find_channel_faults(body, model)
-        found += self._find_length_faults(body, tied, own)
-        found += self._find_sample_faults(body, model, parameters)
-        found += self._find_unit_faults(body, model)
-        found += warm_starts.find_warm_start_faults(self._session, body["warm_start"], model)
-        return found + list(find_signal_faults(body, model))
+        model_parameters = parameters[: len(model.parameters)]
+        tied = apply_ties(model, collect_faults(resolve_ties, faults, model, parameters) or {})
+        collect_faults(check_delays, faults, tied, model_parameters)
+        faults += _find_freedom_faults(parameters, body["algorithm"]["population"])
+        faults += self._find_term_count_faults(body, model)
+        faults += _find_unused_parameters(tied, model_parameters, body["weights"])
+        faults += self._find_repeated_recordings(body)
+        faults += self._find_channel_faults(body, model)
+        faults += self._find_length_faults(body, tied, model_parameters)
+        faults += self._find_sample_faults(body, model, parameters)
+        faults += self._find_unit_faults(body, model)
+        faults += warm_starts.find_warm_start_faults(self._session, body["warm_start"], model)
+        return faults + list(find_signal_faults(body, model))
 
     def resolve_body(self, body: JobBody) -> JobBody:
         """Resolve a body: identifiers for datasets, the document for a model of its own."""
@@ -83,9 +83,12 @@ class JobChecker:
         if body["trend"] is not None:
             reference = self.resolve_warm_start(body["trend"]["reference"])
             body["trend"] = {**body["trend"], "reference": reference}
-        kept = body["validation"]
-        if kept is not None and kept["datasets"] is not None:
-            body["validation"] = {**kept, "datasets": self.resolve_dataset_ids(kept["datasets"])}
+        validation = body["validation"]
+        if validation is not None and validation["datasets"] is not None:
+            body["validation"] = {
+                **validation,
+                "datasets": self.resolve_dataset_ids(validation["datasets"]),
+            }
         return body
 
     def resolve_warm_start(self, reference: str | None) -> str | None:
@@ -106,8 +109,8 @@ class JobChecker:
 
     def resolve_dataset_ids(self, references: list[str]) -> list[str]:
         """List the identifiers of datasets that exist."""
-        found = (self.get_dataset(reference) for reference in references)
-        return [one.id for one in found if isinstance(one, Dataset)]
+        datasets = (self.get_dataset(reference) for reference in references)
+        return [dataset.id for dataset in datasets if isinstance(dataset, Dataset)]
 
     def get_dataset(self, reference: str) -> Dataset | str:
         """Return the dataset with this identifier or name, or why there is none."""
@@ -120,9 +123,11 @@ class JobChecker:
 
         If datasets are missing, the named experiments are counted instead.
         """
-        found = [self.get_dataset(reference) for reference in body["datasets"]]
-        pieces = sum(count_experiments(one) for one in found if isinstance(one, Dataset))
-        if not all(isinstance(one, Dataset) for one in found):
+        datasets = [self.get_dataset(reference) for reference in body["datasets"]]
+        pieces = sum(
+            count_experiments(dataset) for dataset in datasets if isinstance(dataset, Dataset)
+        )
+        if not all(isinstance(dataset, Dataset) for dataset in datasets):
             pieces = max(
                 pieces, min(count_named_experiments(body["parameters"]), MOST_NAMED_EXPERIMENTS)
             )
@@ -130,17 +135,17 @@ class JobChecker:
 
     def _count_samples(self, body: JobBody) -> int:
         """Count the samples of all estimation datasets. A missing dataset counts as very long."""
-        found = [self.get_dataset(reference) for reference in body["datasets"]]
-        if not all(isinstance(one, Dataset) for one in found):
+        datasets = [self.get_dataset(reference) for reference in body["datasets"]]
+        if not all(isinstance(dataset, Dataset) for dataset in datasets):
             return MOST_GENES
-        return sum(one.n_samples for one in found if isinstance(one, Dataset))
+        return sum(dataset.n_samples for dataset in datasets if isinstance(dataset, Dataset))
 
     def _count_scored_samples(self, body: JobBody, model: Model) -> int:
         """Count the fitted samples of all outputs, if no dataset is missing."""
-        kept: float = (body["validation"] or {}).get("fraction") or 0.0
+        fraction: float = (body["validation"] or {}).get("fraction") or 0.0
         samples = self._count_samples(body)
         skipped = body["skip"] * len(body["datasets"])
-        return int(samples - round(kept * samples) - skipped) * len(model.outputs)
+        return int(samples - round(fraction * samples) - skipped) * len(model.outputs)
 
     def _find_missing_datasets(self, body: JobBody) -> Iterator[FieldError]:
         for pointer, reference in _list_dataset_references(body):
@@ -174,10 +179,10 @@ class JobChecker:
     def _find_length_faults(
         self, body: JobBody, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
-        kept: float | None = (body["validation"] or {}).get("fraction")
+        fraction: float | None = (body["validation"] or {}).get("fraction")
         for pointer, dataset in self._list_datasets(body):
             for piece in list_record_lengths(dataset):
-                estimated = piece if kept is None else piece.take_estimation_part(kept)
+                estimated = piece if fraction is None else piece.take_estimation_part(fraction)
                 if estimated is not None:
                     yield from find_length_faults(
                         pointer, model, parameters, estimated, body["skip"]
@@ -185,17 +190,17 @@ class JobChecker:
                 else:
                     yield FieldError(
                         "/validation/fraction",
-                        f"found {kept!r}: with {piece.samples} samples, one part of the record "
+                        f"found {fraction!r}: with {piece.samples} samples, one part of the record "
                         "would be empty",
                     )
 
     def _find_term_count_faults(self, body: JobBody, model: Model) -> list[FieldError]:
-        found: list[FieldError] = []
+        faults: list[FieldError] = []
         if model.rule is not None:
             collect_faults(
-                check_candidate_count, found, len(model.terms), self._count_samples(body)
+                check_candidate_count, faults, len(model.terms), self._count_samples(body)
             )
-        return found
+        return faults
 
     def _find_sample_faults(
         self, body: JobBody, model: Model, parameters: tuple[Parameter, ...]
@@ -206,11 +211,11 @@ class JobChecker:
 
     def _list_datasets(self, body: JobBody) -> list[tuple[str, Dataset]]:
         """List the existing datasets of a body with their pointers."""
-        found = (
+        datasets = (
             (pointer, self.get_dataset(reference))
             for pointer, reference in _list_dataset_references(body)
         )
-        return [(pointer, one) for pointer, one in found if isinstance(one, Dataset)]
+        return [(pointer, dataset) for pointer, dataset in datasets if isinstance(dataset, Dataset)]
 
 
 def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
@@ -219,7 +224,7 @@ def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
         JobIn.model_validate(body)
     except ValidationError as error:
         faults = explain_errors(error.errors(), body, JobIn)
-        return [FieldError(pointer, str(one)) for one in faults]
+        return [FieldError(pointer, str(fault)) for fault in faults]
     return []
 
 
@@ -228,8 +233,8 @@ def _find_unused_parameters(
 ) -> list[FieldError]:
     """Report parameters that affect no output, and similar unused settings."""
     return [
-        FieldError(one.pointer, one.detail)
-        for one in find_unused_settings(model, parameters, weights)
+        FieldError(fault.pointer, fault.detail)
+        for fault in find_unused_settings(model, parameters, weights)
     ]
 
 
@@ -241,7 +246,7 @@ def _list_dataset_references(body: JobBody) -> Iterator[tuple[str, str]]:
 
 
 def _check_sample_count(parameters: tuple[Parameter, ...], samples: int) -> Iterator[FieldError]:
-    free = sum(one.is_free for one in parameters)
+    free = sum(parameter.is_free for parameter in parameters)
     if 0 < samples < free:
         yield FieldError(
             "/datasets",
@@ -253,7 +258,7 @@ def _check_sample_count(parameters: tuple[Parameter, ...], samples: int) -> Iter
 def _find_freedom_faults(
     parameters: tuple[Parameter, ...], population: int
 ) -> Iterator[FieldError]:
-    free = [one for one in parameters if one.is_free]
+    free = [parameter for parameter in parameters if parameter.is_free]
     if not free:
         yield FieldError("/parameters", "every parameter is fixed. Leave at least one free")
     if population * len(free) > MOST_GENES:

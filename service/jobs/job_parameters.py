@@ -41,4 +41,4 @@ def list_job_parameters(
 def count_named_experiments(parameters: Iterable[str]) -> int:
     """Count the experiments that the named initial states imply (a lower bound)."""
     named = (_NUMBERED.search(name) for name in parameters)
-    return max((int(one[1]) for one in named if one), default=1)
+    return max((int(match[1]) for match in named if match), default=1)

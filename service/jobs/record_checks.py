@@ -43,20 +43,20 @@ class RecordLength:
 
 def list_signals(model: Model) -> tuple[list[str], list[str]]:
     """List the names of a model's inputs and outputs, to which channels are mapped."""
-    return [one.name for one in model.inputs], [one.name for one in model.outputs]
+    return [signal.name for signal in model.inputs], [signal.name for signal in model.outputs]
 
 
 def find_channel_faults(
     channels: Mapping[str, str], model: Model, dataset: "Dataset"
 ) -> Iterator[FieldError]:
     """Report signals of the model for which a dataset has no channel."""
-    known = [channel["name"] for channel in dataset.channels]
+    recorded = [channel["name"] for channel in dataset.channels]
     for signal, channel in map_channels(model, channels).by_signal.items():
-        if channel not in known:
+        if channel not in recorded:
             yield FieldError(
                 f"/channels/{signal}" if signal in channels else "/channels",
                 f"dataset {dataset.id} ({dataset.name}) has no channel {channel!r} for signal "
-                f"{signal!r} of the model{suggest_name(channel, known)}",
+                f"{signal!r} of the model{suggest_name(channel, recorded)}",
             )
 
 
@@ -80,10 +80,10 @@ def find_unit_faults(
     units = SignalUnits(model)
     by_signal = map_channels(model, channels).by_signal
     for pointer, dataset in datasets:
-        found = {channel["name"]: channel["unit"] for channel in dataset.channels}
+        recorded_units = {channel["name"]: channel["unit"] for channel in dataset.channels}
         for signal, channel in by_signal.items():
             fault = units.describe_mismatch(
-                signal, channel, found.get(channel), f"dataset {dataset.name!r}"
+                signal, channel, recorded_units.get(channel), f"dataset {dataset.name!r}"
             )
             if fault:
                 yield FieldError(pointer, fault)
@@ -92,7 +92,9 @@ def find_unit_faults(
 def list_record_lengths(dataset: "Dataset") -> list[RecordLength]:
     """List the lengths of a dataset's records: its segments, or the whole dataset."""
     period = dataset.sample_time
-    spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
+    spans = [
+        segment["stop"] - segment["start"] for segment in dataset.details.get("segments") or []
+    ]
     if not spans:
         return [RecordLength(dataset.duration, dataset.n_samples, period)]
     if period is None:  # samples per segment are not stored: the total suffices
@@ -125,7 +127,8 @@ def _check_longest_delay(
         return RecordTooShort(duration, 0.0, "a simulation")
     spans = {p.name: get_interval(p) for p in parameters}
     lagged = sorted(
-        list_past_values(model), key=lambda one: -compute_longest_delay(model, one, spans, step)
+        list_past_values(model),
+        key=lambda past_value: -compute_longest_delay(model, past_value, spans, step),
     )
     try:
         for past in lagged[:1]:
@@ -140,7 +143,10 @@ JobBody = dict[str, Any]
 
 def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
     """Report channels, holds and weights of signals that the model does not have."""
-    inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
+    inputs, outputs = (
+        [signal.name for signal in model.inputs],
+        [signal.name for signal in model.outputs],
+    )
     for name in body["channels"]:
         if name not in (*inputs, *outputs):
             hint = suggest_name(name, (*inputs, *outputs))
@@ -161,22 +167,22 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
 
 def find_setting_conflicts(body: JobBody) -> list[FieldError]:
     """Report settings of search and loss that conflict."""
-    found: list[FieldError] = []
-    collect_faults(to_algorithm, found, body["algorithm"])
-    collect_faults(to_loss, found, body["loss"])
+    faults: list[FieldError] = []
+    collect_faults(to_algorithm, faults, body["algorithm"])
+    collect_faults(to_loss, faults, body["loss"])
     if body["prediction"] == "one-step" and body["loss"]["noise_model"] == "ar1":
         detail = "ar1 needs prediction: simulation. One-step predictions already contain the noise"
-        found.append(FieldError("/loss/noise_model", detail))
-    return found
+        faults.append(FieldError("/loss/noise_model", detail))
+    return faults
 
 
 def find_setting_faults(
     body: JobBody, model: Model, parameters: tuple[Parameter, ...]
 ) -> list[FieldError]:
     """Report faults that the model reveals: unknown names and invalid values."""
-    found = find_setting_conflicts(body)
-    override_by_request(found, parameters, body["parameters"])
-    return [*found, *find_signal_faults(body, model)]
+    faults = find_setting_conflicts(body)
+    override_by_request(faults, parameters, body["parameters"])
+    return [*faults, *find_signal_faults(body, model)]
 
 
 def override_by_request(

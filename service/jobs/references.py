@@ -47,8 +47,10 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
 
 def list_references(session: Session, cursor: str | None, limit: int) -> Page[ReferenceOut]:
     """List the references in use, by name."""
-    found = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
-    return Page(items=[_to_reference_out(one, []) for one in found.items], next=found.next)
+    page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
+    return Page(
+        items=[_to_reference_out(reference, []) for reference in page.items], next=page.next
+    )
 
 
 def resolve_reference(session: Session, reference: str, pointer: str = "/warm_start") -> Run:
@@ -76,17 +78,17 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
 def _check_name(name: str) -> None:
     """Refuse names that look like a run's id or like parts of a path."""
     if not 1 <= len(name) <= MOST_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        wanted = f"1 to {MOST_NAME_CHARACTERS} printable characters without outer blanks"
+        requirement = f"1 to {MOST_NAME_CHARACTERS} printable characters without outer blanks"
     elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
-        wanted = (
+        requirement = (
             f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"
         )
     elif "/" in name or not name.strip("."):
-        wanted = "one without '/', and not of dots only"
+        requirement = "one without '/', and not of dots only"
     else:
         return
     raise InvalidRequest.from_fault(
-        "{name}", f"the name in the path is {name!r:.120}; need {wanted}"
+        "{name}", f"the name in the path is {name!r:.120}; need {requirement}"
     )
 
 
@@ -122,18 +124,18 @@ def _suggest_name(session: Session, name: str) -> str:
     return suggest_name(name, ReferenceRepository(session).list_names())
 
 
-def _to_reference_out(one: CurrentReference, before: list[AcceptedReference]) -> ReferenceOut:
+def _to_reference_out(current: CurrentReference, before: list[AcceptedReference]) -> ReferenceOut:
     latest, *earlier = (
         {"run": row.run_id, "by": row.accepted_by, "note": row.note, "at": row.accepted_at}
-        for row in (one.accepted, *before)
+        for row in (current.accepted, *before)
     )
     return ReferenceOut.model_validate(
         {
             **latest,
-            "name": one.accepted.name,
-            "job": one.job_id,
-            "labels": one.labels,
-            "estimates": one.estimates or {},
+            "name": current.accepted.name,
+            "job": current.job_id,
+            "labels": current.labels,
+            "estimates": current.estimates or {},
             "history": earlier,
         }
     )

@@ -157,12 +157,12 @@ class SweepAxis(Body):
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
-        given = [n for n in ("values", "range", "log") if getattr(self, n) is not None]
-        if len(given) != 1:
+        kinds = [n for n in ("values", "range", "log") if getattr(self, n) is not None]
+        if len(kinds) != 1:
             raise PydanticCustomError(
                 "one_of",
                 "give exactly one of 'values', 'range' and 'log'; found {found}",
-                {"found": " and ".join(given) or "none"},
+                {"found": " and ".join(kinds) or "none"},
             )
         return self
 

@@ -61,9 +61,9 @@ def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -
         }
         if not named:
             continue
-        found = [_resolve_values(checker, spec, step.cell) for step in steps]
+        resolved = [_resolve_values(checker, spec, step.cell) for step in steps]
         for number, path in named.items():
-            axes[number]["values"] = [values[path] for values in found]
+            axes[number]["values"] = [values[path] for values in resolved]
     return axes
 
 

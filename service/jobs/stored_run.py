@@ -123,7 +123,7 @@ class StoredRun:
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""
         names = {parameter.name for parameter in parameters}
-        return {name: one for name, one in self.body["parameters"].items() if name in names}
+        return {name: change for name, change in self.body["parameters"].items() if name in names}
 
 
 def load_run(session: Session, run_id: str) -> StoredRun:

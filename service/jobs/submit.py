@@ -115,8 +115,8 @@ def store_job(
         insert_runs(session, submission.job, checked.cells)
         lineage = LineageRepository(session)
         lineage.add_links(submission.job.id, spec["datasets"], "estimation")
-        kept = (spec["validation"] or {}).get("datasets") or []
-        lineage.add_links(submission.job.id, kept, "validation")
+        validation = (spec["validation"] or {}).get("datasets") or []
+        lineage.add_links(submission.job.id, validation, "validation")
     return submission
 
 
@@ -187,9 +187,9 @@ def list_jobs(
     session: Session, cursor: str | None, limit: int, states: list[JobState]
 ) -> Page[JobOut]:
     """List jobs, latest first."""
-    found = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
-    items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in found.items]
-    return Page(items=items, next=found.next)
+    page = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
+    items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in page.items]
+    return Page(items=items, next=page.next)
 
 
 def _choose_name(checker: JobChecker, spec: Mapping[str, Any]) -> str:

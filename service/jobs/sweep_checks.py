@@ -39,39 +39,41 @@ def find_trend_faults(session: Session, job: JobIn, model: Model | None) -> Iter
     yield from warm_starts.find_warm_start_faults(
         session, job.trend.reference, model, "/trend/reference"
     )
-    known = [one.name for one in model.parameters]
+    names = [parameter.name for parameter in model.parameters]
     for index, name in enumerate(job.trend.parameters):
-        if name not in known:
+        if name not in names:
             yield FieldError(
                 f"/trend/parameters/{index}",
-                f"the model has no parameter {name!r}{suggest_name(name, known)}",
+                f"the model has no parameter {name!r}{suggest_name(name, names)}",
             )
 
 
 def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
     axes = [(n, axis.labels) for n, axis in enumerate(job.sweep.axes) if axis.labels]
-    named = [(n, labels) for n, labels in axes if any(x in one for one in labels)]
+    named = [(n, labels) for n, labels in axes if any(x in value_labels for value_labels in labels)]
     if not named:
-        known = sorted({name for _, labels in axes for one in labels for name in one})
-        there = f"The labels are {', '.join(known)}" if known else "No axis has labels"
+        names = sorted(
+            {name for _, labels in axes for value_labels in labels for name in value_labels}
+        )
+        available = f"The labels are {', '.join(names)}" if names else "No axis has labels"
         yield FieldError(
             "/trend/x",
-            f"no run has a label {x!r}{suggest_name(x, known)}. {there}. Give an axis "
+            f"no run has a label {x!r}{suggest_name(x, names)}. {available}. Give an axis "
             f'"labels": [{{"{x}": …}}, …], one for each value',
         )
     for n, labels in named:
-        for position, one in enumerate(labels):
-            value = one.get(x)
+        for position, value_labels in enumerate(labels):
+            value = value_labels.get(x)
             if not isinstance(value, float | int):
-                found = f"found {one[x]!r}" if x in one else "it is missing"
+                problem = f"found {value_labels[x]!r}" if x in value_labels else "it is missing"
                 needed = "a number"
             elif not is_valid_x(value):
-                found = f"found {value!r}"
+                problem = f"found {value!r}"
                 needed = f"0, or a magnitude from {LEAST_X:g} to {MOST_X:g}"
             else:
                 continue
             yield FieldError(
-                f"/sweep/axes/{n}/labels/{position}", f"{x}: {found}; a trend needs {needed}"
+                f"/sweep/axes/{n}/labels/{position}", f"{x}: {problem}; a trend needs {needed}"
             )
 
 
@@ -94,13 +96,13 @@ def find_job_faults(
     Axis values are checked only if the axes are valid and give at most `most_runs` runs.
     """
     document = body.to_normal_form()
-    found = list(find_axis_faults(body))
-    known = checker.find_faults(build_run_body(document, {}))
-    if not found:
+    faults = list(find_axis_faults(body))
+    base_faults = checker.find_faults(build_run_body(document, {}))
+    if not faults:
         groups = group_axes(body.sweep.axes)
         n_runs = count_runs(body, groups)
         if n_runs > most_runs:
-            found.append(
+            faults.append(
                 FieldError(
                     "/sweep/axes",
                     f"the sweep has {n_runs} runs; a job may have at most {most_runs}",
@@ -108,13 +110,13 @@ def find_job_faults(
             )
         else:
             steps = build_axis_groups(body.sweep.axes, groups)
-            wrong = list(_find_value_faults(checker, document, steps, frozenset(known)))
-            found += wrong
+            wrong = list(_find_value_faults(checker, document, steps, frozenset(base_faults)))
+            faults += wrong
             if len(wrong) < MOST_FAULTY_VALUES:
-                found += _find_repeated_recordings(checker, body)
+                faults += _find_repeated_recordings(checker, body)
     model = checker.resolve_model(body.model)
-    found += find_trend_faults(session, body, None if isinstance(model, list) else model[0])
-    return list(dict.fromkeys([*known, *found]))
+    faults += find_trend_faults(session, body, None if isinstance(model, list) else model[0])
+    return list(dict.fromkeys([*base_faults, *faults]))
 
 
 def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
@@ -125,20 +127,20 @@ def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[Fiel
         if axis.path != "/datasets" or not axis.values or not axis.labels:
             continue
         first: dict[str, tuple[int, tuple[Any, str]]] = {}
-        for position, (given, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
+        for position, (value, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
             x = labels.get(body.trend.x)
-            names = given if isinstance(given, list) else [given]
+            names = value if isinstance(value, list) else [value]
             for name in (
-                one for one in names if isinstance(one, str)
+                name for name in names if isinstance(name, str)
             ):  # others are reported earlier
                 dataset = checker.get_dataset(name)
                 key = dataset if isinstance(dataset, str) else dataset.sha256
-                at, before = first.setdefault(key, (position, (x, name)))
-                if at != position:
+                earlier_position, earlier = first.setdefault(key, (position, (x, name)))
+                if earlier_position != position:
                     yield FieldError(
                         f"/sweep/axes/{number}/values/{position}",
-                        f"{name!r} at {body.trend.x} = {x} is the same recording as {before[1]!r} "
-                        f"at {body.trend.x} = {before[0]}. Give a different file for one of them",
+                        f"{name!r} at {body.trend.x} = {x} is the same recording as {earlier[1]!r} "
+                        f"at {body.trend.x} = {earlier[0]}. Give a different file for one of them",
                     )
 
 
@@ -146,27 +148,27 @@ def _find_value_faults(
     checker: JobChecker,
     document: dict[str, Any],
     groups: Sequence[Sequence[AxisPosition]],
-    known: Set[FieldError],
+    base_faults: Set[FieldError],
 ) -> Iterator[FieldError]:
     """Report faults of axis values; for a range or a logarithmic axis only the first one.
 
     `known` are the faults of the job without its axes. They are not repeated for every value.
     """
-    told: set[str] = set()
+    reported: set[str] = set()
     n_wrong = 0
     for step in (step for group in groups for step in group):
-        if step.pointer in told or _is_valid_alone(step.cell):
+        if step.pointer in reported or _is_valid_alone(step.cell):
             continue
         if n_wrong == MOST_FAULTY_VALUES:
             yield FieldError(
                 "", f"{MOST_FAULTY_VALUES} faulty axis values are reported. The rest is not checked"
             )
             return
-        found = list(_find_position_faults(checker, document, step, known))
-        if found:
-            told.add(step.pointer)
+        faults = list(_find_position_faults(checker, document, step, base_faults))
+        if faults:
+            reported.add(step.pointer)
             n_wrong += 1
-        yield from found
+        yield from faults
 
 
 def _find_type_mismatches(step: AxisPosition, whole: dict[str, Any]) -> Iterator[FieldError]:
@@ -198,7 +200,7 @@ def _find_position_faults(
     checker: JobChecker,
     document: dict[str, Any],
     step: AxisPosition,
-    known: Set[FieldError],
+    base_faults: Set[FieldError],
 ) -> Iterator[FieldError]:
     body = build_run_body(document, step.cell.values)
     wrong = find_type_faults(step.pointer, body)
@@ -208,5 +210,5 @@ def _find_position_faults(
     whole = JobIn.model_validate(body).to_normal_form()
     yield from _find_type_mismatches(step, whole)
     for fault in checker.find_faults(whole):
-        if fault not in known:
+        if fault not in base_faults:
             yield FieldError(step.pointer, str(fault), fault.column)

@@ -45,13 +45,13 @@ class ChainLayout:
 
     def find_chain(self, number: int) -> int:
         """Return the chain number of a run. Chains are numbered by their first runs."""
-        block, place = divmod(number, self.stride * self.length)
-        return block * self.stride + place % self.stride
+        block, offset = divmod(number, self.stride * self.length)
+        return block * self.stride + offset % self.stride
 
     def list_runs(self, chain: int) -> range:
         """List the numbers of the runs of a chain, in order."""
-        block, place = divmod(chain, self.stride)
-        first = block * self.stride * self.length + place
+        block, offset = divmod(chain, self.stride)
+        first = block * self.stride * self.length + offset
         return range(first, first + self.stride * self.length, self.stride)
 
 

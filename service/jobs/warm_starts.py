@@ -44,40 +44,42 @@ def resolve_warm_start(session: Session, reference: str | None) -> str | None:
 
 
 def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
-    theirs = load_run(session, run.id).requested_model
-    if have_same_equations(theirs, model):
+    other = load_run(session, run.id).requested_model
+    if have_same_equations(other, model):
         return ""
     return (
-        f"run {run.id} has another model: the equations of {theirs.name!r} differ from those of "
+        f"run {run.id} has another model: the equations of {other.name!r} differ from those of "
         f"{model.name!r}. Give a run of {model.name!r}"
     )
 
 
 def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
     """Describe how the run's parameters differ from the model's in names and units."""
-    known: Mapping[str, Any] = {one["name"]: one for one in (run.result or {})["parameters"]}
-    names = [one.name for one in model.parameters]
+    estimates: Mapping[str, Any] = {
+        estimate["name"]: estimate for estimate in (run.result or {})["parameters"]
+    }
+    names = [parameter.name for parameter in model.parameters]
     if model.rule is not None:  # the data decide which candidates have coefficients
-        names = [name for name in names if name in known] or names[:1]
-    missing = [name for name in names if name not in known]
+        names = [name for name in names if name in estimates] or names[:1]
+    missing = [name for name in names if name not in estimates]
     if missing:
-        theirs = load_run(session, run.id).requested_model
+        other = load_run(session, run.id).requested_model
         return (
-            f"run {run.id} of {theirs.name!r} has another model: "
-            f"its parameters are {_join_names(known)}, "
+            f"run {run.id} of {other.name!r} has another model: "
+            f"its parameters are {_join_names(estimates)}, "
             f"those of {model.name!r} are {_join_names(names)}. "
             f"Give a run with {_join_names(missing)}"
         )
-    for one in model.parameters:
-        unit = known[one.name]["unit"] if one.name in known else one.unit
-        if unit != one.unit:
+    for parameter in model.parameters:
+        unit = estimates[parameter.name]["unit"] if parameter.name in estimates else parameter.unit
+        if unit != parameter.unit:
             return (
-                f"run {run.id} has another model: {one.name} is in {unit} there, but in {one.unit} "
-                f"in {model.name!r}"
+                f"run {run.id} has another model: {parameter.name} is in {unit} there, but in "
+                f"{parameter.unit} in {model.name!r}"
             )
     return ""
 
 
 def _join_names(names: Any) -> str:
-    found = list(names)
-    return ", ".join(found[:8]) + (" …" if len(found) > 8 else "")
+    listed = list(names)
+    return ", ".join(listed[:8]) + (" …" if len(listed) > 8 else "")

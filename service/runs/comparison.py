@@ -35,19 +35,20 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
     """
     candidates = _read_candidates(session, runs)
     _check_same_data(candidates)
-    ordered = sorted(candidates, key=lambda one: _rank_rms(one.result.get("rms")))
+    ordered = sorted(candidates, key=lambda stored: _rank_rms(stored.result.get("rms")))
     titles = _build_titles(ordered)
     parameters = list(_compare_parameters(ordered, titles))
     return ComparisonOut(
         unit=_find_common_unit(ordered),
-        runs=[_to_compared_run(one, titles[one.run.id]) for one in ordered],
+        runs=[_to_compared_run(stored, titles[stored.run.id]) for stored in ordered],
         parameters=parameters,
-        notes=[one.note for one in parameters if one.differs] + list(_list_notes(ordered)),
+        notes=[parameter.note for parameter in parameters if parameter.differs]
+        + list(_list_notes(ordered)),
     )
 
 
 def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
-    found, faults = [], []
+    candidates, faults = [], []
     for number, name in enumerate(runs):
         pointer = f"/runs/{number}"
         if name in runs[:number]:
@@ -63,18 +64,18 @@ def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
             detail = f"run {name!r} is {state}. Only runs with a result can be compared"
             faults.append(FieldError(pointer, detail))
             continue
-        found.append(stored)
+        candidates.append(stored)
     if faults:
         raise InvalidRequest(faults)
-    return found
+    return candidates
 
 
-def _collect_data_settings(one: StoredRun) -> dict[str, Any]:
+def _collect_data_settings(stored: StoredRun) -> dict[str, Any]:
     """Collect the settings that must be equal, or else the RMS of two runs do not compare."""
-    body = one.body
+    body = stored.body
     return {
         "datasets": body["datasets"],
-        "outputs": sorted(channel for _, channel in one.channels.outputs),
+        "outputs": sorted(channel for _, channel in stored.channels.outputs),
         "validation": {k: v for k, v in (body["validation"] or {}).items() if v is not None},
         "skip": body["skip"],
         "noise": body["noise"],
@@ -84,15 +85,17 @@ def _collect_data_settings(one: StoredRun) -> dict[str, Any]:
 def _check_same_data(candidates: Sequence[StoredRun]) -> None:
     first = _collect_data_settings(candidates[0])
     faults = []
-    for number, one in enumerate(candidates[1:], 1):
-        other = _collect_data_settings(one)
-        apart = [text for name, text in _DATA_DIFFERENCES.items() if other[name] != first[name]]
-        if apart:
+    for number, candidate in enumerate(candidates[1:], 1):
+        other = _collect_data_settings(candidate)
+        differences = [
+            text for name, text in _DATA_DIFFERENCES.items() if other[name] != first[name]
+        ]
+        if differences:
             faults.append(
                 FieldError(
                     f"/runs/{number}",
-                    f"run {one.run.id!r} has {' and '.join(apart)} than {candidates[0].run.id!r}. "
-                    "Only runs on the same data can be compared",
+                    f"run {candidate.run.id!r} has {' and '.join(differences)} than "
+                    f"{candidates[0].run.id!r}. Only runs on the same data can be compared",
                 )
             )
     if faults:
@@ -101,23 +104,23 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
 
 def _build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     """Build the title of each run: its model, with the run's number if models repeat."""
-    names = [one.model.name for one in ordered]
+    names = [stored.model.name for stored in ordered]
     return {
-        one.run.id: name if names.count(name) == 1 else f"{name}, run {one.run.number + 1}"
-        for one, name in zip(ordered, names, strict=True)
+        stored.run.id: name if names.count(name) == 1 else f"{name}, run {stored.run.number + 1}"
+        for stored, name in zip(ordered, names, strict=True)
     }
 
 
-def _to_compared_run(one: StoredRun, title: str) -> ComparedRun:
-    result = one.result
+def _to_compared_run(stored: StoredRun, title: str) -> ComparedRun:
+    result = stored.result
     criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
     return ComparedRun(
-        run=one.run.id,
-        job=one.job.id,
-        number=one.run.number,
-        model=one.model.name,
+        run=stored.run.id,
+        job=stored.job.id,
+        number=stored.run.number,
+        model=stored.model.name,
         title=title,
-        cell=one.run.cell,
+        cell=stored.run.cell,
         parameters=criteria["parameters"],
         samples=criteria["samples"],
         rms=result["rms"],
@@ -136,39 +139,41 @@ def _compare_parameters(
     ordered: Sequence[StoredRun], titles: Mapping[str, str]
 ) -> Iterator[ComparedParameter]:
     """Compare parameters that have the same name and unit in at least two runs."""
-    kept: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
-    for one in ordered:
-        for estimate in one.result["parameters"]:
-            kept.setdefault((estimate["name"], estimate["unit"]), []).append((one, estimate))
-    for (name, unit), found in kept.items():
-        if len(found) < 2:
+    entries: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
+    for stored in ordered:
+        for estimate in stored.result["parameters"]:
+            entries.setdefault((estimate["name"], estimate["unit"]), []).append((stored, estimate))
+    for (name, unit), values in entries.items():
+        if len(values) < 2:
             continue
-        pair = _find_furthest_pair([estimate for _, estimate in found])
+        pair = _find_furthest_pair([estimate for _, estimate in values])
         note = ""
         if pair is not None:
             note = _describe_difference(
                 name,
                 unit,
-                [(titles[found[i][0].run.id], found[i][1]) for i in pair],
-                same_model=len({one.model.name for one, _ in found}) == 1,
+                [(titles[values[i][0].run.id], values[i][1]) for i in pair],
+                same_model=len({stored.model.name for stored, _ in values}) == 1,
             )
-        known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
+        n_intervals = sum(_has_ends(estimate["interval95"]) for _, estimate in values)
         yield ComparedParameter(
             name=name,
             unit=unit,
-            differs=None if known < 2 else pair is not None,
+            differs=None if n_intervals < 2 else pair is not None,
             note=note,
-            values=[ComparedValue.model_validate({**e, "run": one.run.id}) for one, e in found],
+            values=[
+                ComparedValue.model_validate({**e, "run": stored.run.id}) for stored, e in values
+            ],
         )
 
 
 def _find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
     """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap."""
-    known = [i for i, one in enumerate(estimates) if _has_ends(one["interval95"])]
+    with_interval = [i for i, estimate in enumerate(estimates) if _has_ends(estimate["interval95"])]
     gaps = {
         (i, j): max(estimates[i]["interval95"][0], estimates[j]["interval95"][0])
         - min(estimates[i]["interval95"][1], estimates[j]["interval95"][1])
-        for i, j in combinations(known, 2)
+        for i, j in combinations(with_interval, 2)
     }
     widest = max(gaps, key=lambda pair: gaps[pair], default=None)
     return widest if widest is not None and gaps[widest] > 0 else None
@@ -181,18 +186,18 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _describe_difference(
     name: str, unit: str, pair: Sequence[tuple[str, ResultDocument]], *, same_model: bool
 ) -> str:
-    told = ", ".join(
+    values = ", ".join(
         f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
         for title, estimate in pair
     )
-    return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
+    return f"{name} depends on the {'run' if same_model else 'model'}: {values}"
 
 
 def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
     """Find the common unit of the RMS. Weighted outputs have none."""
     units = set()
-    for one in ordered:
-        agreement = one.result["agreement"]["estimation"]
+    for stored in ordered:
+        agreement = stored.result["agreement"]["estimation"]
         outputs = {entry["output"] for entry in agreement}
         units.add(agreement[0]["unit"] if len(outputs) == 1 else "1")
     return units.pop() if len(units) == 1 else "1"
@@ -200,15 +205,18 @@ def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
 
 def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
     """Report why numbers of the table do not compare."""
-    if len({one.body["prediction"] for one in ordered}) > 1:
+    if len({stored.body["prediction"] for stored in ordered}) > 1:
         yield (
             "some runs predict one step ahead and others simulate. "
             "Their RMS, fits and criteria do not compare"
         )
-    losses = ({**one.body["loss"], "noise_model": read_noise_model(one.result)} for one in ordered)
+    losses = (
+        {**stored.body["loss"], "noise_model": read_noise_model(stored.result)}
+        for stored in ordered
+    )
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses. Each loss favours its own measure"
-    if len({one.result["criteria"]["samples"] for one in ordered}) > 1:
+    if len({stored.result["criteria"]["samples"] for stored in ordered}) > 1:
         yield (
             "the runs scored different numbers of samples, so AIC and BIC do not compare. "
             "Recursions do not score their initial samples. Give all runs the same skip"

@@ -73,7 +73,7 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
         values,
         _compute_covariance(stored.result, values),
         _find_sample_time(stored, rows),
-        {one.name: _find_hold(one.name, stored, rows) for one in stored.model.inputs},
+        {signal.name: _find_hold(signal.name, stored, rows) for signal in stored.model.inputs},
         version("lagid"),
         _describe_provenance(stored, rows),
     )
@@ -81,29 +81,35 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
 
 def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
     """Read the estimation datasets that have not been deleted since."""
-    found = []
+    datasets = []
     for name in body["datasets"]:
         try:
-            found.append(DatasetRepository(session).get(name))
+            datasets.append(DatasetRepository(session).get(name))
         except StorageError:
             continue
-    return found
+    return datasets
 
 
 def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
-    for one in stored.estimates:
-        yield IdentifiedValue(one["name"], one["value"], one["unit"], one["stderr"], one["status"])
+    for estimate in stored.estimates:
+        yield IdentifiedValue(
+            estimate["name"],
+            estimate["value"],
+            estimate["unit"],
+            estimate["stderr"],
+            estimate["status"],
+        )
 
 
 def _compute_covariance(result: JobBody, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
     """Compute the covariance from correlations and standard errors; ``nan`` if one is missing."""
-    found = result.get("correlation")
-    if found is None:
+    correlation = result.get("correlation")
+    if correlation is None:
         return None
-    errors = {one.name: np.nan if one.stderr is None else one.stderr for one in values}
-    deviations = np.array([errors[name] for name in found["names"]], dtype=np.float64)
-    matrix = np.array(found["matrix"], dtype=np.float64)
-    return Covariance(tuple(found["names"]), matrix * np.outer(deviations, deviations))
+    errors = {value.name: np.nan if value.stderr is None else value.stderr for value in values}
+    deviations = np.array([errors[name] for name in correlation["names"]], dtype=np.float64)
+    matrix = np.array(correlation["matrix"], dtype=np.float64)
+    return Covariance(tuple(correlation["names"]), matrix * np.outer(deviations, deviations))
 
 
 def _find_channels(
@@ -112,15 +118,15 @@ def _find_channels(
     """Iterate over the datasets' descriptions of the channel of a signal."""
     recorded = stored.channels.by_signal[name]
     for row in rows:
-        yield from (one for one in row.channels if one["name"] == recorded)
+        yield from (channel for channel in row.channels if channel["name"] == recorded)
 
 
 def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
     """Find the common sampling period of all measured outputs; None if there is none."""
     periods = [
-        one["sample_time"]
+        channel["sample_time"]
         for output in stored.model.outputs
-        for one in _find_channels(output.name, stored, rows)
+        for channel in _find_channels(output.name, stored, rows)
     ]
     if not periods or None in periods or max(periods) - min(periods) > 1e-6 * min(periods):
         return None
@@ -129,13 +135,13 @@ def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
 
 def _find_hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
     channel = next(_find_channels(name, stored, rows), None)
-    found: Hold = stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
-    return found
+    hold: Hold = stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
+    return hold
 
 
 def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
     run, job = stored.run, stored.job
-    known = {row.id: {"id": row.id, "name": row.name, "sha256": row.sha256} for row in rows}
+    descriptions = {row.id: {"id": row.id, "name": row.name, "sha256": row.sha256} for row in rows}
     return {
         "run": run.id,
         "job": job.id,
@@ -145,5 +151,5 @@ def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, An
         "seed": run.seed,
         "rms": run.best_rms,
         "fit_percent": stored.result.get("fit_percent"),
-        "datasets": [known.get(name, {"id": name}) for name in stored.body["datasets"]],
+        "datasets": [descriptions.get(name, {"id": name}) for name in stored.body["datasets"]],
     }

@@ -70,17 +70,17 @@ def validate_run(
     InvalidRequest
         If the recording does not have what the model needs, or the simulation diverges.
     """
-    found = simulate_free_run(database, store, run_id, body)
+    free_run = simulate_free_run(database, store, run_id, body)
     return FreeRunOut.from_source(
-        found.metrics,
-        id=found.run,
-        dataset=found.dataset,
-        starts=found.starts,
+        free_run.metrics,
+        id=free_run.run,
+        dataset=free_run.dataset,
+        starts=free_run.starts,
         agreement=[
-            AgreementOut.from_source(one, experiment=one.experiment + 1)
-            for one in found.metrics.channels
+            AgreementOut.from_source(channel, experiment=channel.experiment + 1)
+            for channel in free_run.metrics.channels
         ],
-        experiments=list(_to_experiments_out(found, max_points)),
+        experiments=list(_to_experiments_out(free_run, max_points)),
     )
 
 
@@ -115,17 +115,17 @@ def _find_channel_faults(
     row: Dataset, named: Mapping[str, str], channels: SignalChannels
 ) -> Iterator[FieldError]:
     signals = list(channels.by_signal)
-    recorded = [str(one["name"]) for one in row.channels]
+    recorded = [str(channel["name"]) for channel in row.channels]
     for name in named:
         if name not in signals:
             detail = f"the model has no signal {name!r}{suggest_name(name, signals)}"
             yield FieldError(f"/channels/{name}", detail)
-    for name, wanted in channels.by_signal.items():
-        if wanted not in recorded:
+    for name, recorded_name in channels.by_signal.items():
+        if recorded_name not in recorded:
             yield FieldError(
                 f"/channels/{name}",
-                f"{row.name!r} has no channel {wanted!r}{suggest_name(wanted, recorded)}. It has "
-                f"{', '.join(recorded)}",
+                f"{row.name!r} has no channel {recorded_name!r}"
+                f"{suggest_name(recorded_name, recorded)}. It has {', '.join(recorded)}",
             )
     if row.n_samples > MOST_SAMPLES:
         yield FieldError(
@@ -154,7 +154,7 @@ def _find_unit_faults(
 
 
 def _get_unit(row: Dataset, channel: str) -> str | None:
-    return next((str(one["unit"]) for one in row.channels if one["name"] == channel), None)
+    return next((str(entry["unit"]) for entry in row.channels if entry["name"] == channel), None)
 
 
 def _read_records(store: ObjectStore, row: Dataset, channels: SignalChannels) -> tuple[Record, ...]:
@@ -177,11 +177,13 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
     from sysid.simulation.problem import Problem
 
     model, request = stored.model, stored.body
-    own = {one.name for one in model.parameters}
-    values = {one["name"]: one for one in stored.estimates if one["name"] in own}
-    starts = {one.name for one in build_initial_parameters(model, len(records))}
+    own_names = {parameter.name for parameter in model.parameters}
+    values = {
+        estimate["name"]: estimate for estimate in stored.estimates if estimate["name"] in own_names
+    }
+    starts = {parameter.name for parameter in build_initial_parameters(model, len(records))}
     changes = {name: f for name, f in request["parameters"].items() if name in starts}
-    fixed = {name: _fix_estimate(one) for name, one in values.items()}
+    fixed = {name: _fix_estimate(estimate) for name, estimate in values.items()}
     try:
         return Problem.build(
             model, records, parameters={**changes, **fixed}, weights=request["weights"], skip=skip
@@ -193,12 +195,12 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
 def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
     """Fix an estimate. That of a tied parameter may lie outside its bounds."""
     value = float(estimate["value"])
-    known = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
+    bounds = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
     return {
         "fixed": value,
         "scale": "linear",
-        "lower": min([value, *known]),
-        "upper": max([value, *known]),
+        "lower": min([value, *bounds]),
+        "upper": max([value, *bounds]),
     }
 
 
@@ -212,19 +214,25 @@ def _search_starts(problem: "Problem") -> FloatArray:
     changes = problem.settings.parameters
     if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
         return _refine_starts(problem, most)
-    return np.concatenate([_refine_starts(one, most) for one in _split_by_record(problem)])
+    return np.concatenate([_refine_starts(part, most) for part in _split_by_record(problem)])
 
 
 def _split_by_record(problem: "Problem") -> "Iterator[Problem]":
     """Split a problem by record. Initial states get the names of the first record."""
     model, changes = problem.untied_model, problem.settings.parameters
-    fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
+    fixed = {
+        parameter.name: changes[parameter.name]
+        for parameter in model.parameters
+        if parameter.name in changes
+    }
     for number, record in enumerate(problem.records):
         names = {
-            name_initial_state(one.name, 0): name_initial_state(one.name, number)
-            for one in model.states
+            name_initial_state(state.name, 0): name_initial_state(state.name, number)
+            for state in model.states
         }
-        starts = {own: changes[name] for own, name in names.items() if name in changes}
+        starts = {
+            first_name: changes[name] for first_name, name in names.items() if name in changes
+        }
         yield problem.rebuild(
             records=[record], parameters=fixed | starts, weights=problem.output_weights
         )
@@ -244,8 +252,8 @@ def _refine_starts(problem: "Problem", simulations: int) -> FloatArray:
             f"{MOST_WORK:.3g}. Derive a shorter recording",
         )
     middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
-    found = refine_candidates(problem, [middle], simulations)[0]
-    return middle if found is None else found.theta
+    refined = refine_candidates(problem, [middle], simulations)[0]
+    return middle if refined is None else refined.theta
 
 
 def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
@@ -260,7 +268,7 @@ def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun
             f"the simulation of {run_id} diverges on {row.name!r}. The recording exceeds the "
             "range that the model was identified on",
         )
-    names = [one.name for one in problem.model.outputs]
+    names = [output.name for output in problem.model.outputs]
     return FreeRun(
         run=run_id,
         dataset=row.id,
@@ -275,22 +283,25 @@ def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun
 
 def _apply_recorded_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
     """Replace the unit of outputs that may have any unit by that of the recording."""
-    known = {one.name: one.unit for one in records[0].outputs}
+    units = {channel.name: channel.unit for channel in records[0].outputs}
     channels = tuple(
-        replace(one, unit=known[one.output]) if one.unit == "1" else one for one in metrics.channels
+        replace(channel, unit=units[channel.output]) if channel.unit == "1" else channel
+        for channel in metrics.channels
     )
-    alone = metrics.unit == "1" and len(known) == 1
+    alone = metrics.unit == "1" and len(units) == 1
     return replace(metrics, channels=channels, unit=channels[0].unit if alone else metrics.unit)
 
 
-def _to_experiments_out(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
-    for number, (record, outputs) in enumerate(zip(found.records, found.simulated, strict=True), 1):
+def _to_experiments_out(free_run: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
+    for number, (record, outputs) in enumerate(
+        zip(free_run.records, free_run.simulated, strict=True), 1
+    ):
         simulated = [
-            Channel(one.name, one.times, values, one.unit)
-            for one, values in zip(record.outputs, outputs, strict=True)
+            Channel(channel.name, channel.times, values, channel.unit)
+            for channel, values in zip(record.outputs, outputs, strict=True)
         ]
         yield ExperimentOut(
             name=f"record {number}",
-            measured=[to_series(one, max_points) for one in record.outputs],
-            simulated=[to_series(one, max_points) for one in simulated],
+            measured=[to_series(channel, max_points) for channel in record.outputs],
+            simulated=[to_series(channel, max_points) for channel in simulated],
         )

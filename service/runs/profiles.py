@@ -63,18 +63,18 @@ def compute_profiles(
     if not _profile_lock.acquire(blocking=False):
         raise Conflict("another profile is being computed. Ask again when it is done")
     try:
-        found = list(_profile_parameters(problem, theta, names, body.points))
+        profiles = list(_profile_parameters(problem, theta, names, body.points))
     finally:
         _profile_lock.release()
-    return Profiles(id=run_id, threshold=CHI_SQUARED_95, profiles=found)
+    return Profiles(id=run_id, threshold=CHI_SQUARED_95, profiles=profiles)
 
 
 def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
     free = problem.free_names
-    for place, name in enumerate(body.parameters or ()):
+    for index, name in enumerate(body.parameters or ()):
         if name not in free:
             raise InvalidRequest.from_fault(
-                f"/parameters/{place}",
+                f"/parameters/{index}",
                 f"the run has no free parameter {name!r}{suggest_name(name, free)}",
             )
     return list(dict.fromkeys(body.parameters or free))
@@ -88,8 +88,8 @@ def _profile_parameters(
 
     end = monotonic() + LIMIT_SECONDS
     for name in names:
-        found = compute_profile(problem, theta, name, points, lambda: monotonic() > end)
-        if not found.is_complete:
+        profile = compute_profile(problem, theta, name, points, lambda: monotonic() > end)
+        if not profile.is_complete:
             raise InvalidRequest.from_fault(
                 "/parameters",
                 f"the profiles took more than {LIMIT_SECONDS:g} s and were stopped at {name!r}. "
@@ -98,14 +98,14 @@ def _profile_parameters(
             )
         others = [free for free in problem.free_names if free != name]
         yield ProfileOut.from_source(
-            found,
+            profile,
             name=name,
-            interval95=found.interval,
-            others=dict(zip(others, found.others.T.tolist(), strict=True)),
-            **{key: getattr(found, key).tolist() for key in ("values", "ratio", "rms")},
+            interval95=profile.interval,
+            others=dict(zip(others, profile.others.T.tolist(), strict=True)),
+            **{key: getattr(profile, key).tolist() for key in ("values", "ratio", "rms")},
         )
 
 
 def _read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
-    values = {one["name"]: one["value"] for one in stored.estimates}
+    values = {estimate["name"]: estimate["value"] for estimate in stored.estimates}
     return np.array([values[name] for name in problem.free_names])

@@ -58,16 +58,16 @@ def get_residuals(session: Session, store: ObjectStore, run_id: str) -> Residual
         If the run has no signals: it has not succeeded, or not yet.
     """
     stored = load_run(session, run_id)
-    tested = analyse_residuals(session, store, stored)
-    if tested is None:
+    analysis = analyse_residuals(session, store, stored)
+    if analysis is None:
         raise NotFound("residuals of run", run_id, f"; the run is {stored.run.state.value}")
     return ResidualsOut(
         id=run_id,
-        data=tested.verdict.data,
-        passed=tested.verdict.passed,
+        data=analysis.verdict.data,
+        passed=analysis.verdict.passed,
         level=TEST_LEVEL,
-        note=tested.input_note,
-        tests=[_to_correlation_out(one) for one in tested.correlations],
+        note=analysis.input_note,
+        tests=[_to_correlation_out(function) for function in analysis.correlations],
     )
 
 
@@ -78,19 +78,19 @@ def analyse_residuals(
     if stored.run.signals_sha256 is None:
         return None
     fits = read_fitted_signals(store, stored.run)
-    kept = [fit for fit in fits if fit.role == "validation"]
-    inputs, missing = _read_inputs(session, store, stored, bool(kept))
-    counts = {} if kept else _count_past_coefficients(session, stored)
+    validation = [fit for fit in fits if fit.role == "validation"]
+    inputs, missing = _read_inputs(session, store, stored, bool(validation))
+    counts = {} if validation else _count_past_coefficients(session, stored)
     times = stored.result.get("correlation_times") or {}
-    found = compute_correlations(
+    correlations = compute_correlations(
         [
-            one._replace(coefficients=counts.get(one.output, 0))
-            for one in _build_series(stored.body, kept or list(fits), fits, inputs, times)
+            series._replace(coefficients=counts.get(series.output, 0))
+            for series in _build_series(stored.body, validation or list(fits), fits, inputs, times)
         ]
     )
-    names = [name for name, _ in groupby(fit.experiment for fit in kept or fits)]
-    data = "validation" if kept else "estimation"
-    return ResidualAnalysis(names, found, judge_tests(found, data), missing)  # type: ignore[arg-type]
+    names = [name for name, _ in groupby(fit.experiment for fit in validation or fits)]
+    data = "validation" if validation else "estimation"
+    return ResidualAnalysis(names, correlations, judge_tests(correlations, data), missing)  # type: ignore[arg-type]
 
 
 def _count_past_coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
@@ -100,12 +100,12 @@ def _count_past_coefficients(session: Session, stored: StoredRun) -> dict[str, i
     return count_past_output_coefficients(stored.model, stored.parameters(session))
 
 
-def _to_correlation_out(one: CorrelationFunction) -> CorrelationOut:
+def _to_correlation_out(function: CorrelationFunction) -> CorrelationOut:
     functions = {
-        name: getattr(one, name).tolist() for name in ("lags", "values", "band95", "band99")
+        name: getattr(function, name).tolist() for name in ("lags", "values", "band95", "band99")
     }
     return CorrelationOut.model_validate(
-        {**to_test_document(one.test), "period": one.period, **functions}
+        {**to_test_document(function.test), "period": function.period, **functions}
     )
 
 
@@ -174,8 +174,12 @@ def _read_inputs(
     session: Session, store: ObjectStore, stored: StoredRun, is_validation: bool
 ) -> tuple[list[tuple[Channel, ...]], str]:
     """Read the inputs of every tested record, with a note if they cannot be read."""
-    kept = stored.body["validation"] or {}
-    names = kept["datasets"] if is_validation and kept.get("datasets") else stored.body["datasets"]
+    validation = stored.body["validation"] or {}
+    names = (
+        validation["datasets"]
+        if is_validation and validation.get("datasets")
+        else stored.body["datasets"]
+    )
     try:
         return [record.inputs for record in stored.read_datasets(session, store, names)], ""
     except (SysidError, ServiceError, StorageError) as error:

@@ -13,95 +13,112 @@ from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 
 
-def to_residual_document(found: ResidualTests | None) -> dict[str, Any]:
+def to_residual_document(tests: ResidualTests | None) -> dict[str, Any]:
     """Convert verdicts and statistics, without correlation functions; empty without tests."""
-    if found is None:
+    if tests is None:
         return {}
     return {
-        "data": found.data,
+        "data": tests.data,
         "level": TEST_LEVEL,
-        "passed": found.passed,
-        "tests": [to_test_document(one) for one in found.tests],
+        "passed": tests.passed,
+        "tests": [to_test_document(test) for test in tests.tests],
     }
 
 
-def to_test_document(one: ResidualTest) -> dict[str, Any]:
+def to_test_document(test: ResidualTest) -> dict[str, Any]:
     """Convert one test. Numbers that were not computed are null, with a reason."""
     return {
-        **_read(one, "experiment", "output"),
-        "test": one.kind,
-        **_read(one, "input", "outcome", "reason", "samples"),
-        "lags_tested": one.lags,
-        **_read(one, "inside95", "inside99", "statistic", "degrees", "p"),
+        **_read(test, "experiment", "output"),
+        "test": test.kind,
+        **_read(test, "input", "outcome", "reason", "samples"),
+        "lags_tested": test.lags,
+        **_read(test, "inside95", "inside99", "statistic", "degrees", "p"),
     }
 
 
-def to_onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
+def to_onset_document(onsets: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
     """Convert onset delays in seconds. One that cannot be estimated is null, with a reason."""
     return [
         {
-            **_read(one, "experiment", "input", "output", "delay"),
+            **_read(onset, "experiment", "input", "output", "delay"),
             "unit": "s",
-            **_read(one, "spread", "events", "threshold", "reason"),
+            **_read(onset, "spread", "events", "threshold", "reason"),
         }
-        for one in found
+        for onset in onsets
     ]
 
 
-def to_result_document(found: Identification, seconds: float) -> dict[str, Any]:
+def to_result_document(identification: Identification, seconds: float) -> dict[str, Any]:
     """Convert an identification to its result document; non-finite numbers become null."""
     return {
-        "valid": found.valid,
-        "parameters": [_to_estimate_document(one) for one in found.estimates],
-        "rms": to_finite(found.rms),
-        "rms_validation": to_finite(found.rms_validation),
+        "valid": identification.valid,
+        "parameters": [_to_estimate_document(estimate) for estimate in identification.estimates],
+        "rms": to_finite(identification.rms),
+        "rms_validation": to_finite(identification.rms_validation),
         "fit_percent": {
-            "estimation": to_finite(found.fit_percent),
-            "validation": to_finite(found.fit_percent_validation),
+            "estimation": to_finite(identification.fit_percent),
+            "validation": to_finite(identification.fit_percent_validation),
         },
         "agreement": {
-            "estimation": [_to_agreement_document(one) for one in found.agreement],
-            "validation": [_to_agreement_document(one) for one in found.agreement_validation],
+            "estimation": [_to_agreement_document(metrics) for metrics in identification.agreement],
+            "validation": [
+                _to_agreement_document(metrics) for metrics in identification.agreement_validation
+            ],
         },
-        "evaluations": found.evaluations,
-        "generations": found.generations,
+        "evaluations": identification.evaluations,
+        "generations": identification.generations,
         "seconds": seconds,
         "islands": [
             _read(island, "champion_rms", "refined_rms", "evaluations", "parameters")
-            for island in found.islands
+            for island in identification.islands
         ],
-        "identifiability": _to_identifiability_document(found.uncertainty),
-        "criteria": _to_criteria_document(found.criteria),
-        "correlation": _to_correlation_document(found.uncertainty),
-        "noise_sd": None if found.uncertainty is None else to_finite(found.uncertainty.noise_sd),
-        "noise_colour": None if found.uncertainty is None else found.uncertainty.noise_colour,
-        "noise_model": found.noise_model,
-        "correlation_times": dict(found.correlation_times),
-        "residual_tests": to_residual_document(found.residual_tests),
-        "onset_delays": to_onset_document(found.onset_delays),
+        "identifiability": _to_identifiability_document(identification.uncertainty),
+        "criteria": _to_criteria_document(identification.criteria),
+        "correlation": _to_correlation_document(identification.uncertainty),
+        "noise_sd": None
+        if identification.uncertainty is None
+        else to_finite(identification.uncertainty.noise_sd),
+        "noise_colour": None
+        if identification.uncertainty is None
+        else identification.uncertainty.noise_colour,
+        "noise_model": identification.noise_model,
+        "correlation_times": dict(identification.correlation_times),
+        "residual_tests": to_residual_document(identification.residual_tests),
+        "onset_delays": to_onset_document(identification.onset_delays),
         "known_before": {
-            "estimation": list(found.known_before),
-            "validation": list(found.known_before_validation),
+            "estimation": list(identification.known_before),
+            "validation": list(identification.known_before_validation),
         },
-        "warnings": list(found.warnings),
-        "selection": [one._asdict() for one in found.selection],
+        "warnings": list(identification.warnings),
+        "selection": [step._asdict() for step in identification.selection],
     }
 
 
-def _to_estimate_document(one: Estimate) -> dict[str, Any]:
+def _to_estimate_document(estimate: Estimate) -> dict[str, Any]:
     return _read(
-        one, "name", "unit", "value", "lower", "upper", "stderr", "interval95", "status", "reason"
+        estimate,
+        "name",
+        "unit",
+        "value",
+        "lower",
+        "upper",
+        "stderr",
+        "interval95",
+        "status",
+        "reason",
     )
 
 
-def _to_agreement_document(one: ChannelMetrics) -> dict[str, Any]:
-    return _read(one, "experiment", "output", "unit", "samples", "rms", "fit_percent", "span")
+def _to_agreement_document(metrics: ChannelMetrics) -> dict[str, Any]:
+    return _read(metrics, "experiment", "output", "unit", "samples", "rms", "fit_percent", "span")
 
 
 def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
-    groups = [_read(one, "members", "expression", "value", "stderr") for one in uncertainty.groups]
+    groups = [
+        _read(group, "members", "expression", "value", "stderr") for group in uncertainty.groups
+    ]
     return {
         **_read(uncertainty, "condition"),
         "groups": groups,
@@ -109,8 +126,8 @@ def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, A
     }
 
 
-def _to_criteria_document(one: Criteria) -> dict[str, Any]:
-    return _read(one, "aic", "aicc", "bic", "samples", "parameters")
+def _to_criteria_document(criteria: Criteria) -> dict[str, Any]:
+    return _read(criteria, "aic", "aicc", "bic", "samples", "parameters")
 
 
 def _to_correlation_document(uncertainty: Uncertainty | None) -> dict[str, Any] | None:

@@ -39,7 +39,7 @@ def list_runs(
 ) -> Page[RunOut]:
     """List the runs of a job."""
     job = JobRepository(session).get(job_id)
-    found = RunRepository(session).list_page(
+    page = RunRepository(session).list_page(
         job.id,
         cursor=cursor,
         limit=limit,
@@ -49,35 +49,35 @@ def list_runs(
         order=choice.order,
         descending=choice.descending,
     )
-    known = read_written_progress(session, [run.id for run in found.items if run.result is None])
-    items = [to_run_out(run, job, known.get(run.id)) for run in found.items]
-    return Page(items=items, next=found.next)
+    progress = read_written_progress(session, [run.id for run in page.items if run.result is None])
+    items = [to_run_out(run, job, progress.get(run.id)) for run in page.items]
+    return Page(items=items, next=page.next)
 
 
 def get_run(session: Session, run_id: str) -> RunOut:
     """Read one run with its result document."""
     stored = load_run(session, run_id)
     run = stored.run
-    known = read_written_progress(session, [run.id]) if run.result is None else {}
-    answer = to_run_out(run, stored.job, known.get(run.id))
+    progress = read_written_progress(session, [run.id]) if run.result is None else {}
+    answer = to_run_out(run, stored.job, progress.get(run.id))
     answer = answer.model_copy(update={"rms_unit": stored.rms_unit(session)})
     if run.result is not None or not run.state.is_terminal:
         return answer
     return answer.model_copy(update={"parameters": _list_best_parameters(session, stored)})
 
 
-def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunOut:
+def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> RunOut:
     """Build the answer for a run: its result document, or its progress."""
     so_far: dict[str, Any] = {
         "rms": run.best_rms,
         "evaluations": run.evaluations,
         "generations": run.generations,
     }
-    if known is not None:
+    if written is not None:
         so_far = {
-            "rms": known.rms,
-            "evaluations": known.evaluations,
-            "generations": known.generation,
+            "rms": written.rms,
+            "evaluations": written.evaluations,
+            "generations": written.generation,
         }
     return RunOut.model_validate(
         {
@@ -89,7 +89,7 @@ def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunO
             "cell": run.cell,
             "labels": run.labels,
             "state": run.state.value,
-            "progress": _compute_progress(run, job, known),
+            "progress": _compute_progress(run, job, written),
             "error": run.error,
             "created_at": run.created_at,
             "started_at": run.started_at,
@@ -125,39 +125,41 @@ def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str,
     reason = f"the run was {stored.run.state.value} before its standard errors were computed"
     return [
         {
-            "name": one.name,
-            "unit": one.unit,
+            "name": parameter.name,
+            "unit": parameter.unit,
             "value": value,
-            "lower": one.lower,
-            "upper": one.upper,
+            "lower": parameter.lower,
+            "upper": parameter.upper,
             "stderr": None,
             "interval95": None,
             "status": "unfinished",
             "reason": reason,
         }
-        for one, value in zip(_list_free_parameters(session, stored), best.parameters, strict=False)
+        for parameter, value in zip(
+            _list_free_parameters(session, stored), best.parameters, strict=False
+        )
     ]
 
 
 def _list_free_names(session: Session, stored: StoredRun) -> list[str]:
     if stored.run.result is not None:
-        return [one["name"] for one in stored.estimates if is_free(one)]
-    return [one.name for one in _list_free_parameters(session, stored)]
+        return [estimate["name"] for estimate in stored.estimates if is_free(estimate)]
+    return [parameter.name for parameter in _list_free_parameters(session, stored)]
 
 
 def _list_free_parameters(session: Session, stored: StoredRun) -> list[Parameter]:
     """List the free parameters of a run, in the order of its history's columns."""
     if stored.model.rule is not None:  # the result says which candidates are estimated
         return []
-    return [one for one in stored.parameters(session) if one.is_free]
+    return [parameter for parameter in stored.parameters(session) if parameter.is_free]
 
 
-def _compute_progress(run: Run, job: Job, known: WrittenProgress | None) -> float:
+def _compute_progress(run: Run, job: Job, written: WrittenProgress | None) -> float:
     if run.state.is_terminal:
         return 1.0
     # A single run's generation is the job's. The history is behind if nothing improves.
     of_job = job.generation if job.n_runs == 1 else 0
-    reached_so_far = max(of_job, known.generation if known is not None else 0)
+    reached_so_far = max(of_job, written.generation if written is not None else 0)
     generations: int = build_run_body(job.spec, run.cell)["algorithm"]["generations"]
     return min(reached_so_far / generations, MOST_OPEN_PROGRESS)
 
@@ -170,13 +172,13 @@ def parse_filters(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
     InvalidRequest
         If one is not of that form; `name` is the name of the query's field.
     """
-    found: dict[str, Any] = {}
+    conditions: dict[str, Any] = {}
     for text in filters:
         key, equals, value = text.partition("=")
         if not equals:
             raise InvalidRequest.from_fault(f"?{name}", f"found {text!r}; need path=value")
         try:
-            found[key] = json.loads(value)
+            conditions[key] = json.loads(value)
         except ValueError:
-            found[key] = value
-    return found
+            conditions[key] = value
+    return conditions

@@ -69,11 +69,15 @@ def stream_table(database: Database, job_id: str) -> Iterator[str]:
         spec = JobRepository(session).get(job_id).spec
         runs = RunRepository(session)
         best = runs.list_page(job_id, limit=1, order="best_rms").items
-        first = [(one["name"], one["unit"]) for run in best for one in _get_estimates(run)]
+        first = [
+            (estimate["name"], estimate["unit"]) for run in best for estimate in _get_estimates(run)
+        ]
         parameters = tuple(dict.fromkeys([*first, *runs.list_parameters(job_id)]))
         units = {**COLUMN_UNITS, "best_rms": find_rms_unit(session, spec)}
     axes = spec["sweep"]["axes"]
-    labels = dict.fromkeys(name for axis in axes for one in axis["labels"] or [] for name in one)
+    labels = dict.fromkeys(
+        name for axis in axes for labels in axis["labels"] or [] for name in labels
+    )
     layout = _TableLayout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
     return _stream_parts(database, job_id, layout, units)
 
@@ -101,9 +105,9 @@ def _stream_parts(
 
 
 def _build_row(run: Run, layout: _TableLayout) -> list[Any]:
-    told = {(one["name"], one["unit"]): one for one in _get_estimates(run)}
-    statuses = {one["name"]: one["status"] for one in _get_estimates(run)}
-    found = [told.get(key) or {} for key in layout.parameters]
+    estimates = {(estimate["name"], estimate["unit"]): estimate for estimate in _get_estimates(run)}
+    statuses = {estimate["name"]: estimate["status"] for estimate in _get_estimates(run)}
+    cells = [estimates.get(key) or {} for key in layout.parameters]
     return [
         run.number,
         run.id,
@@ -111,15 +115,15 @@ def _build_row(run: Run, layout: _TableLayout) -> list[Any]:
         *(getattr(run, name) for name in COLUMNS[3:]),
         *(_to_csv_value(run.cell.get(path)) for path in layout.paths),
         *(_to_csv_value(run.labels.get(name)) for name in layout.labels),
-        *(one.get(what) for one in found for what in ("value", "stderr")),
+        *(estimate.get(what) for estimate in cells for what in ("value", "stderr")),
         *(statuses.get(name) for name in layout.parameter_names),
     ]
 
 
 def _get_estimates(run: Run) -> list[dict[str, Any]]:
     """The estimates of a run's result."""
-    found: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
-    return found
+    estimates: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
+    return estimates
 
 
 def _to_csv_value(value: object) -> object:

@@ -27,13 +27,13 @@ class StoredBounds:
         if not self.problems or any(path not in key for path in self._axes):
             return None
         cell = {path: key[path] for path in self._axes}
-        return next((one for one in self.problems if one["cell"] == cell), None)
+        return next((problem for problem in self.problems if problem["cell"] == cell), None)
 
     def list_notes(self) -> Iterator[str]:
         """List the notes that a reader of errors and bounds needs, each once."""
         if not self.problems:
             return
-        kinds = {(one["reference"] or {}).get("kind") for one in self.problems}
+        kinds = {(problem["reference"] or {}).get("kind") for problem in self.problems}
         if "truth" in kinds:
             yield "parameter errors are differences from the true values"
         if "estimate" in kinds:
@@ -41,12 +41,12 @@ class StoredBounds:
                 "the true values are unknown. Parameter errors and Cramér–Rao bounds refer to the "
                 "estimate of the best run with the least noise"
             )
-        if any(_is_measured_record(one["reference"] or {}) for one in self.problems):
+        if any(_is_measured_record(problem["reference"] or {}) for problem in self.problems):
             yield (
                 "σ = 0 is the measured record without added noise. It is always run, because it "
                 "gives that estimate"
             )
-        yield from dict.fromkeys(one["note"] for one in self.problems if one["note"])
+        yield from dict.fromkeys(problem["note"] for problem in self.problems if problem["note"])
         if self._note:
             yield self._note
 

@@ -36,23 +36,23 @@ def group_all_runs(
 
     A run not yet created counts as queued. In a job that ended without it, it has the job's state.
     """
-    found = read_groups(session, job.id, keys, quantities, limit, job.project_id)
-    made = RunRepository(session, job.project_id).count_created(job.id)
-    if made >= job.n_runs or len(found) > limit:
-        return found
+    groups = read_groups(session, job.id, keys, quantities, limit, job.project_id)
+    n_created = RunRepository(session, job.project_id).count_created(job.id)
+    if n_created >= job.n_runs or len(groups) > limit:
+        return groups
     sweep = _GroupedSweep(job.spec, keys)
     # Matched by their first runs: a database may round the numbers in a key.
-    known = {to_json(sweep.find_key(group.first_number)): group for group in found}
+    by_key = {to_json(sweep.find_key(group.first_number)): group for group in groups}
     state = job.state if job.state.is_terminal else JobState.QUEUED
-    for part in sweep.iterate_pending(made):
+    for part in sweep.iterate_pending(n_created):
         text = to_json(part.key)
-        if text not in known:
-            if len(found) > limit:
+        if text not in by_key:
+            if len(groups) > limit:
                 break
-            known[text] = _build_empty_group(part, keys)
-            found.append(known[text])
-        known[text].states[state] += part.size
-    return found
+            by_key[text] = _build_empty_group(part, keys)
+            groups.append(by_key[text])
+        by_key[text].states[state] += part.size
+    return groups
 
 
 class PendingGroup(NamedTuple):
@@ -71,49 +71,51 @@ class _GroupedSweep:
         self._groups = read_axis_groups(spec)
         self._lengths = [len(steps) for steps in self._groups]
         self._places = [
-            place
-            for place, steps in enumerate(self._groups)
+            index
+            for index, steps in enumerate(self._groups)
             if any(_sets_key(steps, key) for key in keys)
         ]
 
     def find_key(self, number: int) -> tuple[Any, ...]:
         """Find the key of the group that a run belongs to."""
         positions = locate_cell(number, self._lengths)
-        return self._build_key([positions[place] for place in self._places])
+        return self._build_key([positions[index] for index in self._places])
 
     def iterate_pending(self, start: int) -> Iterator[PendingGroup]:
         """Iterate over the runs from number `start`, group by group in the order of the sweep."""
         lengths = self._lengths
         total = prod(lengths)
-        for positions in product(*(range(lengths[place]) for place in self._places)):
+        for positions in product(*(range(lengths[index]) for index in self._places)):
             fixed = dict(zip(self._places, positions, strict=True))
             size = count_cells_below(total, lengths, fixed) - count_cells_below(
                 start, lengths, fixed
             )
             if size:
-                first = sum(at * prod(lengths[place + 1 :]) for place, at in fixed.items())
+                first = sum(
+                    position * prod(lengths[index + 1 :]) for index, position in fixed.items()
+                )
                 yield PendingGroup(self._build_key(positions), first, size)
 
     def _build_key(self, positions: Sequence[int]) -> tuple[Any, ...]:
         cells = [
-            self._groups[place][position].cell
-            for place, position in zip(self._places, positions, strict=True)
+            self._groups[index][position].cell
+            for index, position in zip(self._places, positions, strict=True)
         ]
         return tuple(_get_key_value(cells, key) for key in self._keys)
 
 
 def count_cells_below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
-    """Count the cells before number `end` that have the `fixed` positions, given by place."""
+    """Count the cells before number `end` that have the `fixed` positions, by axis group."""
     count = 0
-    for place, _ in enumerate(lengths):
-        later = range(place + 1, len(lengths))
-        free = prod(lengths[one] for one in later if one not in fixed)
-        position, end = divmod(end, prod(lengths[one] for one in later))
-        wanted = fixed.get(place)
-        if wanted is None:
+    for index, _ in enumerate(lengths):
+        later = range(index + 1, len(lengths))
+        free = prod(lengths[axis] for axis in later if axis not in fixed)
+        position, end = divmod(end, prod(lengths[axis] for axis in later))
+        required = fixed.get(index)
+        if required is None:
             count += position * free
-        elif wanted != position:
-            return count + (free if wanted < position else 0)
+        elif required != position:
+            return count + (free if required < position else 0)
     return count + end  # without axes there is one cell
 
 
@@ -186,10 +188,10 @@ def get_groups(
     """
     if not job.state.is_terminal:
         return group_all_runs(session, job, keys, quantities, limit)
-    asked = (job.id, job.attempt, job.finished_at, tuple(keys), tuple(quantities), limit)
-    found = _cache.get(asked)
-    if found is None:
-        found = group_all_runs(session, job, keys, quantities, limit)
-        if len(found) <= MOST_CACHED_GROUPS:
-            _cache.put(asked, found)
-    return found
+    key = (job.id, job.attempt, job.finished_at, tuple(keys), tuple(quantities), limit)
+    groups = _cache.get(key)
+    if groups is None:
+        groups = group_all_runs(session, job, keys, quantities, limit)
+        if len(groups) <= MOST_CACHED_GROUPS:
+            _cache.put(key, groups)
+    return groups

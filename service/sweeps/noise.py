@@ -90,7 +90,7 @@ def submit_noise_sweep(
             job = job.model_copy(update={"datasets": [stored]})
         return jobs.submit_job(database, job, settings, key)
     except InvalidRequest as error:
-        raise InvalidRequest(_move_fault(one, body) for one in error.errors) from None
+        raise InvalidRequest(_move_fault(fault, body) for fault in error.errors) from None
 
 
 def _grid_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
@@ -112,17 +112,19 @@ def _prepare_source(database: Database, store: ObjectStore, body: NoiseSweepIn) 
         return _RecordSource(list(body.datasets or ()))
     document = {"model": body.model, **body.truth.model_dump()}
     try:
-        found = simulate_or_find(database, store, SimulateIn.model_validate(document))
+        simulation = simulate_or_find(database, store, SimulateIn.model_validate(document))
     except (InvalidModel, UnknownModel) as error:
-        of_model = (fault_in_job(body.model, one) for one in to_field_errors(error))
+        of_model = (fault_in_job(body.model, fault) for fault in to_field_errors(error))
         return _RecordSource([UNSTORED_ID], faults=tuple(of_model))
     except (InvalidRequest, SysidError) as error:
         faults = error.errors if isinstance(error, InvalidRequest) else to_field_errors(error)
-        at_home = (FieldError(f"/truth{one.pointer}", one.detail, one.column) for one in faults)
+        at_home = (
+            FieldError(f"/truth{fault.pointer}", fault.detail, fault.column) for fault in faults
+        )
         return _RecordSource([UNSTORED_ID], faults=tuple(at_home))
-    if isinstance(found, SimulatedDataset):
-        return _RecordSource([UNSTORED_ID], found)
-    return _RecordSource([found.dataset.id])
+    if isinstance(simulation, SimulatedDataset):
+        return _RecordSource([UNSTORED_ID], simulation)
+    return _RecordSource([simulation.dataset.id])
 
 
 def _build_base(
@@ -137,9 +139,9 @@ def _build_base(
     checker = JobChecker(session, source.unstored_rows)
     faults = [*_grid_faults(body, most_runs), *source.faults]
     faults += (
-        one
-        for one in checker.find_faults(job.to_normal_form())
-        if not (source.is_missing and one.pointer.startswith("/datasets"))
+        fault
+        for fault in checker.find_faults(job.to_normal_form())
+        if not (source.is_missing and fault.pointer.startswith("/datasets"))
     )
     rows = [one for name in job.datasets if isinstance(one := checker.get_dataset(name), Dataset)]
     model = checker.resolve_model(job.model)
@@ -160,10 +162,10 @@ def _build_job(
     """Build the whole job. A relative σ is converted and becomes a label."""
     sigma: dict[str, Any] = {"path": "/noise/sigma", "values": plain.sigmas}
     if body.relative:
-        made = None if source.simulated is None else source.simulated.recording
-        unit = compute_spread(store, plain.rows, plain.channel, made)
-        sigma["values"] = [unit * one for one in plain.sigmas]
-        sigma["labels"] = [{"relative": one} for one in plain.sigmas]
+        recording = None if source.simulated is None else source.simulated.recording
+        unit = compute_spread(store, plain.rows, plain.channel, recording)
+        sigma["values"] = [unit * sigma_value for sigma_value in plain.sigmas]
+        sigma["labels"] = [{"relative": sigma_value} for sigma_value in plain.sigmas]
     together = {
         "range": [body.seed * MOST_REPLICATES, body.seed * MOST_REPLICATES + body.replicates],
         "zip": "replicate",
@@ -179,9 +181,11 @@ def _build_job(
 
 def _move_fault(error: FieldError, body: NoiseSweepIn) -> FieldError:
     """Move a fault of the job to its pointer in this body."""
-    for theirs, ours in _list_moved_pointers(body):
-        if error.pointer.startswith(theirs):
-            return FieldError(ours + error.pointer.removeprefix(theirs), error.detail, error.column)
+    for job_pointer, pointer in _list_moved_pointers(body):
+        if error.pointer.startswith(job_pointer):
+            return FieldError(
+                pointer + error.pointer.removeprefix(job_pointer), error.detail, error.column
+            )
     return error
 
 

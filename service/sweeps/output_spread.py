@@ -17,7 +17,7 @@ MOST_READ_VALUES = 10_000_000
 
 def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldError]:
     """Report faults of a relative σ: several outputs, or too many values to read."""
-    names = [one.name for one in model.outputs]
+    names = [signal.name for signal in model.outputs]
     if len(names) > 1:
         yield FieldError(
             "/relative",
@@ -52,16 +52,16 @@ def compute_spread(
     for row in rows:
         recording = load_recording(store, row.sha256) if made is None else made
         values = recording.channel(channel).values
-        known = values[np.isfinite(values)]
-        if known.size:
-            squares += float(np.sum(np.square(known - np.mean(known))))
-            count += known.size
-            largest = max(largest, float(np.max(np.abs(known))))
-    found = float(np.sqrt(squares / count)) if count else 0.0
-    if not found > 1e-12 * largest:
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            squares += float(np.sum(np.square(finite - np.mean(finite))))
+            count += finite.size
+            largest = max(largest, float(np.max(np.abs(finite))))
+    deviation = float(np.sqrt(squares / count)) if count else 0.0
+    if not deviation > 1e-12 * largest:
         raise InvalidRequest.from_fault(
             "/relative",
-            f"the output {channel!r} does not vary (standard deviation {found:g}), so σ cannot "
+            f"the output {channel!r} does not vary (standard deviation {deviation:g}), so σ cannot "
             "be relative to it. Give σ in its unit, with relative: false",
         )
-    return found
+    return deviation

@@ -44,7 +44,7 @@ def submit_reidentification(
         with database.read_session() as session:
             jobs.check_job(session, job, settings)
     except InvalidRequest as error:
-        faults += [_move_fault(one, order) for one in error.errors]
+        faults += [_move_fault(fault, order) for fault in error.errors]
     raise InvalidRequest(dict.fromkeys(faults))
 
 
@@ -58,8 +58,8 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     chosen = [body.batch[number] for number in order]
     axis = {
         "path": "/datasets",
-        "values": [one.datasets for one in chosen],
-        "labels": [{body.label: one.x} for one in chosen],
+        "values": [entry.datasets for entry in chosen],
+        "labels": [{body.label: entry.x} for entry in chosen],
     }
     reference = _to_job_reference(body.reference)
     trend = {
@@ -86,27 +86,27 @@ def _choose_model_name(model: Any) -> str:
     return name if isinstance(name, str) and find_text_fault(name) is None else "model"
 
 
-def _to_job_reference(given: str | None) -> str | None:
+def _to_job_reference(reference: str | None) -> str | None:
     """Convert a reference to the form of a job: a run's id, or ``reference:`` and a name."""
-    if given is None or given.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
-        return given
-    return REFERENCE_PREFIX + given
+    if reference is None or reference.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
+        return reference
+    return REFERENCE_PREFIX + reference
 
 
 def _choose_warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
-    wanted = body.warm_start or ("previous" if reference is None else "reference")
-    if wanted == "reference":
+    start = body.warm_start or ("previous" if reference is None else "reference")
+    if start == "reference":
         return reference
-    return PREVIOUS if wanted == "previous" else None
+    return PREVIOUS if start == "previous" else None
 
 
 def _move_fault(error: FieldError, order: list[int]) -> FieldError:
     """Move a fault of the job to its pointer in this body."""
-    place = _move_pointer(error.pointer, order)
+    pointer = _move_pointer(error.pointer, order)
     inner = DATASET_FAULT.match(error.detail)
-    if inner and place.startswith("/batch/"):
-        return FieldError(place + inner["place"], error.detail[inner.end() :], error.column)
-    return FieldError(place, error.detail, error.column)
+    if inner and pointer.startswith("/batch/"):
+        return FieldError(pointer + inner["place"], error.detail[inner.end() :], error.column)
+    return FieldError(pointer, error.detail, error.column)
 
 
 def _move_pointer(pointer: str, order: list[int]) -> str:
@@ -117,13 +117,13 @@ def _move_pointer(pointer: str, order: list[int]) -> str:
         return "/label"
     if pointer.startswith("/datasets"):
         return "/".join([f"/batch/{order[0]}", *parts[1:]])
-    for theirs, ours in (
+    for job_pointer, body_pointer in (
         ("/trend/parameters", "/look_at"),
         ("/trend/reference", "/reference"),
         ("/trend/predict", "/predict"),
         ("/trend/x", "/label"),
         ("/warm_start", "/reference"),
     ):
-        if pointer.startswith(theirs):
-            return ours + pointer.removeprefix(theirs)
+        if pointer.startswith(job_pointer):
+            return body_pointer + pointer.removeprefix(job_pointer)
     return pointer

@@ -14,13 +14,13 @@ MOST_REPLICATES = 1_000_000
 """The seed of replicate r is `seed` times this plus r, so that sweeps share no seed by chance."""
 
 
-def _check_distinct(found: list[Any]) -> list[Any]:
+def _check_distinct(values: list[Any]) -> list[Any]:
     seen: set[Any] = set()
-    for one in found:
-        if one in seen:
-            raise PydanticCustomError("distinct", "{one} is given twice", {"one": str(one)})
-        seen.add(one)
-    return found
+    for value in values:
+        if value in seen:
+            raise PydanticCustomError("distinct", "{one} is given twice", {"one": str(value)})
+        seen.add(value)
+    return values
 
 
 class TruthIn(Body):

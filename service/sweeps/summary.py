@@ -65,8 +65,8 @@ def summarise_job(
     if not errors_only:
         quantities += [RMS, FIT_ESTIMATION, FIT_VALIDATION]
         quantities += [SummaryQuantity("stderr", name) for name in units]
-    found = get_groups(session, job, keys, quantities, MOST_GROUPS)
-    if len(found) > MOST_GROUPS:
+    groups = get_groups(session, job, keys, quantities, MOST_GROUPS)
+    if len(groups) > MOST_GROUPS:
         raise InvalidRequest.from_fault(
             "?by", f"gives more than {MOST_GROUPS} groups. Name fewer axes, for example no seed"
         )
@@ -74,11 +74,11 @@ def summarise_job(
         job=job.id,
         by=[key.name for key in keys],
         quantiles=[q / 1000 for q in QUANTILES_PER_MILLE],
-        groups=[_to_group_out(group, keys, units, floors) for group in found],
+        groups=[_to_group_out(group, keys, units, floors) for group in groups],
         runs=job.n_runs,
         reused=job.n_reused,
         rms_unit=find_rms_unit(session, job.spec),
-        references=[_to_reference_out(one) for one in floors.problems],
+        references=[_to_reference_out(problem) for problem in floors.problems],
         notes=list(_list_notes(job, floors)),
     )
 
@@ -91,26 +91,27 @@ def _list_notes(job: Job, floors: StoredBounds) -> Iterator[str]:
 
 
 def _to_reference_out(problem: Mapping[str, Any]) -> ErrorReferenceOut:
-    known = problem["reference"] or {}
+    reference = problem["reference"] or {}
     none = {"kind": None, "run": None, "sigma": None}
     return ErrorReferenceOut.model_validate(
-        {**none, **known, **problem, "parameters": known.get("values", {})}
+        {**none, **reference, **problem, "parameters": reference.get("values", {})}
     )
 
 
 def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
     axes = job.spec["sweep"]["axes"]
     paths = [axis["path"] for axis in axes]
-    labels = {name for axis in axes for one in axis["labels"] or [] for name in one}
+    labels = {name for axis in axes for labels in axis["labels"] or [] for name in labels}
     if by is None:
         return [GroupKey("axis", path) for path in paths if not path.endswith("/seed")]
     keys = []
     for name in dict.fromkeys(by):
         if name not in paths and name not in labels:
-            known = [*paths, *sorted(labels)]
-            there = f". The names are {', '.join(known)}" if known else ". The job has no axes"
+            names = [*paths, *sorted(labels)]
+            available = f". The names are {', '.join(names)}" if names else ". The job has no axes"
             raise InvalidRequest.from_fault(
-                "?by", f"the job has no axis or label {name!r}{suggest_name(name, known)}{there}"
+                "?by",
+                f"the job has no axis or label {name!r}{suggest_name(name, names)}{available}",
             )
         keys.append(GroupKey("axis" if name in paths else "label", name))
     return keys
@@ -129,10 +130,10 @@ def _read_units(session: Session, job: Job) -> dict[str, str]:
             cell = {"/model": group.key[0]}
             heads += runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED], cell=cell).items
     return {
-        one["name"]: one["unit"]
+        estimate["name"]: estimate["unit"]
         for run in heads
-        for one in (run.result or {}).get("parameters", [])
-        if one["status"] != "fixed"
+        for estimate in (run.result or {}).get("parameters", [])
+        if estimate["status"] != "fixed"
     }
 
 
@@ -166,13 +167,13 @@ def _to_group_out(
 def _summarise_parameters(
     group: RunGroup, units: dict[str, str], problem: Mapping[str, Any]
 ) -> Iterator[ParameterSummaryOut]:
-    known = (problem.get("reference") or {}).get("values", {})
+    references = (problem.get("reference") or {}).get("values", {})
     floors = problem.get("stderr", {})
     for name, unit in units.items():
         values = _list_quantiles(group, SummaryQuantity("estimate", name))
         errors = _list_quantiles(group, SummaryQuantity("stderr", name))
         if values is not None:
-            reference = known.get(name)
+            reference = references.get(name)
             yield ParameterSummaryOut(
                 name=name,
                 unit=unit,
@@ -185,5 +186,5 @@ def _summarise_parameters(
 
 
 def _list_quantiles(group: RunGroup, quantity: SummaryQuantity) -> Any:
-    found = group.quantiles.get(quantity)
-    return None if found is None else list(found)
+    quantiles = group.quantiles.get(quantity)
+    return None if quantiles is None else list(quantiles)

@@ -22,14 +22,14 @@ def find_true_parameters(
     truths = [
         _read_true_parameters(model, stored, row, number) for number, row in enumerate(datasets)
     ]
-    if not truths or any(one is None for one in truths):
+    if not truths or any(truth is None for truth in truths):
         return None
-    known: dict[str, float] = {}
-    for one in truths:
-        for name, value in (one or {}).items():
-            if known.setdefault(name, value) != value:
+    values: dict[str, float] = {}
+    for truth in truths:
+        for name, value in (truth or {}).items():
+            if values.setdefault(name, value) != value:
                 return None
-    return known
+    return values
 
 
 def _read_true_parameters(
@@ -38,11 +38,13 @@ def _read_true_parameters(
     source = row.details.get("simulation") if row.kind == "simulate" else None
     if not isinstance(source, Mapping) or source.get("model") != stored:
         return None
-    given: Mapping[str, float] = row.details.get("true_parameters") or {}
-    own = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
+    stored_values: Mapping[str, float] = row.details.get("true_parameters") or {}
+    values = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
     names = {p.name for p in model.parameters}
-    own |= {name: float(value) for name, value in given.items() if name in names}
+    values |= {name: float(value) for name, value in stored_values.items() if name in names}
     for state, start in zip(model.states, model.initial, strict=True):
         if isinstance(start, EstimatedInitial):
-            own[name_initial_state(state.name, number)] = float(given.get(f"{state.name}(0)", 0.0))
-    return own
+            values[name_initial_state(state.name, number)] = float(
+                stored_values.get(f"{state.name}(0)", 0.0)
+            )
+    return values

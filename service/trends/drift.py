@@ -48,39 +48,39 @@ class BatchReference:
 
 
 def compare_with_reference(
-    one: TrendQuantity, reference: BatchReference | None, comparisons: int
+    quantity: TrendQuantity, reference: BatchReference | None, comparisons: int
 ) -> dict[float, list[DriftOut]]:
     """Compute the drifts of each point, by its x."""
-    found: dict[float, list[DriftOut]] = {}
+    drifts: dict[float, list[DriftOut]] = {}
     if reference is None:
-        return found
-    new = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
-    old = _read_estimate(reference.run, one.name)
+        return drifts
+    new = [(point.x, point.estimate) for point in quantity.points if point.estimate is not None]
+    old = _read_estimate(reference.run, quantity.name)
     for x, estimate in new:
         if x == reference.x and old is not None:
-            found[x] = [_to_drift_out("run", old.value, compute_drift(estimate, old, comparisons))]
-    fitted, theirs = reference.trends.get(one.name, (None, None))
-    if fitted is None or theirs is None or fitted.best_law is None:
-        return found
-    used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
+            drifts[x] = [_to_drift_out("run", old.value, compute_drift(estimate, old, comparisons))]
+    fitted, reference_quantity = reference.trends.get(quantity.name, (None, None))
+    if fitted is None or reference_quantity is None or fitted.best_law is None:
+        return drifts
+    used = [(p.x, p.estimate.stderr) for p in reference_quantity.points if p.estimate is not None]
     places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
-    at = np.array([x for x, _ in new])
+    new_places = np.array([x for x, _ in new])
     moved = compute_law_drifts(
-        [estimate for _, estimate in new], fitted.best_law, places, errors, at, comparisons
+        [estimate for _, estimate in new], fitted.best_law, places, errors, new_places, comparisons
     )
     for (x, estimate), so_far in zip(new, moved, strict=True):
         if isfinite(so_far.difference):
             expected = estimate.value - so_far.difference
-            found.setdefault(x, []).append(_to_drift_out("trend", expected, so_far))
-    return found
+            drifts.setdefault(x, []).append(_to_drift_out("trend", expected, so_far))
+    return drifts
 
 
 def _read_estimate(run: Run, name: str) -> TrendEstimate | None:
     """Read the estimate of a parameter or an onset delay, with its standard error."""
-    one: Any = (run.estimates or {}).get(name)
-    if one is None:
+    estimate: Any = (run.estimates or {}).get(name)
+    if estimate is None:
         return read_onset_estimates((run.result or {}).get("onset_delays") or []).get(name)
-    return TrendEstimate(one["value"], one["stderr"]) if one["stderr"] else None
+    return TrendEstimate(estimate["value"], estimate["stderr"]) if estimate["stderr"] else None
 
 
 def _to_drift_out(kind: Literal["run", "trend"], expected: float, moved: Drift) -> DriftOut:

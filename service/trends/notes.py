@@ -11,12 +11,12 @@ from sysid.trends.trend import Trend, TrendPoint
 BIRGE_LIMIT = 1.5  # Birge ratios below that happen by chance in small batches
 
 
-def describe_quantity(one: TrendQuantity, fitted: Trend) -> list[str]:
+def describe_quantity(quantity: TrendQuantity, fitted: Trend) -> list[str]:
     """List all notes: on the points, the laws, and the predictions."""
     return [
-        *_describe_points(one),
-        *_describe_laws(one, fitted),
-        *_describe_predictions(one, fitted),
+        *_describe_points(quantity),
+        *_describe_laws(quantity, fitted),
+        *_describe_predictions(quantity, fitted),
     ]
 
 
@@ -32,10 +32,13 @@ def describe_noise_models(
     reference : str
         Noise model of the reference run; empty if there is none.
     """
-    found = {at: {read_noise_model(row._asdict()) for row in rows} for at, rows in places.items()}
-    if len({reference, *(one for models in found.values() for one in models)} - {""}) < 2:
+    models_by_x = {
+        x_value: {read_noise_model(row._asdict()) for row in rows}
+        for x_value, rows in places.items()
+    }
+    if len({reference, *(model for models in models_by_x.values() for model in models)} - {""}) < 2:
         return ""
-    whitened = [f"{at:g}" for at, models in found.items() if "ar1" in models]
+    whitened = [f"{x_value:g}" for x_value, models in models_by_x.items() if "ar1" in models]
     where = f"{x} = {', '.join(whitened)}" if whitened else "the reference run"
     if whitened and reference == "ar1":
         where += " and the reference run"
@@ -46,18 +49,18 @@ def describe_noise_models(
     )
 
 
-def _describe_points(one: TrendQuantity) -> Iterator[str]:
-    without = [f"{point.x:g}" for point in one.points if point.estimate is None]
+def _describe_points(quantity: TrendQuantity) -> Iterator[str]:
+    without = [f"{point.x:g}" for point in quantity.points if point.estimate is None]
     if without:
         yield f"no standard error at {', '.join(without)}, so the laws leave it out"
-    if one.between_runs is not None and one.between_runs > 1:
+    if quantity.between_runs is not None and quantity.between_runs > 1:
         yield (
-            f"runs of one label differ by {one.between_runs:.2g} times their standard errors. "
+            f"runs of one label differ by {quantity.between_runs:.2g} times their standard errors. "
             "The errors shown include this scatter"
         )
 
 
-def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
+def _describe_laws(quantity: TrendQuantity, fitted: Trend) -> Iterator[str]:
     chosen = fitted.best_law
     if chosen is None:
         return
@@ -67,7 +70,7 @@ def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
             "(Birge ratio). Band and intervals are widened by this factor"
         )
     if all(law.kind != "power" for law in fitted.laws):
-        wrong = [f"{x:g}" for x in _list_used_x(one) if not x > 0]
+        wrong = [f"{x:g}" for x in _list_used_x(quantity) if not x > 0]
         yield "no power law: " + (
             f"it needs x > 0, found {', '.join(wrong)}"
             if wrong
@@ -82,31 +85,34 @@ def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
         )
 
 
-def _describe_predictions(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
-    outside = [f"{at.x:g}" for at in fitted.predictions if at.is_outside]
+def _describe_predictions(quantity: TrendQuantity, fitted: Trend) -> Iterator[str]:
+    outside = [f"{prediction.x:g}" for prediction in fitted.predictions if prediction.is_outside]
     if outside:
         yield f"{', '.join(outside)} is outside the measured range, so this is an extrapolation"
-    used = _list_used_x(one)
-    beyond = [f"{at.x:g}" for at in fitted.predictions if not at.x > 0]
+    used = _list_used_x(quantity)
+    beyond = [f"{prediction.x:g}" for prediction in fitted.predictions if not prediction.x > 0]
     if beyond and used and min(used) > 0:
         yield f"{', '.join(beyond)} is not above 0, unlike all measured points"
-    for at in fitted.predictions:
-        yield from _compare_with_bounds(one, at)
+    for prediction in fitted.predictions:
+        yield from _compare_with_bounds(quantity, prediction)
 
 
-def _list_used_x(one: TrendQuantity) -> list[float]:
-    return [point.x for point in one.points if point.estimate is not None]
+def _list_used_x(quantity: TrendQuantity) -> list[float]:
+    return [point.x for point in quantity.points if point.estimate is not None]
 
 
-def _compare_with_bounds(one: TrendQuantity, at: TrendPoint) -> Iterator[str]:
+def _compare_with_bounds(quantity: TrendQuantity, prediction: TrendPoint) -> Iterator[str]:
     """Report predictions or intervals outside the bounds of the parameter."""
-    lower, upper = one.bounds
-    unit = format_unit(one.unit)
+    lower, upper = quantity.bounds
+    unit = format_unit(quantity.unit)
     limits = f"{lower:g} to {upper:g}{unit}" if upper < float("inf") else f"{lower:g}{unit} or more"
-    if not lower <= at.value <= upper and at.value == at.value:
+    if not lower <= prediction.value <= upper and prediction.value == prediction.value:
         yield (
-            f"{at.value:.4g}{unit}, predicted at {at.x:g}, is outside the bounds of {one.name} "
-            f"({limits}). The law does not hold there"
+            f"{prediction.value:.4g}{unit}, predicted at {prediction.x:g}, is outside the bounds "
+            f"of {quantity.name} ({limits}). The law does not hold there"
         )
-    elif at.lower < lower or at.upper > upper:
-        yield f"the interval at {at.x:g} reaches beyond the bounds of {one.name} ({limits})"
+    elif prediction.lower < lower or prediction.upper > upper:
+        yield (
+            f"the interval at {prediction.x:g} reaches beyond the bounds of {quantity.name} "
+            f"({limits})"
+        )

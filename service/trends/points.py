@@ -71,16 +71,16 @@ class _QuantityEstimates:
 
 def group_by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
     """Group runs by label, ascending. Of runs on the same data only the best is used."""
-    found: dict[float, dict[str, TrendRow]] = {}
+    by_label: dict[float, dict[str, TrendRow]] = {}
     for row in rows:
-        at = float(row.labels[x])
+        x_value = float(row.labels[x])
         data = repr(
             {path: value for path, value in row.cell.items() if path.startswith(DATA_FIELDS)}
         )
-        one = found.setdefault(at, {}).setdefault(data, row)
-        if _rank_rms(row) < _rank_rms(one):
-            found[at][data] = row
-    return {at: list(found[at].values()) for at in sorted(found)}
+        best = by_label.setdefault(x_value, {}).setdefault(data, row)
+        if _rank_rms(row) < _rank_rms(best):
+            by_label[x_value][data] = row
+    return {x_value: list(by_label[x_value].values()) for x_value in sorted(by_label)}
 
 
 def _rank_rms(row: TrendRow) -> float:
@@ -94,15 +94,19 @@ def build_quantities(
     columns: dict[str, _QuantityEstimates] = {}
     for x, rows in places.items():
         for row in rows:
-            for one in row.parameters:
-                if one["name"] in names or (not names and is_free(one)):
-                    entry = _RunEstimate(row.id, one["value"], one["stderr"], one["status"])
-                    column = _add_estimate(columns, one["name"], one["unit"], "parameter", x, entry)
-                    column.widen_bounds(one["lower"], one["upper"])
+            for estimate in row.parameters:
+                if estimate["name"] in names or (not names and is_free(estimate)):
+                    entry = _RunEstimate(
+                        row.id, estimate["value"], estimate["stderr"], estimate["status"]
+                    )
+                    column = _add_estimate(
+                        columns, estimate["name"], estimate["unit"], "parameter", x, entry
+                    )
+                    column.widen_bounds(estimate["lower"], estimate["upper"])
             for name, unit, entry in _average_onsets(row.id, row.onset_delays):
                 _add_estimate(columns, name, unit, "onset delay", x, entry).widen_bounds(0.0, None)
     order = {name: number for number, name in enumerate(names)}
-    named = sorted(columns.items(), key=lambda one: order.get(one[0], len(order)))
+    named = sorted(columns.items(), key=lambda item: order.get(item[0], len(order)))
     return [_build_quantity(name, column) for name, column in named]
 
 
@@ -119,71 +123,77 @@ def _add_estimate(
     return column
 
 
-def read_onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, TrendEstimate]:
+def read_onset_estimates(onsets: Sequence[Mapping[str, Any]]) -> dict[str, TrendEstimate]:
     """Read the onset delays of a result that have standard errors, by their names in a trend."""
-    known = {name: _to_estimate(entry) for name, _, entry in _average_onsets("", told)}
-    return {name: one for name, one in known.items() if one is not None}
+    estimates = {name: _to_estimate(entry) for name, _, entry in _average_onsets("", onsets)}
+    return {name: estimate for name, estimate in estimates.items() if estimate is not None}
 
 
 def _average_onsets(
-    run: str, told: Sequence[Mapping[str, Any]]
+    run: str, onsets: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, str, _RunEstimate]]:
     """Average the onset delays of a run over its experiments, with standard errors."""
     pairs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for one in told:
-        pairs.setdefault((one["input"], one["output"]), []).append(one)
-    found = []
-    for (first, then), several in pairs.items():
-        known = [one for one in several if one["delay"] is not None]
+    for onset in onsets:
+        pairs.setdefault((onset["input"], onset["output"]), []).append(onset)
+    averages = []
+    for (first, then), experiments in pairs.items():
+        measured = [experiment for experiment in experiments if experiment["delay"] is not None]
         name = "onset delay" if len(pairs) == 1 else f"onset delay {first} → {then}"
-        if not known:
-            found.append((name, several[0]["unit"], _RunEstimate(run, None, None, "not told")))
+        if not measured:
+            averages.append(
+                (name, experiments[0]["unit"], _RunEstimate(run, None, None, "not told"))
+            )
             continue
-        n = len(known)
-        value = sum(one["delay"] for one in known) / n
-        errors = [_compute_onset_error(one) for one in known]
+        n = len(measured)
+        value = sum(experiment["delay"] for experiment in measured) / n
+        errors = [_compute_onset_error(experiment) for experiment in measured]
         error = None if None in errors else sum(e**2 for e in errors if e is not None) ** 0.5 / n
-        found.append((name, known[0]["unit"], _RunEstimate(run, value, error, "measured")))
-    return found
+        averages.append((name, measured[0]["unit"], _RunEstimate(run, value, error, "measured")))
+    return averages
 
 
-def _compute_onset_error(one: Mapping[str, Any]) -> float | None:
+def _compute_onset_error(onset: Mapping[str, Any]) -> float | None:
     """Compute the standard error of a median of n events that scatter by `spread`."""
-    if not one["spread"] or one["events"] < 2:
+    if not onset["spread"] or onset["events"] < 2:
         return None
     median_over_mean = 1.2533  # √(π/2), of normally distributed events
-    return float(median_over_mean * one["spread"] / one["events"] ** 0.5)
+    return float(median_over_mean * onset["spread"] / onset["events"] ** 0.5)
 
 
 def _build_quantity(name: str, column: _QuantityEstimates) -> TrendQuantity:
-    groups = {x: [_to_estimate(one) for one in many] for x, many in column.entries.items()}
-    known = {x: [one for one in many if one is not None] for x, many in groups.items()}
-    used = [x for x, many in known.items() if many]
-    means, ratio = pool_estimates([known[x] for x in used])
+    groups = {x: [_to_estimate(entry) for entry in many] for x, many in column.entries.items()}
+    estimates_by_x = {
+        x: [entry for entry in many if entry is not None] for x, many in groups.items()
+    }
+    used = [x for x, many in estimates_by_x.items() if many]
+    means, ratio = pool_estimates([estimates_by_x[x] for x in used])
     estimates = dict(zip(used, means, strict=True))
-    several = any(len(known[x]) > 1 for x in used)
+    has_repeats = any(len(estimates_by_x[x]) > 1 for x in used)
     points = tuple(
         _build_point(x, column.entries[x], estimates.get(x)) for x in sorted(column.entries)
     )
     bounds = column.lower, column.upper
-    return TrendQuantity(name, column.unit, column.kind, points, ratio if several else None, bounds)
+    return TrendQuantity(
+        name, column.unit, column.kind, points, ratio if has_repeats else None, bounds
+    )
 
 
-def _to_estimate(one: _RunEstimate) -> TrendEstimate | None:
-    if one.value is None or not one.stderr or not one.stderr > 0:
+def _to_estimate(entry: _RunEstimate) -> TrendEstimate | None:
+    if entry.value is None or not entry.stderr or not entry.stderr > 0:
         return None
-    return TrendEstimate(float(one.value), float(one.stderr))
+    return TrendEstimate(float(entry.value), float(entry.stderr))
 
 
 def _build_point(
     x: float, entries: Sequence[_RunEstimate], estimate: TrendEstimate | None
 ) -> TrendPoint:
-    states = list(dict.fromkeys(one.status for one in entries))
-    values = [one.value for one in entries if one.value is not None]
+    states = list(dict.fromkeys(entry.status for entry in entries))
+    values = [entry.value for entry in entries if entry.value is not None]
     value = sum(values) / len(values) if values else None
     return TrendPoint(
         x,
-        tuple(one.run for one in entries),
+        tuple(entry.run for entry in entries),
         ", ".join(states),
         estimate,
         value if estimate is None else estimate.value,
@@ -194,23 +204,23 @@ def to_label_out(
     x: float,
     rows: Sequence[TrendRow],
     datasets: Mapping[str, Sequence[str]],
-    known: DatasetChannels,
+    dataset_channels: DatasetChannels,
     channels: Mapping[str, str],
 ) -> BatchLabelOut:
     """Describe all runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
-        for one in row.agreement["estimation"]:
-            low, high = one["span"]
+        for metrics in row.agreement["estimation"]:
+            low, high = metrics["span"]
             if low is None or high is None:
                 continue
-            channel = channels.get(one["output"], one["output"])
-            unit = _find_unit(known, datasets.get(row.id, ()), channel, one["unit"])
-            before = spans.get(one["output"])
+            channel = channels.get(metrics["output"], metrics["output"])
+            unit = _find_unit(dataset_channels, datasets.get(row.id, ()), channel, metrics["unit"])
+            before = spans.get(metrics["output"])
             if before is not None:
                 low, high = min(low, before.lower), max(high, before.upper)
-            spans[one["output"]] = SpanOut(
-                output=one["output"], channel=channel, unit=unit, lower=low, upper=high
+            spans[metrics["output"]] = SpanOut(
+                output=metrics["output"], channel=channel, unit=unit, lower=low, upper=high
             )
     return BatchLabelOut(
         x=x,
@@ -222,7 +232,11 @@ def to_label_out(
 
 
 def _find_unit(
-    known: DatasetChannels, datasets: Sequence[str], channel: str, otherwise: str
+    dataset_channels: DatasetChannels, datasets: Sequence[str], channel: str, otherwise: str
 ) -> str:
-    units = [known[one][channel]["unit"] for one in datasets if channel in known.get(one, {})]
+    units = [
+        dataset_channels[dataset][channel]["unit"]
+        for dataset in datasets
+        if channel in dataset_channels.get(dataset, {})
+    ]
     return next((unit for unit in units if unit != "1"), otherwise)

@@ -22,7 +22,7 @@ _NO_VALUE = "none"
 
 
 def describe_differences(
-    session: Session, run: Run, bodies: Sequence[JobBody], known: DatasetChannels
+    session: Session, run: Run, bodies: Sequence[JobBody], dataset_channels: DatasetChannels
 ) -> str:
     """Describe settings of a reference run that differ from those of a batch; empty if none do.
 
@@ -34,39 +34,46 @@ def describe_differences(
         Channels of their datasets.
     """
     body = load_run(session, run.id).body
-    theirs = _collect_facts(session, body, read_channels(session, set(body["datasets"])))
-    told: dict[str, None] = {}
-    for ours in _list_distinct_facts(session, bodies, known):
-        for name in dict.fromkeys([*theirs, *ours]):
-            one, other = theirs.get(name, _NO_VALUE), ours.get(name, _NO_VALUE)
-            if one != other:
-                told[f"{name} = {one} (here {other})"] = None
-    return f"the reference was made with {', '.join(told)}" if told else ""
+    reference_facts = _collect_facts(session, body, read_channels(session, set(body["datasets"])))
+    differences: dict[str, None] = {}
+    for facts in _list_distinct_facts(session, bodies, dataset_channels):
+        for name in dict.fromkeys([*reference_facts, *facts]):
+            reference_value, value = (
+                reference_facts.get(name, _NO_VALUE),
+                facts.get(name, _NO_VALUE),
+            )
+            if reference_value != value:
+                differences[f"{name} = {reference_value} (here {value})"] = None
+    return f"the reference was made with {', '.join(differences)}" if differences else ""
 
 
 def read_channels(session: Session, datasets: set[str]) -> DatasetChannels:
     """Read the channels of datasets, by name."""
-    found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
-    return {one.id: {channel["name"]: channel for channel in one.channels} for one in found}
+    datasets_found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
+    return {
+        dataset.id: {channel["name"]: channel for channel in dataset.channels}
+        for dataset in datasets_found
+    }
 
 
 def _list_distinct_facts(
-    session: Session, bodies: Sequence[JobBody], known: DatasetChannels
+    session: Session, bodies: Sequence[JobBody], dataset_channels: DatasetChannels
 ) -> Iterator[RunFacts]:
     """Iterate over the distinct settings of a batch."""
-    told: set[str] = set()
+    seen: set[str] = set()
     for body in bodies:
         settings = {name: body[name] for name in _COMPARED_FIELDS}
         kinds = [
             sorted(
-                (one["name"], one["unit"], one["hold"]) for one in known.get(dataset, {}).values()
+                (channel_row["name"], channel_row["unit"], channel_row["hold"])
+                for channel_row in dataset_channels.get(dataset, {}).values()
             )
             for dataset in body["datasets"]
         ]
         key = repr((settings, kinds))
-        if key not in told:
-            told.add(key)
-            yield _collect_facts(session, body, known)
+        if key not in seen:
+            seen.add(key)
+            yield _collect_facts(session, body, dataset_channels)
 
 
 _COMPARED_FIELDS = (
@@ -82,25 +89,29 @@ _COMPARED_FIELDS = (
 )
 
 
-def _collect_facts(session: Session, body: JobBody, known: DatasetChannels) -> RunFacts:
+def _collect_facts(session: Session, body: JobBody, dataset_channels: DatasetChannels) -> RunFacts:
     """Describe the settings that an estimate depends on, besides the data."""
     try:
         model, _ = models.resolve_model(session, body["model"])
     except UnknownModel:
         return {}  # no longer in the catalogue
     inputs, outputs = list_signals(model)
-    found = {"model": model.name}
+    facts = {"model": model.name}
     for signal in (*inputs, *outputs):
         channel = body["channels"].get(signal, signal)
-        stored = [known[one][channel] for one in body["datasets"] if channel in known.get(one, {})]
-        found[signal] = channel
-        found[f"unit of {signal}"] = ", ".join(_list_distinct(one["unit"] for one in stored))
+        stored = [
+            dataset_channels[dataset][channel]
+            for dataset in body["datasets"]
+            if channel in dataset_channels.get(dataset, {})
+        ]
+        facts[signal] = channel
+        facts[f"unit of {signal}"] = ", ".join(_list_distinct(row["unit"] for row in stored))
         if signal in inputs:
-            given = body["hold"].get(signal)
-            held = [given or one["hold"] for one in stored]
-            found[f"hold of {signal}"] = ", ".join(_list_distinct(held))
+            hold = body["hold"].get(signal)
+            held = [hold or row["hold"] for row in stored]
+            facts[f"hold of {signal}"] = ", ".join(_list_distinct(held))
     return {
-        **found,
+        **facts,
         **dict(_describe_settings(body)),
         **dict(_describe_fixed_parameters(model, body)),
     }
@@ -129,10 +140,10 @@ def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
 
 def _describe_fixed_parameters(model: Model, body: JobBody) -> Iterator[tuple[str, str]]:
     """Describe the parameters that are not estimated."""
-    own = {one.name for one in model.parameters}
-    changes = {name: one for name, one in body["parameters"].items() if name in own}
-    for one in override_parameters(model.parameters, changes):
-        if one.fixed is not None:
-            yield one.name, f"{one.fixed:g}, fixed"
-        elif one.tied is not None:
-            yield one.name, f"{one.tied}, tied"
+    names = {parameter.name for parameter in model.parameters}
+    changes = {name: change for name, change in body["parameters"].items() if name in names}
+    for parameter in override_parameters(model.parameters, changes):
+        if parameter.fixed is not None:
+            yield parameter.name, f"{parameter.fixed:g}, fixed"
+        elif parameter.tied is not None:
+            yield parameter.name, f"{parameter.tied}, tied"

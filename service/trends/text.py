@@ -84,83 +84,102 @@ class TrendTables(NamedTuple):
 def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
     """Build the tables of a trend. Quantities without any value are left out."""
     shown: list[QuantityDocument] = [
-        one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
+        quantity
+        for quantity in trend["quantities"]
+        if any(p["value"] is not None for p in quantity["points"])
     ]
     return TrendTables(
-        headings=[append_unit(one["name"], one["unit"]) for one in shown],
-        rows=[_place_row(place, shown, style) for place in trend["places"]],
+        headings=[append_unit(quantity["name"], quantity["unit"]) for quantity in shown],
+        rows=[_place_row(label_runs, shown, style) for label_runs in trend["places"]],
         laws=[
             LawRow(
-                one["name"],
-                format_law(one["name"], law, trend["x"], style),
+                quantity["name"],
+                format_law(quantity["name"], law, trend["x"], style),
                 law["aic"],
                 law["birge"],
                 law["is_chosen"],
             )
-            for one in shown
-            for law in one["laws"]
+            for quantity in shown
+            for law in quantity["laws"]
         ],
-        predictions=[_prediction_row(one, at, style) for one in shown for at in one["predictions"]],
-        reasons=[(one["name"], one["reason"]) for one in shown if one["reason"]],
+        predictions=[
+            _prediction_row(quantity, prediction, style)
+            for quantity in shown
+            for prediction in quantity["predictions"]
+        ],
+        reasons=[
+            (quantity["name"], quantity["reason"]) for quantity in shown if quantity["reason"]
+        ],
     )
 
 
-def _place_row(place: dict[str, Any], quantities: list[QuantityDocument], style: Style) -> PlaceRow:
-    points = [next((p for p in one["points"] if p["x"] == place["x"]), None) for one in quantities]
+def _place_row(
+    label_runs: dict[str, Any], quantities: list[QuantityDocument], style: Style
+) -> PlaceRow:
+    points = [
+        next((p for p in quantity["points"] if p["x"] == label_runs["x"]), None)
+        for quantity in quantities
+    ]
     return PlaceRow(
-        x_text=style.label(place["x"]),
+        x_text=style.label(label_runs["x"]),
         cells=[
             DASH if p is None or p["value"] is None else style.estimate(p["value"], p["stderr"])
             for p in points
         ],
-        span_text="; ".join(map(format_span, place["spans"])) or DASH,
-        evaluations=place["evaluations"],
-        flags=list_flags(place, quantities),
-        runs=place["runs"],
+        span_text="; ".join(map(format_span, label_runs["spans"])) or DASH,
+        evaluations=label_runs["evaluations"],
+        flags=list_flags(label_runs, quantities),
+        runs=label_runs["runs"],
     )
 
 
-def _prediction_row(one: QuantityDocument, at: dict[str, Any], style: Style) -> PredictionRow:
-    name, x = str(one["name"]), style.label(at["x"])
-    if at["value"] is None or at["lower"] is None:
+def _prediction_row(
+    quantity: QuantityDocument, prediction: dict[str, Any], style: Style
+) -> PredictionRow:
+    name, x = str(quantity["name"]), style.label(prediction["x"])
+    if prediction["value"] is None or prediction["lower"] is None:
         return PredictionRow(name, x, DASH, DASH, "the law is not defined here")
-    interval = style.between.join(style.number(at[end]) for end in ("lower", "upper"))
-    unit = style.unit(one["unit"])
-    remark = "extrapolated" if at["is_outside"] else ""
-    return PredictionRow(name, x, style.number(at["value"]) + unit, interval + unit, remark)
+    interval = style.between.join(style.number(prediction[end]) for end in ("lower", "upper"))
+    unit = style.unit(quantity["unit"])
+    remark = "extrapolated" if prediction["is_outside"] else ""
+    return PredictionRow(name, x, style.number(prediction["value"]) + unit, interval + unit, remark)
 
 
-def list_flags(place: dict[str, Any], quantities: list[QuantityDocument]) -> list[str]:
+def list_flags(label_runs: dict[str, Any], quantities: list[QuantityDocument]) -> list[str]:
     """List the findings that need attention in the runs of one label."""
-    found = []
-    for one in quantities:
-        for point in one["points"]:
-            if point["x"] == place["x"]:
-                found += [f"{one['name']} {text}" for text in _list_point_flags(point)]
-    separable = [text for text in place["warnings"] if "not separable" in text]
-    return found + [text.partition(":")[0].partition(" (")[0] for text in separable]
+    flags = []
+    for quantity in quantities:
+        for point in quantity["points"]:
+            if point["x"] == label_runs["x"]:
+                flags += [f"{quantity['name']} {text}" for text in _list_point_flags(point)]
+    separable = [text for text in label_runs["warnings"] if "not separable" in text]
+    return flags + [text.partition(":")[0].partition(" (")[0] for text in separable]
 
 
 def _list_point_flags(point: dict[str, Any]) -> list[str]:
-    found = [word for word in point["status"].split(", ") if word not in USUAL_STATUSES]
+    flags = [word for word in point["status"].split(", ") if word not in USUAL_STATUSES]
     if point["is_outlier"]:
-        found.append(f"outlier (p = {point['p_value']:.2g})")
+        flags.append(f"outlier (p = {point['p_value']:.2g})")
     for drift in point["drifts"]:
         if drift["drifted"]:
-            whom = "the reference" if drift["kind"] == "run" else "the reference's trend"
-            found.append(f"drifted from {whom} (z = {drift['z']:+.1f}, limit {drift['limit']:.1f})")
-    return found
+            reference = "the reference" if drift["kind"] == "run" else "the reference's trend"
+            flags.append(
+                f"drifted from {reference} (z = {drift['z']:+.1f}, limit {drift['limit']:.1f})"
+            )
+    return flags
 
 
 def format_limits(quantities: list[QuantityDocument]) -> str:
     """Describe the z at which drift is flagged; empty if nothing is compared."""
-    found: dict[str, dict[str, None]] = {}
-    for one in quantities:
-        for drift in (drift for point in one["points"] for drift in point["drifts"]):
+    limits: dict[str, dict[str, None]] = {}
+    for quantity in quantities:
+        for drift in (drift for point in quantity["points"] for drift in point["drifts"]):
             against = "the reference's trend" if drift["kind"] == "trend" else "the reference run"
-            found.setdefault(f"{drift['limit']:.1f} against {against}", {})[one["name"]] = None
-    told = "; ".join(f"{limit} ({', '.join(names)})" for limit, names in found.items())
-    return f"drift is flagged where z, in standard errors, exceeds {told}" if told else ""
+            limits.setdefault(f"{drift['limit']:.1f} against {against}", {})[quantity["name"]] = (
+                None
+            )
+    text = "; ".join(f"{limit} ({', '.join(names)})" for limit, names in limits.items())
+    return f"drift is flagged where z, in standard errors, exceeds {text}" if text else ""
 
 
 def format_reference(trend: dict[str, Any]) -> str:
@@ -170,32 +189,36 @@ def format_reference(trend: dict[str, Any]) -> str:
     return " ".join(filter(None, (names, f"({label})" if label else "")))
 
 
-def format_span(one: dict[str, Any]) -> str:
+def format_span(span: dict[str, Any]) -> str:
     """Format the range of an output, with the channel's name if it has no unit."""
-    unit = plain_unit(one["unit"]) or f" ({one['channel']})"
-    return f"{one['lower']:.6g} to {one['upper']:.6g}{unit}"
+    unit = plain_unit(span["unit"]) or f" ({span['channel']})"
+    return f"{span['lower']:.6g} to {span['upper']:.6g}{unit}"
 
 
 def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
     """Format a law with its coefficients and their standard errors."""
-    known = {
-        one["name"]: f"({style.estimate(one['value'], one['stderr'])})"
-        for one in law["coefficients"]
+    coefficients = {
+        coefficient["name"]: f"({style.estimate(coefficient['value'], coefficient['stderr'])})"
+        for coefficient in law["coefficients"]
     }
-    a, b = known["a"], known["b"]
+    a, b = coefficients["a"], coefficients["b"]
     text = f"{a} + {b}·{x}" if law["law"] == "line" else f"{a}·{x}^{b}"
     return f"{name} = {text}"
 
 
 def list_notes(trend: dict[str, Any]) -> list[str]:
     """List all notes on the numbers."""
-    found = [f"{one['name']}: {text}" for one in trend["quantities"] for text in one["notes"]]
+    notes = [
+        f"{quantity['name']}: {text}"
+        for quantity in trend["quantities"]
+        for text in quantity["notes"]
+    ]
     by_text: dict[str, list[str]] = {}
-    for place in trend["places"]:
-        for text in place["warnings"]:
-            by_text.setdefault(text, []).append(f"{place['x']:g}")
-    found += [f"{trend['x']} {', '.join(at)}: {text}" for text, at in by_text.items()]
+    for label_runs in trend["places"]:
+        for text in label_runs["warnings"]:
+            by_text.setdefault(text, []).append(f"{label_runs['x']:g}")
+    notes += [f"{trend['x']} {', '.join(values)}: {text}" for text, values in by_text.items()]
     if trend["missing"]:
-        found.append(f"{trend['missing']} runs failed or have not ended. They are not in the table")
+        notes.append(f"{trend['missing']} runs failed or have not ended. They are not in the table")
     limits = format_limits(trend["quantities"])
-    return [*found, *trend["notes"], *([limits] if limits else [])]
+    return [*notes, *trend["notes"], *([limits] if limits else [])]

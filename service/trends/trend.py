@@ -58,33 +58,38 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
         raise Conflict(
             f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
-    asked = job.spec["trend"]
-    places, found = _collect_quantities(session, job)
+    request = job.spec["trend"]
+    places, quantities = _collect_quantities(session, job)
     bodies = {
         row.id: build_run_body(job.spec, row.cell) for rows in places.values() for row in rows
     }
     datasets = {run: body["datasets"] for run, body in bodies.items()}
-    known = read_channels(session, {one for many in datasets.values() for one in many})
-    reference = _load_reference(session, job, asked.get("reference"))
-    told = [_to_quantity_out(one, asked["predict"], reference, found) for one in found]
-    theirs = "" if reference is None else read_noise_model(reference.run.result or {})
-    notes = [describe_noise_models(asked["x"], places, theirs)]
+    channels = read_channels(session, {dataset for many in datasets.values() for dataset in many})
+    reference = _load_reference(session, job, request.get("reference"))
+    answers = [
+        _to_quantity_out(quantity, request["predict"], reference, quantities)
+        for quantity in quantities
+    ]
+    reference_noise_model = (
+        "" if reference is None else read_noise_model(reference.run.result or {})
+    )
+    notes = [describe_noise_models(request["x"], places, reference_noise_model)]
     if reference is not None:
         notes += [
-            reference.explain_gaps(asked["x"], places),
-            describe_differences(session, reference.run, list(bodies.values()), known),
+            reference.explain_gaps(request["x"], places),
+            describe_differences(session, reference.run, list(bodies.values()), channels),
         ]
     return TrendOut(
         job=job.id,
-        x=asked["x"],
+        x=request["x"],
         reference=None if reference is None else reference.run.id,
         reference_x=None if reference is None else reference.x,
         reference_names=[] if reference is None else list(reference.names),
         places=[
-            to_label_out(x, rows, datasets, known, bodies[rows[0].id]["channels"])
+            to_label_out(x, rows, datasets, channels, bodies[rows[0].id]["channels"])
             for x, rows in places.items()
         ],
-        quantities=told,
+        quantities=answers,
         missing=job.n_runs - count_succeeded(session, job.id),
         notes=[note for note in notes if note],
     )
@@ -97,9 +102,9 @@ def _collect_quantities(
         raise InvalidRequest.from_fault(
             "", f"{job.id} has {job.n_runs} runs; a trend may have at most {MOST_RUNS}"
         )
-    asked = job.spec["trend"]
-    places = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), asked["x"])
-    return places, build_quantities(places, asked["parameters"])
+    request = job.spec["trend"]
+    places = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), request["x"])
+    return places, build_quantities(places, request["parameters"])
 
 
 def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchReference | None:
@@ -107,50 +112,50 @@ def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchRefe
     if run_id is None:
         return None
     run = RunRepository(session).get(run_id)
-    theirs = JobRepository(session).get(run.job_id)
+    reference_job = JobRepository(session).get(run.job_id)
     x = job.spec["trend"]["x"]
     label = run.labels.get(x)
-    at = float(label) if isinstance(label, int | float) else None
+    x_value = float(label) if isinstance(label, int | float) else None
     names = tuple(list_reference_names(session, run.id))
-    why = _explain_missing_trend(theirs, x)
+    why = _explain_missing_trend(reference_job, x)
     if why:
-        return BatchReference(run, at, why_no_trend=why, names=names)
-    _, known = _collect_quantities(session, theirs)
-    trends = {one.name: (_fit_quantity(one, ()), one) for one in known}
-    return BatchReference(run, at, trends, names=names)
+        return BatchReference(run, x_value, why_no_trend=why, names=names)
+    _, quantities = _collect_quantities(session, reference_job)
+    trends = {quantity.name: (_fit_quantity(quantity, ()), quantity) for quantity in quantities}
+    return BatchReference(run, x_value, trends, names=names)
 
 
-def _explain_missing_trend(theirs: Job, x: str) -> str:
+def _explain_missing_trend(reference_job: Job, x: str) -> str:
     """Explain why the reference's job has no comparable trend over x; empty if it has one."""
-    if not has_trend(theirs):
+    if not has_trend(reference_job):
         return "its job has no trend"
-    if theirs.spec["trend"]["x"] != x:
-        return f"the trend of its job is over {theirs.spec['trend']['x']!r}"
-    if theirs.n_runs > MOST_RUNS:
+    if reference_job.spec["trend"]["x"] != x:
+        return f"the trend of its job is over {reference_job.spec['trend']['x']!r}"
+    if reference_job.n_runs > MOST_RUNS:
         return (
-            f"the reference batch {theirs.id} has {theirs.n_runs} runs (a trend may have at most "
-            f"{MOST_RUNS})"
+            f"the reference batch {reference_job.id} has {reference_job.n_runs} runs (a trend may "
+            f"have at most {MOST_RUNS})"
         )
     return ""
 
 
-def _fit_quantity(one: TrendQuantity, predict: Sequence[float]) -> Trend:
-    used = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
+def _fit_quantity(quantity: TrendQuantity, predict: Sequence[float]) -> Trend:
+    used = [(point.x, point.estimate) for point in quantity.points if point.estimate is not None]
     return fit_trend(
         [x for x, _ in used], [e.value for _, e in used], [e.stderr for _, e in used], predict
     )
 
 
 def _to_quantity_out(
-    one: TrendQuantity,
+    quantity: TrendQuantity,
     predict: Sequence[float],
     reference: BatchReference | None,
     all_: Sequence[TrendQuantity],
 ) -> QuantityOut:
-    fitted = _fit_quantity(one, predict)
+    fitted = _fit_quantity(quantity, predict)
     influences = iter(fitted.influences)
     n = sum(point.estimate is not None for other in all_ for point in other.points)
-    drifts = compare_with_reference(one, reference, n)
+    drifts = compare_with_reference(quantity, reference, n)
     points = [
         _to_point_out(
             point,
@@ -158,17 +163,17 @@ def _to_quantity_out(
             drifts.get(point.x, []),
             bool(fitted.laws),
         )
-        for point in one.points
+        for point in quantity.points
     ]
     return QuantityOut.from_source(
-        one,
+        quantity,
         points=points,
-        between_runs=one.between_runs,
+        between_runs=quantity.between_runs,
         laws=[_to_law_out(law, law is fitted.best_law) for law in fitted.laws],
         reason=fitted.reason,
-        band=[LawPointOut.from_source(at) for at in fitted.band],
-        predictions=[LawPointOut.from_source(at) for at in fitted.predictions],
-        notes=describe_quantity(one, fitted),
+        band=[LawPointOut.from_source(law_point) for law_point in fitted.band],
+        predictions=[LawPointOut.from_source(law_point) for law_point in fitted.predictions],
+        notes=describe_quantity(quantity, fitted),
     )
 
 
@@ -192,5 +197,7 @@ def _to_law_out(law: TrendLaw, is_chosen: bool) -> LawOut:
         law=law.kind,
         formula=FORMULAS[law.kind],
         is_chosen=is_chosen,
-        coefficients=[dict(zip(names, one, strict=True)) for one in law.coefficients],
+        coefficients=[
+            dict(zip(names, coefficient, strict=True)) for coefficient in law.coefficients
+        ],
     )
