@@ -1,1 +1,1 @@
-"""Errors, types, settings, threads, JIT and code cache, units: what everything may use."""
+"""Foundations of the numerical core: errors, types, settings, threads, code cache, units."""

@@ -1,7 +1,8 @@
-"""Machine code on disk, in a folder private to the user, because what lies there is run.
+"""Cache of machine code on disk.
 
-Each file holds a digest. One that is damaged or that somebody else owns is made again; a folder
-that cannot be used costs time only, and is told of once in a process.
+The folder is private to the user, because its content is executed. Each file holds a digest. A
+file that is damaged or belongs to another user is compiled again. An unusable folder costs time
+only and is logged once in a process.
 """
 
 import contextlib
@@ -15,20 +16,20 @@ from pathlib import Path
 from typing import Literal
 
 CodeKind = Literal["o", "loop"]
-"""Object code of kernels, or loops that Numba compiled."""
+"""Object code of a kernel (``o``), or a function compiled by Numba (``loop``)."""
 
 _MAGIC = b"lagid-kernel-1\n"
 _DIGEST_SIZE = 32
 _MAX_FILES = 2_000
-"""Each update of lagid leaves some fifty behind; those not used for the longest time go."""
+"""Each update of lagid adds about fifty files; the least recently used are removed."""
 _CACHE_FILE_NAME = re.compile(r"[0-9a-f]{64}\.(o|loop)")
-_ADVICE = "set LAGID_CACHE_DIR to a folder that this user alone can write to"
+_ADVICE = "set LAGID_CACHE_DIR to a folder that only this user can write to"
 _log = logging.getLogger(__name__)
 _logged_reasons: list[str] = []
 
 
 def digest_files(paths: Iterable[Path], root: Path) -> str:
-    """SHA-256 of some files below `root`: of their places there and of what they hold.
+    """Compute the SHA-256 digest of files below `root`: their relative paths and contents.
 
     Raises
     ------
@@ -43,16 +44,16 @@ def digest_files(paths: Iterable[Path], root: Path) -> str:
 
 
 def find_cache_folder() -> Path:
-    """Folder of compiled code: `LAGID_CACHE_DIR`, or ``~/.cache/lagid``.
+    """Return the folder of compiled code: `LAGID_CACHE_DIR`, or ``~/.cache/lagid``.
 
     Raises
     ------
     OSError
-        If the user has no home.
+        If the user has no home folder.
     """
-    chosen = os.environ.get("LAGID_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
+    configured = os.environ.get("LAGID_CACHE_DIR")
+    if configured:
+        return Path(configured)
     base = os.environ.get("XDG_CACHE_HOME")
     if base:
         return Path(base) / "lagid"
@@ -63,13 +64,13 @@ def find_cache_folder() -> Path:
 
 
 def _find_code_folder(kind: CodeKind) -> Path:
-    """Where a kind is kept: as Numba's own cache, loops follow `NUMBA_CACHE_DIR` if it is set."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(chosen) if chosen and kind == "loop" else find_cache_folder()
+    """Return the folder of one kind of code; loops follow `NUMBA_CACHE_DIR`, as in Numba."""
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(configured) if configured and kind == "loop" else find_cache_folder()
 
 
 def load_code(key: str, kind: CodeKind = "o") -> bytes | None:
-    """Code kept under a key; None if there is none that can be trusted."""
+    """Load the code stored under a key; None if there is none that can be trusted."""
     name = f"{key}.{kind}"
     try:
         folder = _find_code_folder(kind)
@@ -79,8 +80,8 @@ def load_code(key: str, kind: CodeKind = "o") -> bytes | None:
             if _belongs_to_another(os.fstat(file.fileno())):
                 return None
             content = file.read()
-        with contextlib.suppress(OSError):  # in a folder that may only be read
-            os.utime(folder / name)  # what is used stays the longest
+        with contextlib.suppress(OSError):  # the folder may be read-only
+            os.utime(folder / name)  # marks the file as recently used
     except OSError:
         return None
     start = len(_MAGIC) + _DIGEST_SIZE
@@ -92,21 +93,21 @@ def load_code(key: str, kind: CodeKind = "o") -> bytes | None:
 
 
 def store_code(key: str, code: bytes, kind: CodeKind = "o") -> None:
-    """Keep code under a key, whole or not at all; a folder that cannot be used is no error."""
+    """Store code under a key, atomically; an unusable folder is logged, not raised."""
     folder = None
     try:
         folder = _find_code_folder(kind)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _is_private(folder):
             warn_not_cached(
-                f"{folder} belongs to another user, or others may write to it; {_ADVICE}"
+                f"{folder} belongs to another user, or other users may write to it; {_ADVICE}"
             )
             return
         _write_file(folder, f"{key}.{kind}", code)
         _prune_files(folder)
     except OSError as error:
-        why = error if folder is None else f"{folder}: {error.strerror}"
-        warn_not_cached(f"{why}; {_ADVICE}")
+        reason = error if folder is None else f"{folder}: {error.strerror}"
+        warn_not_cached(f"{reason}; {_ADVICE}")
 
 
 def _write_file(folder: Path, name: str, code: bytes) -> None:
@@ -120,11 +121,11 @@ def _write_file(folder: Path, name: str, code: bytes) -> None:
         raise
 
 
-def warn_not_cached(why: str) -> None:
-    """Log why compiled code is not kept, once in a process."""
+def warn_not_cached(reason: str) -> None:
+    """Log why compiled code is not cached, once in a process."""
     if not _logged_reasons:
-        _logged_reasons.append(why)
-        _log.warning("compiled code is not kept, so every process compiles it anew: %s", why)
+        _logged_reasons.append(reason)
+        _log.warning("compiled code is not cached, so every process compiles it again: %s", reason)
 
 
 def _compute_digest(name: str, code: bytes) -> bytes:
@@ -136,7 +137,7 @@ def _belongs_to_another(status: os.stat_result) -> bool:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether nobody else may write there."""
+    """Whether only this user may write to the folder."""
     if not hasattr(os, "getuid"):
         return True
     status = folder.stat()
@@ -144,14 +145,14 @@ def _is_private(folder: Path) -> bool:
 
 
 def _prune_files(folder: Path) -> None:
-    """Remove the files beyond the most that are kept; other processes may do so meanwhile."""
-    files = [one.path for one in os.scandir(folder) if _CACHE_FILE_NAME.fullmatch(one.name)]
+    """Remove the oldest files beyond `_MAX_FILES`; other processes may do the same meanwhile."""
+    files = [entry.path for entry in os.scandir(folder) if _CACHE_FILE_NAME.fullmatch(entry.name)]
     if len(files) <= _MAX_FILES:
         return
-    used = []
+    dated = []
     for path in files:
         with contextlib.suppress(FileNotFoundError):
-            used.append((os.stat(path).st_mtime_ns, path))
-    for _, path in sorted(used)[: len(used) - _MAX_FILES]:
+            dated.append((os.stat(path).st_mtime_ns, path))
+    for _, path in sorted(dated)[: len(dated) - _MAX_FILES]:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)

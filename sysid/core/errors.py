@@ -1,17 +1,17 @@
-"""Every error the numerical core raises on purpose.
+"""Errors that the numerical core raises on purpose.
 
 * SysidError
     - InvalidBounds        a parameter's search interval is empty or not finite
-    - InvalidModel         a model document has faults (each with its place)
+    - InvalidModel         a model document has faults (each with its pointer)
     - UnknownModel         no built-in model has that name
     - InvalidRecord        a recording cannot be used: channels, times or values
     - RecordTooShort       a record is shorter than the model's memory
-    - InvalidSettings      a setting of the search or of the problem is not usable
-    - DivergedEverywhere   no candidate of a search gave a finite simulation
+    - InvalidSettings      a setting of the search or of the problem is invalid
+    - DivergedEverywhere   every candidate of a search diverged
     - NothingIdentifiable  no free parameter has an effect on the output
 
-A message says what was wrong, what was found, and what would be right. Numerical kernels never
-raise: they return ``nan`` or ``inf``, and the caller decides.
+A message says what was wrong, what was read, and what would be right. Numerical kernels never
+raise. They return ``nan`` or ``inf``, and the caller decides.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 _MAX_NAMES = 30
-"""Known names that a message lists at most: of datasets there may be thousands."""
+"""Most valid names that a message lists; there may be thousands of datasets."""
 
 
 class SysidError(Exception):
@@ -37,14 +37,14 @@ class InvalidBounds(SysidError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong with a document.
+    """A fault of a document.
 
     Attributes
     ----------
     pointer : str
         JSON pointer of the field, such as ``/equations/v``.
     detail : str
-        What was wrong, what was found, what would be right.
+        What was wrong, what was read, and what would be right.
     column : int or None
         Column (from 1) inside the text of the field, for equations.
     """
@@ -54,8 +54,8 @@ class Fault:
     column: int | None = None
 
     def __str__(self) -> str:
-        place = self.pointer if self.column is None else f"{self.pointer}, column {self.column}"
-        return f"{place}: {self.detail}" if place else self.detail
+        location = self.pointer if self.column is None else f"{self.pointer}, column {self.column}"
+        return f"{location}: {self.detail}" if location else self.detail
 
 
 class InvalidModel(SysidError, ValueError):
@@ -69,8 +69,8 @@ class InvalidModel(SysidError, ValueError):
 class UnknownModel(SysidError, LookupError):
     """No built-in model has that name."""
 
-    def __init__(self, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"there is no model {name!r}{suggest_name(name, known)}")
+    def __init__(self, name: str, valid: Iterable[str]) -> None:
+        super().__init__(f"there is no model {name!r}{suggest_name(name, valid)}")
         self.name = name
 
 
@@ -84,16 +84,16 @@ class RecordTooShort(SysidError, ValueError):
     def __init__(
         self, duration: float, needed: float, what: str, why: str = "", cure: str = ""
     ) -> None:
-        because = f" ({why})" if why else ""
+        reason = f" ({why})" if why else ""
         super().__init__(
-            f"the record lasts {duration:g} s, but {what} needs more than {needed:g} s{because}; "
+            f"the record lasts {duration:g} s, but {what} needs more than {needed:g} s{reason}; "
             f"give {cure or 'a longer record'}"
         )
         self.duration, self.needed = duration, needed
 
 
 class InvalidSettings(SysidError, ValueError):
-    """A setting of the search or of the problem is not usable."""
+    """A setting of the search or of the problem is invalid."""
 
     def __init__(self, pointer: str, detail: str) -> None:
         super().__init__(f"{pointer}: {detail}")
@@ -105,8 +105,8 @@ class DivergedEverywhere(SysidError, ArithmeticError):
 
     def __init__(self, evaluations: int) -> None:
         super().__init__(
-            f"the model diverged for every one of {evaluations} candidates inside the bounds; "
-            "narrow the bounds, use a smaller step or check the equations and units"
+            f"the model diverged for every one of {evaluations} candidates inside the bounds. "
+            "Narrow the bounds, use a smaller step, or check the equations and units."
         )
         self.evaluations = evaluations
 
@@ -116,27 +116,27 @@ class NothingIdentifiable(SysidError, ValueError):
 
     def __init__(self, names: Iterable[str]) -> None:
         super().__init__(
-            f"none of {', '.join(names)} has an effect on the output in these data; look at the "
-            "inputs: one that is zero excites nothing"
+            f"none of {', '.join(names)} has an effect on the output in these data. Check the "
+            "inputs: an input that is always zero excites nothing."
         )
 
 
-def suggest_name(name: str, known: Iterable[str]) -> str:
-    """Suggestion to add to a message about an unknown name: the nearest known one, or the first."""
-    names = sorted(known)
+def suggest_name(name: str, valid: Iterable[str]) -> str:
+    """Suggest valid names for an unknown one: the nearest, else the first ones."""
+    names = sorted(valid)
     close = get_close_matches(name, names, n=1)
     if close:
         return f"; did you mean {close[0]!r}?"
     left = len(names) - _MAX_NAMES
-    more = f", and {left} more" if left > 0 else ""
-    return f"; known are {', '.join(names[:_MAX_NAMES])}{more}" if names else ""
+    rest = f", and {left} more" if left > 0 else ""
+    return f"; known are {', '.join(names[:_MAX_NAMES])}{rest}" if names else ""
 
 
 def join_pointer(*parts: str | int) -> str:
-    """JSON pointer (RFC 6901) of nested fields and entries of lists."""
+    """Join fields and list indices to a JSON pointer (RFC 6901)."""
     return "".join("/" + str(part).replace("~", "~0").replace("/", "~1") for part in parts)
 
 
 def split_pointer(pointer: str) -> list[str]:
-    """The parts that `join_pointer` joined, as text."""
+    """Split a JSON pointer into the parts that `join_pointer` joined, as text."""
     return [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]

@@ -1,12 +1,12 @@
-"""Compiled functions that are kept on disk until any source of compiled code changes.
+"""Just-in-time compilation with a disk cache that any change of the sources invalidates.
 
-Numba's own cache keys a function by its own file only. A compiled function contains those that it
-calls, so after an update of another file the old machine code would run on, silently. Here the
-key holds a digest of all the files that compiled functions come from, and the code lies where
-kernels lie (`sysid.core.code_cache`): private, whole, with a digest.
+Numba's own cache keys a function by its own file only. A compiled function contains the functions
+that it calls. After an update of another file the old machine code would silently run on. Here
+the key holds a digest of all files with compiled functions. The code is stored with the kernels
+(`sysid.core.code_cache`): private, atomically written, with a digest.
 
-What a compiled function consists of is known only to Numba's insides. Where these are not as
-expected, functions are compiled as without a cache and the log says so.
+The cache uses internals of Numba. If these are not as expected, functions are compiled without a
+cache and a warning is logged.
 """
 
 import pickle
@@ -54,18 +54,18 @@ def _digest_sources() -> str:
     return digest_files((f for pattern in _SOURCE_PATTERNS for f in package.glob(pattern)), package)
 
 
-# Read before any module with a compiled function is loaded, all of which load this one first.
+# Computed before any module with a compiled function is loaded: all of them import this one.
 _SOURCES_DIGEST = _digest_sources()
 
 
 def get_sources_digest() -> str:
-    """Digest of the sources of all compiled functions, as this process began with them."""
+    """Return the digest of the sources of all compiled functions at the start of this process."""
     return _SOURCES_DIGEST
 
 
 @cache
 def _digest_file(source: str) -> str | None:
-    """Digest of a file, None if there is none."""
+    """Digest of a file; None if it cannot be read."""
     try:
         return digest_files([Path(source)], Path(source).parent)
     except OSError:
@@ -73,7 +73,7 @@ def _digest_file(source: str) -> str | None:
 
 
 class _FunctionCache:
-    """What Numba asks of the cache of one function, by its dispatcher."""
+    """Cache of one function, with the interface that Numba's dispatcher expects."""
 
     cache_path = None
 
@@ -83,7 +83,7 @@ class _FunctionCache:
         self._source = _digest_file(self._code.co_filename)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The function for some types of arguments, None if none is kept that can be used."""
+        """Load the compiled function for a signature; None if no usable one is stored."""
         try:
             content = load_code(self._compute_key(sig, target_context), "loop")
             return None if content is None else _rebuild_function(content, target_context)
@@ -92,10 +92,10 @@ class _FunctionCache:
             return None
 
     def save_overload(self, sig: Any, compiled_: Any) -> None:
-        """Keep what was compiled, except code with addresses of this process in it.
+        """Store a compiled function, unless it contains addresses of this process.
 
-        Neither where sources have changed since the process began (an update in place): it may
-        have loaded some of them before and some after, and the others take what lies here.
+        Nothing is stored if sources have changed since the process began (an update in place). The
+        process may have loaded some of them before the update and some after it.
         """
         try:
             if _digest_sources() != _SOURCES_DIGEST:
@@ -110,7 +110,7 @@ class _FunctionCache:
             warn_not_cached(f"{self._name} is not saved ({error!r})")
 
     def flush(self) -> None:
-        """Nothing: what is compiled anew replaces what was kept."""
+        """Do nothing: a newly compiled function replaces the stored one."""
 
     def _compute_key(self, sig: Any, target_context: Any) -> str:
         if self._source is None:
@@ -128,31 +128,32 @@ class _FunctionCache:
 
 
 def _serialize_function(compiled_: Any) -> bytes:
-    """The function without empty environments of others, and the names that it defines.
+    """Pickle a function and the names that it defines, without empty environments.
 
-    An environment holds a function's Python constants, and to make it again imports the
-    function's module: for Numba's own versions of NumPy a good part of the compiler.
+    An environment holds a function's Python constants. Rebuilding it imports the function's
+    module. For Numba's own versions of NumPy functions that is a good part of the compiler.
     """
     from numba.core.serialize import dumps
 
     parts = compiled_._reduce()
     if len(parts) == _REDUCED_PARTS:
-        parts = (*parts[:-1], tuple(one for one in parts[-1] if one.consts))
+        parts = (*parts[:-1], tuple(part for part in parts[-1] if part.consts))
     module = compiled_.library._get_module_for_linking()
     defined = (*module.functions, *module.global_variables)
-    names = {one.name for one in defined if not one.is_declaration}
+    names = {symbol.name for symbol in defined if not symbol.is_declaration}
     return bytes(dumps((names, *parts)))  # type: ignore[no-untyped-call]
 
 
 def _rebuild_function(content: bytes, target_context: Any) -> Any:
-    """The function in this process.
+    """Rebuild a pickled function in this process.
 
-    Numba's own cache first registers all that could be compiled, a quarter of a second; what is
-    loaded needs the memory management alone. The compiler registers it where it runs. It also
-    reads the function's bitcode, which only the compiler asks for, to tell what is defined.
+    Numba's own cache first registers everything that could be compiled, which takes a quarter of
+    a second. A loaded function needs only the memory management. Numba's cache also parses the
+    bitcode to list the defined symbols. Here the names are stored, and the bitcode is parsed only
+    if the compiler asks for it.
 
-    Numba unpickles what it has pickled: as with the machine code itself, this is safe because
-    only files that this user alone can have written get here (`sysid.core.code_cache`).
+    Numba unpickles its own pickles. As with the machine code itself, this is safe: only files
+    that this user alone can have written are read (`sysid.core.code_cache`).
     """
     from llvmlite.binding import parse_assembly
     from numba.core.compiler import CompileResult
@@ -167,31 +168,29 @@ def _rebuild_function(content: bytes, target_context: Any) -> Any:
         initialize(target_context)
     names, (name, kind, (machine_code, bitcode)), *others = loads(content)
     target_context.codegen()._engine._defined_symbols.update(names)
-    without = (name, kind, (machine_code, parse_assembly("").as_bitcode()))
-    rebuilt = inside._rebuild(target_context, without, *others)
+    stored = (name, kind, (machine_code, parse_assembly("").as_bitcode()))
+    rebuilt = inside._rebuild(target_context, stored, *others)
     rebuilt.library._get_module_for_linking = partial(_link_module, rebuilt.library, bitcode)
     return rebuilt
 
 
 def _link_module(library: Any, bitcode: bytes) -> Any:
-    """The module of a loaded function, read where another is compiled that calls it."""
+    """Parse the module of a loaded function, when a function that calls it is compiled."""
     from llvmlite.binding import parse_bitcode
 
-    del library._get_module_for_linking  # Numba's own gives it from now on
+    del library._get_module_for_linking  # from now on Numba's own method is used
     library._shared_module = parse_bitcode(bitcode)
     return library._shared_module
 
 
 def jit_compile(function: _Function) -> _Function:
-    """Compile with Numba: cached on disk, the GIL released, division as in IEEE 754.
+    """Compile with Numba: cached on disk, GIL released, IEEE 754 division.
 
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
-    made: Any = numba.njit(nogil=True, error_model="numpy")(function)
-    if hasattr(made, "_cache"):
-        made._cache = _FunctionCache(function)
-    elif made is not function:  # as it is where NUMBA_DISABLE_JIT is set
-        warn_not_cached(
-            f"Numba {numba.__version__} keeps no cache of functions where it is looked for"
-        )
-    return cast(_Function, made)
+    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    if hasattr(compiled, "_cache"):
+        compiled._cache = _FunctionCache(function)
+    elif compiled is not function:  # they are the same if NUMBA_DISABLE_JIT is set
+        warn_not_cached(f"Numba {numba.__version__} has no function cache in the expected place")
+    return cast(_Function, compiled)

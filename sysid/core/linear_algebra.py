@@ -1,4 +1,4 @@
-"""What the columns of a matrix span, without the directions that are rounding only."""
+"""Singular value decomposition, with the rank determined up to rounding."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 
 
 class TruncatedSvd(NamedTuple):
-    """Singular values (K,), vectors in columns (N, K) and rows (K, D), and which are `kept` (K,).
+    """Singular values (K,), left vectors (N, K), right vectors (K, D), and `kept` (K,).
 
-    K = min(N, D); a value is kept where it is more than rounding of the largest.
+    K = min(N, D). A value is kept if it exceeds the rounding of the largest.
     """
 
     left: FloatArray
@@ -20,7 +20,7 @@ class TruncatedSvd(NamedTuple):
 
 
 def truncated_svd(columns: FloatArray) -> TruncatedSvd:
-    """Singular value decomposition of columns (N, D)."""
+    """Decompose columns (N, D) and mark the singular values above rounding."""
     left, singular, rows = np.linalg.svd(columns, full_matrices=False)
     return TruncatedSvd(
         left, singular, rows, singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)

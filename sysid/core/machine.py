@@ -1,4 +1,4 @@
-"""Which machine this is, for the names of files that several machines may share."""
+"""Identity of the machine, for names of files that several machines share."""
 
 import hashlib
 import socket
@@ -10,9 +10,9 @@ _TAG_LENGTH = 6
 
 @cache
 def read_machine_id() -> str | None:
-    """Name of this boot and of the PID namespace; None where there is no ``/proc``.
+    """Read the identity of this boot and PID namespace; None where there is no ``/proc``.
 
-    Equal process numbers mean the same process, or its successor, only if this name is equal.
+    Process numbers can be compared only if this identity is equal.
     """
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -22,6 +22,6 @@ def read_machine_id() -> str | None:
 
 
 def make_machine_tag() -> str:
-    """A short name of the machine for file names; from the host's name if it has no other."""
+    """Make a short tag of the machine for file names; without ``/proc`` from the host name."""
     name = read_machine_id() or f"host {socket.gethostname()}"
     return hashlib.sha256(name.encode()).hexdigest()[:_TAG_LENGTH]

@@ -1,4 +1,4 @@
-"""Values kept by the identity of what they are of, where its equality would be a long walk."""
+"""Cache keyed by the identity of an argument whose comparison would be slow."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -13,21 +13,21 @@ _Value = TypeVar("_Value")
 def cache_by_identity(
     function: Callable[Concatenate[_Subject, _Others], _Value],
 ) -> Callable[Concatenate[_Subject, _Others], _Value]:
-    """The function, its last values kept by its first argument itself and by the others' value.
+    """Cache a function by the identity of its first argument and the values of the others.
 
-    A subject that is kept cannot be freed, so no other one gets its identity meanwhile.
+    The cache keeps the first argument alive, so that no other object can get its identity.
     """
-    known: dict[tuple[object, ...], tuple[_Subject, _Value]] = {}
+    entries: dict[tuple[object, ...], tuple[_Subject, _Value]] = {}
 
     @wraps(function)
     def cached(subject: _Subject, /, *others: _Others.args, **named: _Others.kwargs) -> _Value:
         key = (id(subject), *others, *sorted(named.items()))
-        entry = known.get(key)
+        entry = entries.get(key)
         if entry is None:
             entry = (subject, function(subject, *others, **named))
-            if len(known) >= _MAX_KEPT:
-                known.clear()
-            known[key] = entry
+            if len(entries) >= _MAX_KEPT:
+                entries.clear()
+            entries[key] = entry
         return entry[1]
 
     return cached

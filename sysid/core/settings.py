@@ -1,7 +1,7 @@
 """Settings of a search and of the problem it solves, as frozen values.
 
-The field names are those of the job body. Names to choose from, defaults and bounds are defined
-here once: the wire schemas, the forms and the command line take them from here.
+The field names are those of the job body. Choices, defaults and bounds are defined here once. The
+wire schemas, the forms and the command line take them from here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,10 @@ PREDICTION_KINDS: tuple[PredictionKind, ...] = get_args(PredictionKind)
 LOSS_KINDS: tuple[LossKind, ...] = get_args(LossKind)
 NOISE_MODELS: tuple[NoiseModel, ...] = get_args(NoiseModel)
 MIN_POPULATION = 4
-"""Individuals of an island at least: a child needs two parents, and they others to replace."""
+"""Fewest individuals of an island: two parents, and others for their children to replace."""
 MAX_BITS = 32
-"""Bits of a coded parameter at most."""
-# What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
+"""Most bits of a coded parameter."""
+# The compiled search counts these in 64 bits; a run of years does not come near them.
 MAX_GENERATIONS = 10**9
 MAX_EVALUATIONS = 10**12
 MutationSchedule = tuple[tuple[int, float], ...]
@@ -36,8 +36,9 @@ MutationSchedule = tuple[tuple[int, float], ...]
 class SequenceSearch:
     """The paper's sequence search (Eq. 11, 12).
 
-    ``kind`` ``"paper"``: the step stays fixed; ``"adaptive"``: it learns step sizes and
-    directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the range.
+    With ``kind="paper"`` the step stays fixed. With ``kind="adaptive"`` the search learns step
+    sizes and directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the
+    range.
     """
 
     kind: SequenceKind = "adaptive"
@@ -45,14 +46,14 @@ class SequenceSearch:
     relative: bool = True
 
     def __post_init__(self) -> None:
-        right = ", ".join(SEQUENCE_KINDS)
-        _require(self.kind in SEQUENCE_KINDS, "sequence/kind", self.kind, right)
+        allowed = ", ".join(SEQUENCE_KINDS)
+        _require(self.kind in SEQUENCE_KINDS, "sequence/kind", self.kind, allowed)
         _require(0 < self.beta < 1, "sequence/beta", self.beta, "between 0 and 1")
 
 
 @dataclass(frozen=True, slots=True)
 class Migration:
-    """Every how many generations, along which topology, how many migrants (pagmo's words)."""
+    """Migration between islands: interval in generations, topology, number of migrants."""
 
     every: int = 25
     topology: TopologyName = "one-way-ring"
@@ -73,14 +74,18 @@ class Migration:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End conditions besides the generations; whichever comes first. None: not used.
+    """Stopping conditions besides the generations; the first one met ends the search.
 
-    `settled`: the best individual was found again by two searches more than that, half of that
-    at least from new random places and half from beside it, and by a third of all searches; where
-    fewer than half of those from random places agree, only after two and a half times as many.
-    Where the fitness jumps nearby, by that many of either kind, by two thirds of those from random
-    places and nine of ten from beside it. Only the adaptive sequence search makes these, so that
-    the paper's methods never end by it.
+    None disables a condition. `settled` stops the search by agreement of restarts:
+
+    * `settled` + 2 restarts must confirm the best individual. At least half of `settled` must
+      start from random points and half near the best individual.
+    * At least a third of all restarts must agree.
+    * If fewer than half of the random restarts agree, two and a half times as many are needed.
+    * If the fitness jumps nearby, that many of either kind must agree. So must two thirds of the
+      random restarts and nine of ten of those nearby.
+
+    Only the adaptive sequence search makes restarts, so the paper's methods never stop by it.
     """
 
     evaluations: int | None = None
@@ -102,7 +107,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class IslandChange:
-    """What one island does otherwise; None: as the archipelago."""
+    """Settings of one island that differ from the archipelago's; None: the same."""
 
     method: SearchMethod | None = None
     bits: int | None = None
@@ -120,14 +125,14 @@ class GeneticAlgorithm:
     Attributes
     ----------
     population : int
-        Individuals in all, dealt over the islands as evenly as possible, so that the budget of
+        Individuals of all islands together, distributed as evenly as possible. The budget of
         evaluations does not depend on the number of islands.
     mutation : tuple of (generation, rate)
-        Schedule: from that generation on, that probability of one flipped bit in a child.
+        Schedule: probability of one flipped bit in a child, from that generation on.
     stagnation : int
         Generations without a better champion before the sequence search begins.
     islands : int or tuple of IslandChange or None
-        None: 4 for ``improved``, 1 for the two methods of the paper, which knows no islands.
+        None: 4 for ``improved``, 1 for the two methods of the paper, which has no islands.
     safe_limit : float or None
         Fitness above which an individual is invalid (section 3), in the output's unit.
     """
@@ -173,7 +178,7 @@ class GeneticAlgorithm:
             budget is None or budget >= self.population,
             "stop/evaluations",
             budget,
-            f"{self.population} or more, the simulations of one population of "
+            f"{self.population} or more, one simulation for each of the "
             f"{self.population} individuals",
         )
         _require(
@@ -193,12 +198,12 @@ class GeneticAlgorithm:
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit.
+    """Loss to minimise: squares (Eq. 10), or soft-l1 with a scale in the output's unit.
 
-    With the noise model ``ar1`` the search minimises squares; from its end on the estimates are
-    those of generalised least squares under first-order noise
-    (`sysid.identification.generalised_least_squares`). ``auto`` is that for free runs by squares
-    whose residuals are coloured and whose model does not forget where it began
+    With the noise model ``ar1`` the search minimises squares. Then generalised least squares
+    under first-order noise gives the estimates
+    (`sysid.identification.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
+    squares with coloured residuals and an integrating model
     (`sysid.identification.noise_model_choice`), else ``white``.
     """
 
@@ -223,22 +228,22 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """What a fit takes besides its model and its records.
+    """Settings of a fit, besides its model and its records.
 
     Attributes
     ----------
     parameters : mapping of str to mapping
-        Changed bounds, scales or fixed values, or what a parameter is tied to.
+        Changed bounds, scales, fixed values or ties.
     prediction : {"simulation", "one-step"}
         Free run or one step ahead.
     loss : Loss
-        What is minimised.
+        Loss to minimise.
     weights : mapping of str to float or None
         Weight of each output. None: 1 for one output, else 1 / its standard deviation.
     skip : int
         First samples of each output that are not scored.
     scored_from : tuple of float or None
-        For each record the time (s) from which on samples are scored. None: all are.
+        For each record the time (s) from which samples are scored. None: all samples.
     """
 
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -260,33 +265,35 @@ class FitSettings:
         if self.prediction == "one-step" and self.loss.noise_model == "ar1":
             raise InvalidSettings(
                 "/loss/noise_model",
-                f"{self.loss.noise_model} is for free runs; predictions one step ahead contain the "
-                "noise",
+                f"{self.loss.noise_model} is for free runs; one-step predictions already "
+                "contain the noise",
             )
         if self.skip < 0:
-            raise InvalidSettings("/skip", f"{self.skip!r} is not a number of samples, 0 or more")
+            raise InvalidSettings(
+                "/skip", f"{self.skip!r} is not a number of samples; need 0 or more"
+            )
 
 
-def _require(holds: bool, pointer: str, found: object, right: str) -> None:
+def _require(holds: bool, pointer: str, value: object, allowed: str) -> None:
     if not holds:
-        raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")
+        raise InvalidSettings(f"/algorithm/{pointer}", f"found {value!r}; need {allowed}")
 
 
-def _require_count(found: int, pointer: str) -> None:
-    _require(1 <= found <= MAX_GENERATIONS, pointer, found, f"1 to {MAX_GENERATIONS}")
+def _require_count(value: int, pointer: str) -> None:
+    _require(1 <= value <= MAX_GENERATIONS, pointer, value, f"1 to {MAX_GENERATIONS}")
 
 
-def _require_schedule(found: MutationSchedule, pointer: str) -> None:
-    generations = [generation for generation, _ in found]
+def _require_schedule(schedule: MutationSchedule, pointer: str) -> None:
+    generations = [generation for generation, _ in schedule]
     holds = (
         bool(generations)
         and generations[0] == 0
         and generations[-1] <= MAX_GENERATIONS
         and generations == sorted(set(generations))
-        and all(0 <= rate <= 1 for _, rate in found)
+        and all(0 <= rate <= 1 for _, rate in schedule)
     )
-    right = f"[generation, rate] pairs from generation 0 up to {MAX_GENERATIONS}, rates 0 to 1"
-    _require(holds, pointer, found, right)
+    allowed = f"[generation, rate] pairs from generation 0 up to {MAX_GENERATIONS}, rates 0 to 1"
+    _require(holds, pointer, schedule, allowed)
 
 
 def _join(names: Sequence[str]) -> str:

@@ -1,8 +1,8 @@
-"""One thread for the linear algebra, so that sums are made in the same order everywhere.
+"""One thread for the linear algebra, so that sums are added in the same order everywhere.
 
-NumPy and SciPy each bring or load an OpenBLAS. It deals long arrays over as many threads as the
-machine has, and the last digits of a sum depend on how many those are. What runs inside uses that
-of NumPy; SciPy's is told too where it is loaded before the first use, and takes long to load.
+NumPy and SciPy each load an OpenBLAS. OpenBLAS splits long arrays over all threads of the
+machine, and the last digits of a sum depend on their number. The numerical core uses NumPy's
+library. SciPy's, which takes long to load, is limited too if it is loaded before the first use.
 """
 
 import ctypes
@@ -27,7 +27,7 @@ class _BlasLibrary(NamedTuple):
 
 
 class _ThreadLimit:
-    """How many callers want one thread at present, and what the libraries had before."""
+    """Number of callers that need one thread, and the libraries' thread counts before."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -55,7 +55,7 @@ _thread_limit = _ThreadLimit()
 
 @contextmanager
 def use_one_thread() -> Iterator[None]:
-    """Linear algebra inside uses one thread, in the whole process until the last caller is done."""
+    """Limit linear algebra to one thread in the process, until the last caller leaves."""
     _thread_limit.acquire()
     try:
         yield
@@ -65,8 +65,8 @@ def use_one_thread() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _load_libraries() -> tuple[_BlasLibrary, ...]:
-    """Every OpenBLAS in this process; another library of linear algebra is left as it is."""
-    found = []
+    """Load every OpenBLAS of this process; other linear algebra libraries stay unchanged."""
+    libraries = []
     for path in sorted(_find_library_paths()):
         loaded = ctypes.CDLL(path)
         for prefix, suffix in product(_PREFIXES, _SUFFIXES):
@@ -75,16 +75,16 @@ def _load_libraries() -> tuple[_BlasLibrary, ...]:
             if limit is not None and count is not None:
                 limit.argtypes, limit.restype = (ctypes.c_int,), None
                 count.argtypes, count.restype = (), ctypes.c_int
-                found.append(_BlasLibrary(count, limit))
+                libraries.append(_BlasLibrary(count, limit))
                 break
-    return tuple(found)
+    return tuple(libraries)
 
 
 def _find_library_paths() -> set[str]:
-    """Files of OpenBLAS: on Linux those loaded, elsewhere those that NumPy and SciPy bring."""
+    """Find the files of OpenBLAS: on Linux the loaded ones, else those of NumPy and SciPy."""
     if _MAPS_FILE.exists():
         mapped = (line.split(maxsplit=5) for line in _MAPS_FILE.read_text().splitlines())
         files = {parts[5] for parts in mapped if len(parts) == 6}
-        return {one for one in files if "openblas" in Path(one).name and Path(one).exists()}
+        return {file for file in files if "openblas" in Path(file).name and Path(file).exists()}
     site = Path(np.__file__).parents[1]
     return {str(path) for part in _BUNDLED for path in (site / part).glob("*openblas*")}

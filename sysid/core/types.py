@@ -1,7 +1,7 @@
 """Array types of the numerical core, and the dimension letters that docstrings use.
 
-N samples of a record, M measured output values that are compared, P individuals of a population,
-D free parameters, K all parameters (free and fixed), E experiments, W lanes of a kernel.
+N samples of a record; M measured output values that are compared; P individuals of a population;
+D free parameters; K all parameters (free and fixed); E experiments; W lanes of a kernel.
 """
 
 from typing import Any, TypeAlias, get_type_hints
@@ -14,7 +14,7 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
 WordArray: TypeAlias = NDArray[np.uint32]
-"""Chromosomes: one unsigned word per free parameter, of which `bits` bits are used."""
+"""Chromosomes: one unsigned word for each free parameter; `bits` bits of it are used."""
 
 Interval: TypeAlias = tuple[float, float]
 """Lower and upper end."""
@@ -23,7 +23,7 @@ RANK_TOLERANCE = 1e-7  # of the largest singular value: below, the differences a
 
 
 def make_record_dtype(fields: type) -> np.dtype[Any]:
-    """Data type of records with the annotated fields of a class, each an int or a float.
+    """Make the dtype of records with the annotated fields of a class, each int or float.
 
     Compiled code reads and changes such a record by the names of its fields.
     """

@@ -1,13 +1,12 @@
-"""Units as they are written beside signals: whether two are the same, and by what they differ.
+"""Units of signals: parsing, comparison and conversion factors.
 
-A unit is a product of powers such as ``kg·m²/s``, ``N*m``, ``1/(V s)`` or ``mbar``. It is read
-into seven whole-numbered powers of the SI base units and a factor, so that ``kPa`` and ``Pa``, or
-``m/s^2`` and ``N/kg``, can be compared. °C and °F have an offset, which no factor is: each is a
-unit of its own. Of a text that is no such product nothing is known: it may be any unit.
+A unit is a product of powers such as ``kg·m²/s``, ``N*m``, ``1/(V s)`` or ``mbar``. It is parsed
+into whole powers of the seven SI base units and a factor. So ``kPa`` and ``Pa``, or ``m/s^2`` and
+``N/kg``, can be compared. °C and °F have an offset, so each is a unit of its own. A text that is
+no such product may be any unit.
 
-A radian is 1, and so is a revolution where it is counted: 1 rpm is 1/60 Hz, but π/30 rad/s. Whether
-a signal in Hz is meant as a rate of cycles or of radians nobody can tell, so that between ``Hz``
-and ``rad/s`` there is no number.
+A radian is 1, and so is a revolution that is counted: 1 rpm is 1/60 Hz, but π/30 rad/s. A signal
+in Hz may count cycles or radians, so ``Hz`` and ``rad/s`` have no conversion factor.
 """
 
 import re
@@ -21,15 +20,15 @@ _BasePowers = tuple[int, int, int, int, int, int, int]
 _DIMENSIONLESS: _BasePowers = (0, 0, 0, 0, 0, 0, 0)  # of m, kg, s, A, K, mol, cd
 
 _BLANK_UNITS = ("", "1", "-", "–")
-_MAX_CHARACTERS = 80  # characters of a text that is looked at
-_MAX_FACTOR = 1e300  # a factor beyond it, or its inverse, is none
+_MAX_CHARACTERS = 80  # longest text that is parsed
+_MAX_FACTOR = 1e300  # larger factors, or smaller than its inverse, are refused
 
 
 class _Unit(NamedTuple):
-    """`find_conversion_factor` base units.
+    """A unit as `factor` times powers of the base units.
 
-    `pi` is the power of π in it, so that factors stay exact; `around` are those of radians,
-    revolutions and hertz; `scale` names a unit with an offset.
+    `pi` is the power of π in the factor, so that factors stay exact. `angle_powers` are the powers
+    of radians, revolutions and hertz. `offset_scale` names a unit with an offset.
     """
 
     powers: _BasePowers
@@ -39,16 +38,16 @@ class _Unit(NamedTuple):
     offset_scale: str = ""
 
     def multiply_power(self, other: "_Unit", power: int) -> "_Unit":
-        """Multiply by a power of another."""
+        """Multiply by a power of another unit."""
         powers = tuple(a + power * b for a, b in zip(self.powers, other.powers, strict=True))
-        around = tuple(
+        angle_powers = tuple(
             a + power * b for a, b in zip(self.angle_powers, other.angle_powers, strict=True)
         )
         return _Unit(
             powers,  # type: ignore[arg-type]
             self.factor * other.factor**power,
             self.pi + power * other.pi,
-            around,  # type: ignore[arg-type]
+            angle_powers,  # type: ignore[arg-type]
         )
 
 
@@ -145,7 +144,7 @@ _OFFSET_SCALES = {
 }
 
 _UNCONVERTIBLE = ("dB", "dBm", "pH", "count", "counts", "px")
-"""Units that many have and no factor leads to: known, and compared with nothing."""
+"""Common units without a conversion factor: known, but compared with no other unit."""
 
 _SPELLED_OUT = {
     "second": "s",
@@ -178,8 +177,8 @@ _SPELLED_OUT = {
     "unitless": "1",
     "dimensionless": "1",
 }
-_COMMON_PREFIXES = "µmckMh"  # prefixes of what is suggested
-_MIN_LIKENESS = 0.6  # of the letters of a name, for which another is suggested
+_COMMON_PREFIXES = "µmckMh"  # prefixes of suggested units
+_MIN_LIKENESS = 0.6  # share of equal letters from which a unit is suggested
 
 _SUPERSCRIPTS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _TOKEN = re.compile(
@@ -191,104 +190,106 @@ _TOKEN = re.compile(
 
 
 def is_blank_unit(unit: str | None) -> bool:
-    """Whether nothing is said by it: a channel without a unit, or a plain number."""
+    """Whether a unit is missing or that of a plain number."""
     return unit is None or unit.strip() in _BLANK_UNITS
 
 
 def format_unit(unit: str) -> str:
-    """A unit as it stands behind a number; nothing where there is none."""
+    """Format a unit behind a number; empty if there is none."""
     return "" if unit in ("", "1") else f" {unit}"
 
 
 def is_readable_unit(unit: str) -> bool:
-    """Whether it is known what a unit means."""
+    """Whether a unit can be parsed."""
     return _parse_unit(unit) is not None
 
 
 def is_known_unit(unit: str) -> bool:
-    """Whether a unit can be read, or is one of those that no factor leads to, such as ``dB``."""
+    """Whether a unit can be parsed, or is known without a factor, such as ``dB``."""
     return unit.strip() in _UNCONVERTIBLE or is_readable_unit(unit)
 
 
 def find_conversion_factor(unit: str, other: str) -> float | None:
-    """By what a value in `unit` is multiplied to be in `other`; None if no such number is known.
+    """Return the factor that converts a value from `unit` to `other`; None if there is none.
 
-    Two equal texts give 1, whatever they mean.
+    Two equal texts give 1, whatever their meaning.
     """
     if unit.strip() == other.strip():
         return 1.0
     a, b = _parse_unit(unit), _parse_unit(other)
     if a is None or b is None or not _have_same_dimension(a, b):
         return None
-    turned = _count_revolutions(a, b)
-    if turned is None:
+    revolutions = _count_revolutions(a, b)
+    if revolutions is None:
         return None
     try:
-        times = float(a.factor / b.factor * Fraction(2) ** turned) * pi ** (a.pi - b.pi + turned)
+        factor = float(a.factor / b.factor * Fraction(2) ** revolutions) * pi ** (
+            a.pi - b.pi + revolutions
+        )
     except OverflowError:
         return None
-    return times if 1 / _MAX_FACTOR < times < _MAX_FACTOR else None
+    return factor if 1 / _MAX_FACTOR < factor < _MAX_FACTOR else None
 
 
 def describe_difference(unit: str | None, other: str | None) -> str:
-    """What to say of two units that are not one: empty where they are, or where they may be.
+    """Describe how two units differ; empty if they are or may be the same.
 
-    They may where one is blank, or cannot be read.
+    They may be the same if one is blank or cannot be parsed.
     """
     if unit is None or other is None or is_blank_unit(unit) or is_blank_unit(other):
         return ""
-    times = find_conversion_factor(unit, other)
-    if times == 1.0:
+    factor = find_conversion_factor(unit, other)
+    if factor == 1.0:
         return ""
-    if times is not None:
-        return f"1 {unit} is {times:.12g} {other}"
+    if factor is not None:
+        return f"1 {unit} is {factor:.12g} {other}"
     a, b = _parse_unit(unit), _parse_unit(other)
     if a is None or b is None:
         return ""
     if _have_same_dimension(a, b) and _count_revolutions(a, b) is None:
         return f"between {unit} and {other} it is open whether cycles or radians are meant"
-    return f"{unit} is not {other}, and no number makes one of the other"
+    return f"{unit} and {other} are not units of the same quantity"
 
 
 def multiply_units(unit: str, other: str) -> str:
-    """Product of two units as a text; of a number without dimension the other one."""
+    """Write the product of two units; a dimensionless one is left out."""
     return other if unit in ("1", "") else f"{unit}·{other}"
 
 
 def suggest_unit(unit: str) -> str:
-    """What may be meant by a text that is no known unit, to be added to a message about it.
+    """Suggest a known unit for an unknown one, to append to a message.
 
-    Empty of a known unit, and where none is written alike.
+    Empty if the unit is known, or if no known unit is similar.
     """
     if is_known_unit(unit):
         return ""
     parts = re.split(r"([A-Za-zµΩ]+)", unit[:_MAX_CHARACTERS].strip())
     names = [
-        part if at % 2 == 0 or _find_named_unit(part) else _find_nearest_unit(part)
-        for at, part in enumerate(parts)
+        part if position % 2 == 0 or _find_named_unit(part) else _find_nearest_unit(part)
+        for position, part in enumerate(parts)
     ]
-    meant = "".join(names)
-    return f"; did you mean {meant!r}?" if meant and is_readable_unit(meant) else ""
+    suggestion = "".join(names)
+    return f"; did you mean {suggestion!r}?" if suggestion and is_readable_unit(suggestion) else ""
 
 
 def _find_nearest_unit(name: str) -> str:
-    """The known unit whose symbol is written most alike; empty if none is."""
+    """Find the known unit with the most similar symbol; empty if none is similar."""
     spelled = name.lower()
-    if found := _SPELLED_OUT.get(spelled) or _SPELLED_OUT.get(spelled.removesuffix("s")):
-        return found
-    known = [
+    if spelled_out := _SPELLED_OUT.get(spelled) or _SPELLED_OUT.get(spelled.removesuffix("s")):
+        return spelled_out
+    symbols = [
         *_PREFIXED,
         *_UNPREFIXED,
         *(a + b for b in _PREFIXED for a in _COMMON_PREFIXES if len(b) < 4),
     ]
-    best = max(known, key=lambda one: _measure_likeness(name, one))
+    best = max(symbols, key=lambda symbol: _measure_likeness(name, symbol))
     return best if _measure_likeness(name, best)[0] >= _MIN_LIKENESS else ""
 
 
-def _measure_likeness(name: str, known: str) -> tuple[float, float]:
-    """How many letters two names share, whatever their case, and how many in the same case."""
-    alike = SequenceMatcher(None, name.lower(), known.lower(), autojunk=False).ratio()
-    return alike, SequenceMatcher(None, name, known, autojunk=False).ratio()
+def _measure_likeness(name: str, symbol: str) -> tuple[float, float]:
+    """Share of equal letters of two names, ignoring case and respecting case."""
+    any_case = SequenceMatcher(None, name.lower(), symbol.lower(), autojunk=False).ratio()
+    return any_case, SequenceMatcher(None, name, symbol, autojunk=False).ratio()
 
 
 def _have_same_dimension(a: _Unit, b: _Unit) -> bool:
@@ -296,14 +297,14 @@ def _have_same_dimension(a: _Unit, b: _Unit) -> bool:
 
 
 def _count_revolutions(a: _Unit, b: _Unit) -> int | None:
-    """How many revolutions of `a` are radians in `b`, each of 2π; None if that is open."""
+    """Count the revolutions of `a` that are radians (2π each) in `b`; None if ambiguous."""
     radians, revolutions, hertz = (
         x - y for x, y in zip(a.angle_powers, b.angle_powers, strict=True)
     )
     if revolutions == -radians and hertz == 0:
         return revolutions
     if radians == 0:
-        # Counted, as in 1/min and Hz. Of what else is per revolution, as N·m, it is open.
+        # A count, as in 1/min and Hz. Other quantities per revolution, such as N·m, are ambiguous.
         is_rate = a.powers[2] and not any((*a.powers[:2], *a.powers[3:]))
         return 0 if is_rate or revolutions + hertz == 0 or revolutions == 0 else None
     return 0 if revolutions == hertz == 0 else None
@@ -311,48 +312,48 @@ def _count_revolutions(a: _Unit, b: _Unit) -> int | None:
 
 @lru_cache(maxsize=256)
 def _parse_unit(text: str) -> _Unit | None:
-    """The unit that a text means; None if it is no product of powers of known ones."""
+    """Parse a unit; None if it is not a product of powers of known units."""
     scale = _OFFSET_SCALES.get(text.replace(" ", ""))
     if scale is not None:
         return _Unit(_DIMENSIONLESS, offset_scale=scale)
     tokens = _tokenize_unit(text.replace("μ", "µ").replace("Ω", "Ω").strip())
     if tokens is None:
         return None
-    reader = _UnitParser(tokens)
-    found = reader.parse_product()
-    return None if reader.tokens else found
+    parser = _UnitParser(tokens)
+    unit = parser.parse_product()
+    return None if parser.tokens else unit
 
 
 def _tokenize_unit(text: str) -> list[tuple[str, str]] | None:
     if len(text) > _MAX_CHARACTERS:
         return None
     tokens: list[tuple[str, str]] = []
-    place = 0
-    while place < len(text):
-        found = _TOKEN.match(text, place)
-        if found is None or found.lastgroup is None:
+    position = 0
+    while position < len(text):
+        match = _TOKEN.match(text, position)
+        if match is None or match.lastgroup is None:
             return None
-        tokens.append((found.lastgroup, found[found.lastgroup]))
-        place = found.end()
+        tokens.append((match.lastgroup, match[match.lastgroup]))
+        position = match.end()
     return tokens
 
 
 class _UnitParser:
-    """Products and quotients from left to right: ``m/s·kg`` is ``(m/s)·kg``."""
+    """Parser of products and quotients, from left to right: ``m/s·kg`` is ``(m/s)·kg``."""
 
     def __init__(self, tokens: list[tuple[str, str]]) -> None:
         self.tokens = tokens
 
     def parse_product(self) -> _Unit | None:
-        """Factors up to a closing parenthesis or the end."""
-        found = self._parse_power()
-        while found is not None and self.tokens and self.tokens[0] != ("sign", ")"):
+        """Parse factors up to a closing parenthesis or the end."""
+        unit = self._parse_power()
+        while unit is not None and self.tokens and self.tokens[0] != ("sign", ")"):
             sign = -1 if self.tokens[0] == ("sign", "/") else 1
             if self.tokens[0][0] == "sign" and self.tokens[0][1] != "(":
                 self.tokens.pop(0)
             other = self._parse_power()
-            found = None if other is None else found.multiply_power(other, sign)
-        return found
+            unit = None if other is None else unit.multiply_power(other, sign)
+        return unit
 
     def _parse_power(self) -> _Unit | None:
         base = self._parse_base()
@@ -376,10 +377,10 @@ class _UnitParser:
 
 
 def _find_named_unit(name: str) -> _Unit | None:
-    """A unit by its symbol, with or without a prefix; without goes first, so ``min`` is one."""
-    known = _UNPREFIXED.get(name) or _PREFIXED.get(name)
-    if known is not None:
-        return known
+    """Find a unit by its symbol, first without and then with a prefix (``min`` is minutes)."""
+    plain = _UNPREFIXED.get(name) or _PREFIXED.get(name)
+    if plain is not None:
+        return plain
     for prefix, power in _PREFIXES.items():
         unit = _PREFIXED.get(name.removeprefix(prefix)) if name.startswith(prefix) else None
         if unit is not None:

@@ -99,7 +99,9 @@ def trim_recording(recording: Recording, given: StepArguments) -> Recording:
     given.reject_others("start", "stop", "rows", "history")
     if given.has_argument("rows"):
         if given.has_argument("start") or given.has_argument("stop"):
-            given.fail("rows", "is given together with a time; give rows, or start and stop")
+            given.fail(
+                "rows", "cannot be combined with start or stop; give rows, or start and stop"
+            )
         return _attach_or_drop_history(_cut_rows(recording, given), recording, given)
     if not given.has_argument("start") and not given.has_argument("stop"):
         given.fail("", "need start, stop (seconds), or rows")
@@ -233,7 +235,7 @@ def rename_channels(recording: Recording, given: StepArguments) -> Recording:
     renamed = [names.get(name, name) for name in recording.names]
     for name in renamed:
         if not name or renamed.count(name) > 1:
-            given.fail("", f"two channels would be called {name!r}, or one has no name")
+            given.fail("", f"two channels would be called {name!r}, or a channel has no name")
     return replace(
         recording,
         channels=tuple(

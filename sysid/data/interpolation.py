@@ -180,8 +180,8 @@ def _interpolate_band_limited(channel: Channel, times: FloatArray) -> FloatArray
     sampling = measure_sampling(channel.times, within=_PERIOD_TOLERANCE)
     if not sampling.is_regular:
         raise InvalidRecord(
-            f"input {channel.name!r} is to be band-limited between its samples, but they are not "
-            "regular; use hold 'first' or resample it"
+            f"input {channel.name!r} is to be band-limited between its samples, but its sampling "
+            "is irregular; use hold 'first' or resample it"
         )
     reach = np.arange(-_HALF_WIDTH * POINTS_PER_SAMPLE, _HALF_WIDTH * POINTS_PER_SAMPLE + 1)
     kernel = np.sinc(reach / POINTS_PER_SAMPLE) * np.kaiser(reach.size, _KAISER)

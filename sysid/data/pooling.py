@@ -37,7 +37,7 @@ def select_segments(recording: Recording, given: StepArguments) -> Recording:
         )
     )
     if not kept:
-        given.fail("", f"none of the {len(recording.segments)} segments satisfies this")
+        given.fail("", f"none of the {len(recording.segments)} segments satisfies these conditions")
     is_first = kept[0] is recording.segments[0]
     return Recording(
         tuple(_select_samples(one, kept, is_first) for one in recording.channels), kept

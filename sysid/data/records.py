@@ -91,7 +91,7 @@ class Channel:
         if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
             raise InvalidRecord(
                 f"channel {self.name!r} has times of shape {self.times.shape} and values of shape "
-                f"{self.values.shape}; need two equal one-dimensional arrays with a sample or more"
+                f"{self.values.shape}; need one-dimensional arrays of equal length, not empty"
             )
         if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
@@ -103,14 +103,14 @@ class Channel:
         if before.ndim != 1 or before.shape != values.shape or before.size == 0:
             raise InvalidRecord(
                 f"the history of channel {self.name!r} has times of shape {before.shape} and "
-                f"values of shape {values.shape}; need two equal one-dimensional arrays with a "
-                "sample or more, or no history"
+                f"values of shape {values.shape}; need one-dimensional arrays of equal length, "
+                "not empty, or None"
             )
         times = np.append(before, self.times[0])
         if np.any(np.diff(times) < 0) or not np.all(np.isfinite(times)):
             raise InvalidRecord(
-                f"the history of channel {self.name!r} is not before its first sample, or its "
-                "times decrease or are not finite"
+                f"the history of channel {self.name!r} does not end before its first sample, or "
+                "its times decrease or are not finite"
             )
 
     @property
@@ -268,8 +268,8 @@ class Recording:
             raise InvalidRecord(fault)
         if len(self.segments) > 1:
             raise InvalidRecord(
-                f"the recording has {len(self.segments)} segments, each measured on its own; "
-                "derive one record with 'pool' or 'select', or use every segment as an experiment"
+                f"the recording has {len(self.segments)} segments, each measured on its own. "
+                "Derive one record with 'pool' or 'select', or use every segment as an experiment."
             )
         return Record(
             tuple(_to_input(self.channel(ours), role) for role, ours in inputs.items()),
@@ -304,8 +304,8 @@ def find_shared_channels(inputs: Mapping[str, str], outputs: Mapping[str, str]) 
     """
     measured = {channel: name for name, channel in outputs.items()}
     return {
-        name: f"channel {channel!r} is given to input {name!r} and to output "
-        f"{measured[channel]!r}: an output that is its own input tells nothing"
+        name: f"channel {channel!r} is both input {name!r} and output "
+        f"{measured[channel]!r}; an output that is its own input contains no information"
         for name, channel in inputs.items()
         if channel in measured
     }
@@ -336,8 +336,8 @@ def _to_input(channel: Channel, role: str) -> Channel:
     if missing.size:
         raise InvalidRecord(
             f"input {role!r} (channel {channel.name!r}) has {missing.size} missing values (NaN), "
-            f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
-            "everywhere: trim the recording or fill the gaps"
+            f"the first at t = {channel.times[missing[0]]:g} s. An input needs a value at every "
+            "sample. Trim the recording or fill the gaps."
         )
     return replace(channel, name=role, history=trim_missing_history(channel.history))
 

@@ -35,7 +35,7 @@ def resample_recording(recording: Recording, given: StepArguments) -> Recording:
     period = given.read_positive("sample_time")
     method = given.read_choice("method", ("linear", "mean"), "linear")
     if recording.duration / period > MAX_SAMPLES:
-        given.fail("sample_time", f"found {period!r}; that would be over {MAX_SAMPLES} samples")
+        given.fail("sample_time", f"found {period!r}, which gives more than {MAX_SAMPLES} samples")
     spans = [(one.start, one.stop) for one in recording.segments] or [(-np.inf, np.inf)]
     grids = [
         _build_grid([c.slice_time(*span) for c in recording.channels], period) for span in spans

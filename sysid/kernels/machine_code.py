@@ -87,12 +87,14 @@ _log = logging.getLogger(__name__)
 
 
 def compile_bounded(assembly: str) -> bytes:
-    """Compile assembly for this machine, here or, after `MAX_OWN_COMPILATIONS` of them, in another process."""
+    """Compile assembly here or, after `MAX_OWN_COMPILATIONS` kernels, in another process."""
     if len(_own_compilations) >= MAX_OWN_COMPILATIONS:
         try:
             return _compile_in_subprocess(assembly)
         except (OSError, subprocess.SubprocessError) as error:
-            _log.warning("a kernel is compiled in this process, which keeps its traces: %s", error)
+            _log.warning(
+                "a kernel is compiled in this process, whose memory grows by it: %s", error
+            )
     _own_compilations.append(None)
     return compile_assembly(assembly)
 

@@ -103,7 +103,7 @@ class ParameterEnvironment(Environment):
 
     def emit_past_value(self, past: PastValue) -> IrValue:
         """Never asked: the language allows no signals in a lag."""
-        raise AssertionError(f"a lag holds no signal such as {past.name}")
+        raise AssertionError(f"a delay contains no signal such as {past.name}")
 
 
 class Delays:
@@ -291,7 +291,7 @@ class SignalReaders:
     def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
         """Who reads that lagged signal at that place."""
         if past.delay is None:
-            raise AssertionError(f"{past.name} is read without lag")
+            raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
 
     def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:

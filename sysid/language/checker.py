@@ -45,9 +45,9 @@ def check_expression(text: str, scope: Scope) -> CheckedExpression:
     Examples
     --------
     >>> scope = Scope("difference", states=("x",), parameters={"L": (0.0, 1.0)})
-    >>> check("x(k-1-L/h)", scope).tree.offset
+    >>> check_expression("x(k-1-L/h)", scope).tree.offset
     1
-    >>> check("y(k-1)", scope).faults[0].detail
+    >>> check_expression("y(k-1)", scope).faults[0].detail
     "'y' is not declared; did you mean 'x'?"
     """
     syntax, faults = parse_expression(text)
@@ -141,7 +141,7 @@ class _ExpressionChecker:
 
     def _describe_unknown(self, name: str) -> str:
         if name == "h":
-            return "'h' is not declared; the sampling period is known in the difference form only"
+            return "'h' is not declared; it is the sampling period in the difference form only"
         return f"{name!r} is not declared{suggest_name(name, self._scope.names)}"
 
     def _check_apply(self, node: Apply, depth: int) -> Expression:
@@ -186,7 +186,9 @@ class _ExpressionChecker:
         inside, self.uses = self.uses, outside
         if inside:
             name = inside[0].value.name
-            detail = f"the lag depends on {name!r}; a lag is made of parameters and constants only"
+            detail = (
+                f"the delay depends on {name!r}; a delay consists of parameters and constants only"
+            )
             return self._add_fault(inside[0].column, detail)
         if len(self._faults) > known:
             return _ZERO

@@ -40,20 +40,21 @@ def split_index(index: Expression, scope: Scope) -> PastIndex | str:
     back = scale_polynomial(terms, -1.0)
     rest = to_expression(back)
     if slope == 1.0 and set(back) == {CONSTANT} and back[CONSTANT] < 0:
-        return "this is a value of the future, which is not known"
+        return "this is a value in the future, which cannot be read"
     if not mentions_time(rest) and not slope:
         return f"the index does not count from {scope.clock}; {_describe_form(scope)}"
     if scope.form == "difference" and mentions_time(rest, "time"):
         return f"the index counts seconds; {_describe_form(scope)}"
     if abs(slope - 1.0) > 1e-9 or mentions_time(rest):
-        return f"the lag changes with time; {_describe_form(scope)}, where the lag is fixed"
+        return f"the delay changes with time; {_describe_form(scope)} with a constant delay"
     if (low := bound_expression(rest, scope.parameters)[0]) < 0:
         return _describe_negative(back, low, scope)
     if not back:
         return PastIndex(0, None)
     # Any period tells a lag without limit; back[CONSTANT] counts samples or seconds.
     if max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _MAX_DELAY:
-        return f"the lag {format_expression(rest, scope.clock)} has no limit inside the bounds of its parameters"
+        written = format_expression(rest, scope.clock)
+        return f"the delay {written} has no upper limit inside the bounds of its parameters"
     return PastIndex(0, rest) if scope.form == "differential" else _split_offset(back, low, scope)
 
 
@@ -86,8 +87,9 @@ def _describe_negative(back: LaurentPolynomial, low: float, scope: Scope) -> str
             "s",
         )
     smallest = "" if isinf(low) else f"; its smallest value is {format_number(low)} {unit}"
+    written = format_expression(to_expression(back), scope.clock)
     return (
-        f"the lag {format_expression(to_expression(back), scope.clock)} may be negative inside the bounds{smallest}; "
+        f"the delay {written} may be negative inside the bounds{smallest}; "
         "give its parameters bounds that keep it at 0 or more"
     )
 

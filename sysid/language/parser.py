@@ -296,7 +296,7 @@ def _describe_unexpected(word: Token) -> str:
     if word.text == ")":
         return "')' closes a parenthesis that was never opened"
     if word.text == ",":
-        return "',' is only for the arguments of a function"
+        return "',' only separates the arguments of a function"
     return f"unexpected {word.text!r}; an operator such as * is missing before it"
 
 
@@ -304,5 +304,5 @@ def _describe_missing_operand(word: Token) -> str:
     if word.kind == "end":
         return "the expression ends where a number, a name or a parenthesis should follow"
     if word.text == "+":
-        return "'+' has nothing on its left; leave it out"
+        return "'+' has no left operand; leave it out"
     return f"unexpected {word.text!r} where a number, a name or a parenthesis should be"

@@ -1,1 +1,1 @@
-"""Model document → `Model`: parameters, equations, initial states, polynomial models, catalogue."""
+"""Models: documents, parameters, equations, polynomials, ties, units, and the catalogue."""

@@ -1,6 +1,6 @@
-"""Whether a model's lags stay in the past, and inside a record, for bounds given in a request.
+"""Checks of a request: delays must be causal and fit into the record; settings must be used.
 
-What a request gives without any effect: refused, since it is a mistake more often than not.
+A setting without effect is refused, since it is usually a mistake.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,26 +17,26 @@ from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.sections import get_interval
 from sysid.models.ties import apply_ties, collect_parameter_names, resolve_ties
 
-_HALVINGS = 60  # of a parameter's interval, in search of the largest value that a record allows
+_HALVINGS = 60  # bisections for the largest value of a parameter that a record allows
 
 
 def check_delays(
     model: Model, parameters: Sequence[Parameter], period: float | None = None
 ) -> None:
-    """Raise if a lag could be negative inside these bounds.
+    """Raise if a delay could be negative inside these bounds.
 
     Parameters
     ----------
     model : Model
     parameters : sequence of Parameter
-        The model's, with the bounds and fixed values of a request.
+        The model's parameters, with the bounds and fixed values of a request.
     period : float or None
         Sampling period in s, if it is known.
 
     Raises
     ------
     InvalidSettings
-        Naming the past value and the smallest lag.
+        If so; the message names the past value and the smallest delay.
     """
     ends = {parameter.name: get_interval(parameter) for parameter in parameters}
     clock = "t" if model.form == "differential" else "k"
@@ -47,13 +47,13 @@ def check_delays(
             smallest = f"{low + value.offset:g} {unit}"
             raise InvalidSettings(
                 "/parameters",
-                f"inside these bounds the lag of {format_expression(value, clock)} can be as small as "
-                f"{smallest}; the model needs {value.offset} {unit} or more",
+                f"inside these bounds the delay of {format_expression(value, clock)} can be as "
+                f"small as {smallest}; the model needs {value.offset} {unit} or more",
             )
 
 
 def list_past_values(model: Model) -> list[PastValue]:
-    """Every past value that an equation or an output reads."""
+    """List every past value that an equation or an output reads."""
     trees = (*model.equations, *(output.expression for output in model.outputs))
     return [value for tree in trees for value in collect_past_values(tree)]
 
@@ -61,7 +61,7 @@ def list_past_values(model: Model) -> list[PastValue]:
 def compute_longest_delay(
     model: Model, past: PastValue, spans: Mapping[str, Interval], step: float | None
 ) -> float:
-    """How far (s) a past value may lie back inside these bounds; `step`: of the integration, s."""
+    """Compute the longest delay (s) of a past value inside these bounds; `step` in s."""
     back = past.offset + (
         0.0 if past.delay is None else bound_expression(past.delay, spans, step)[1]
     )
@@ -71,20 +71,20 @@ def compute_longest_delay(
 def check_record_length(
     model: Model, past: PastValue, spans: Mapping[str, Interval], step: float, duration: float
 ) -> None:
-    """Raise if a past value may lie as far back as a record lasts.
+    """Raise if a past value may lie further back than the record lasts.
 
     Parameters
     ----------
     spans : mapping of str to (lower, upper)
-        Of every parameter; one that is fixed has two equal ends.
+        Interval of every parameter; a fixed one has two equal ends.
     step, duration : float
-        Of the integration and of the record, in s.
+        Integration step and length of the record, in s.
 
     Raises
     ------
     RecordTooShort
-        Naming the parameters that the lag is made of, their bounds, and what would be short
-        enough.
+        If so; the message names the parameters of the delay, their bounds and a value that is
+        short enough.
     """
     longest = compute_longest_delay(model, past, spans, step)
     if longest < duration:
@@ -93,17 +93,17 @@ def check_record_length(
         sorted(collect_parameter_names(past.delay) & set(spans)) if past.delay is not None else []
     )
     units = {parameter.name: parameter.unit for parameter in model.parameters}
-    told = [_describe_bound(name, spans[name], units.get(name, "1")) for name in names]
+    reasons = [_describe_bound(name, spans[name], units.get(name, "1")) for name in names]
     cure = "a longer record"
     if len(names) == 1:
-        most = _find_largest_value(model, past, spans, step, duration)
+        limit = _find_largest_value(model, past, spans, step, duration)
         unit = format_unit(units.get(names[0], "1"))
-        end = names[0] if _is_fixed(spans[names[0]]) else f"upper bound of {names[0]}"
-        cure += "" if most is None else f", or a smaller {end}: below {most:.4g}{unit}"
+        quantity = names[0] if _is_fixed(spans[names[0]]) else f"upper bound of {names[0]}"
+        cure += "" if limit is None else f", or a smaller {quantity}: below {limit:.4g}{unit}"
     elif names:
-        cure += ", or smaller ones"
-    what = f"the lag of {past.name!r}"
-    raise RecordTooShort(duration, longest, what, " and ".join(told), cure)
+        cure += ", or smaller bounds"
+    what = f"the delay of {past.name!r}"
+    raise RecordTooShort(duration, longest, what, " and ".join(reasons), cure)
 
 
 def _describe_bound(name: str, span: Interval, unit: str) -> str:
@@ -118,7 +118,7 @@ def _is_fixed(span: Interval) -> bool:
 def _find_largest_value(
     model: Model, past: PastValue, spans: Mapping[str, Interval], step: float, duration: float
 ) -> float | None:
-    """The largest value of the lag's only parameter that the record allows; None: there is none."""
+    """Find the largest value of the delay's only parameter that the record allows, or None."""
     [name] = collect_parameter_names(past.delay) & set(spans) if past.delay is not None else []
     lower, upper = spans[name]
     start = min(lower, 0.0) if _is_fixed(spans[name]) else lower
@@ -138,35 +138,35 @@ def _find_largest_value(
 def find_unused_settings(
     model: Model, parameters: Sequence[Parameter], weights: Mapping[str, float] | None
 ) -> list[Fault]:
-    """Free parameters that no equation reads, and a weight beside which there is no other output.
+    """Find free parameters that no equation reads, and a weight on the only output.
 
     Parameters
     ----------
     model : Model
-        Its ties resolved.
+        With its ties applied.
     parameters : sequence of Parameter
-        The model's own, as they are sought.
+        The model's own, without initial states.
     """
     trees = (*model.equations, *(output.expression for output in model.outputs))
     read = {name for tree in trees for name in collect_parameter_names(tree)}
-    where = "no term" if model.form == "polynomial" else "no equation and no output"
-    found = [
+    nowhere = "no term" if model.form == "polynomial" else "no equation and no output"
+    faults = [
         Fault(
-            f"/parameters/{one.name}",
-            f"{where} of model {model.name!r} uses {one.name!r}, so no data can tell its value; "
-            "take it out of the model, or fix it",
+            f"/parameters/{parameter.name}",
+            f"{nowhere} of model {model.name!r} uses {parameter.name!r}, so no data can determine "
+            "it; remove it from the model, or fix it",
         )
-        for one in parameters
-        if one.is_free and one.name not in read
+        for parameter in parameters
+        if parameter.is_free and parameter.name not in read
     ]
-    only = [output.name for output in model.outputs]
-    if len(only) == 1 and only[0] in (weights or {}):
+    outputs = [output.name for output in model.outputs]
+    if len(outputs) == 1 and outputs[0] in (weights or {}):
         detail = (
-            f"{only[0]!r} is the model's only output, so a weight would change nothing; leave it "
+            f"{outputs[0]!r} is the model's only output, so a weight would change nothing; leave it "
             "out"
         )
-        found.append(Fault(f"/weights/{only[0]}", detail))
-    return found
+        faults.append(Fault(f"/weights/{outputs[0]}", detail))
+    return faults
 
 
 def check_unused_settings(
@@ -175,16 +175,16 @@ def check_unused_settings(
     changes: Mapping[str, Mapping[str, object]] | None,
     weights: Mapping[str, float] | None,
 ) -> None:
-    """Raise for the first of these.
+    """Raise for the first unused setting (see `find_unused_settings`).
 
     Raises
     ------
     InvalidSettings, InvalidBounds
-        With its pointer; also if the changes of parameters cannot be used.
+        With the pointer of the setting; also if the changes of parameters are invalid.
     """
-    everything = override_parameters(
+    overridden = override_parameters(
         (*model.parameters, *build_initial_parameters(model, experiments)), dict(changes or {})
     )
-    tied = apply_ties(model, resolve_ties(model, everything))
-    for fault in find_unused_settings(tied, everything[: len(model.parameters)], weights):
+    tied = apply_ties(model, resolve_ties(model, overridden))
+    for fault in find_unused_settings(tied, overridden[: len(model.parameters)], weights):
         raise InvalidSettings(fault.pointer, fault.detail)

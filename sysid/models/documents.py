@@ -1,6 +1,6 @@
-"""Reading a document field by field: what does not fit is noted with its place.
+"""Reading of YAML documents, field by field; every fault is recorded with its pointer.
 
-YAML text to plain data: YAML 1.2 numbers and truth values, no tags, no aliases, no surprises.
+Numbers and truth values are those of YAML 1.2. Tags and aliases are not allowed.
 """
 
 import re
@@ -25,10 +25,9 @@ _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
 
 
 class _YamlLoader(yaml.SafeLoader):
-    """The safe loader without aliases (a small text could stand for a huge document).
+    """Safe YAML loader without aliases, by which a small text could expand to a huge document.
 
-    Its numbers are those of YAML 1.2: ``1e-3`` is a number, and ``on``, ``no`` and ``12:30`` are
-    texts.
+    Numbers are those of YAML 1.2: ``1e-3`` is a number; ``on``, ``no`` and ``12:30`` are texts.
     """
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
@@ -76,15 +75,18 @@ _YamlLoader.add_constructor("tag:yaml.org,2002:int", _construct_integer)
 
 
 def parse_yaml(text: str) -> Any:
-    """The data of a YAML text (JSON is YAML, too).
+    """Parse a YAML text (JSON is YAML, too).
 
     Raises
     ------
     InvalidModel
-        In one line, with the line and column where reading stopped.
+        If it cannot be read; the message has the line and column.
     """
     if len(text) > MAX_DOCUMENT_CHARACTERS:
-        detail = f"the document has {len(text)} characters; at most {MAX_DOCUMENT_CHARACTERS} are allowed"
+        detail = (
+            f"the document has {len(text)} characters; "
+            f"at most {MAX_DOCUMENT_CHARACTERS} are allowed"
+        )
         raise InvalidModel([Fault("", detail)])
     try:
         return yaml.load(text, Loader=_YamlLoader)
@@ -109,38 +111,38 @@ _SHORT_REPR.maxstring, _SHORT_REPR.maxother = 60, 60
 
 
 def quote_value(value: object) -> str:
-    """A value as messages quote it: short, whatever was sent."""
+    """Quote a value for a message, shortened if it is long."""
     return _SHORT_REPR.repr(value)
 
 
 def _replace_unprintable(text: str) -> str:
-    """The text in one line: a name that was sent may hold anything."""
-    return "".join(one if one.isprintable() else "�" for one in text)
+    """Replace unprintable characters, such as line breaks in a name."""
+    return "".join(letter if letter.isprintable() else "�" for letter in text)
 
 
 class DocumentReader:
-    """Takes values from a document and keeps every fault. Each method gives a usable default."""
+    """Reader of a document that records every fault; each method returns a usable default."""
 
     def __init__(self) -> None:
         self._faults: list[Fault] = []
 
     def add_fault(self, place: str, detail: str, column: int | None = None) -> None:
-        """Note something wrong."""
+        """Record a fault; `place` is its JSON pointer."""
         self._faults.append(
             Fault(_replace_unprintable(place), _replace_unprintable(detail), column)
         )
 
     def count_faults(self) -> int:
-        """Faults so far."""
+        """Return the number of faults so far."""
         return len(self._faults)
 
     def raise_faults(self) -> None:
-        """Stop here if anything was wrong.
+        """Raise if there are faults.
 
         Raises
         ------
         InvalidModel
-            With every fault noted so far.
+            With every fault so far.
         """
         if self._faults:
             raise InvalidModel(self._faults)
@@ -148,7 +150,7 @@ class DocumentReader:
     def read_section(
         self, value: object, place: str, known: Iterable[str] | None = None, most: int = 256
     ) -> dict[str, Any]:
-        """A mapping of names; None is an empty one.
+        """Read a mapping of names to values; None is an empty one.
 
         Parameters
         ----------
@@ -156,9 +158,9 @@ class DocumentReader:
         place : str
             JSON pointer of the mapping.
         known : iterable of str or None
-            Fields it may have; None: any name.
+            Fields that it may have; None: any name.
         most : int
-            How many fields at most.
+            Largest number of fields.
         """
         if value is None:
             return {}
@@ -172,7 +174,7 @@ class DocumentReader:
         fields: dict[str, Any] = {}
         for key, item in value.items():
             if not isinstance(key, str):
-                # YAML takes {lower: 0,2} for lower: 0 and a key 2 without a value
+                # YAML reads {lower: 0,2} as lower: 0 and a key 2 without a value
                 comma = item is None and isinstance(key, int) and not isinstance(key, bool)
                 meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
                 self.add_fault(
@@ -187,13 +189,13 @@ class DocumentReader:
         return fields
 
     def require_field(self, fields: Mapping[str, Any], name: str, place: str, what: str) -> Any:
-        """A field that must be there; None if it is not."""
+        """Return a required field; None, with a fault, if it is missing."""
         if fields.get(name) is None:
             self.add_fault(place + join_pointer(name), f"is missing; {what}")
         return fields.get(name)
 
     def read_number(self, value: object, place: str, default: float = 0.0) -> float:
-        """A finite number."""
+        """Read a finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float):
             self.add_fault(place, f"{quote_value(value)} is not a number")
             return default
@@ -203,17 +205,17 @@ class DocumentReader:
         return float(value)
 
     def read_whole_number(self, value: object, place: str, low: int, high: int) -> int:
-        """A whole number between two."""
-        found = self.read_number(value, place, float(low)) if not isinstance(value, int) else value
-        if isinstance(found, bool) or found != int(found) or not low <= found <= high:
+        """Read a whole number from `low` to `high`."""
+        number = self.read_number(value, place, float(low)) if not isinstance(value, int) else value
+        if isinstance(number, bool) or number != int(number) or not low <= number <= high:
             self.add_fault(
                 place, f"{quote_value(value)} is not a whole number from {low} to {high}"
             )
             return low
-        return int(found)
+        return int(number)
 
     def read_text(self, value: object, place: str, default: str = "", most: int = 4000) -> str:
-        """A text; None is the default."""
+        """Read a text of at most `most` characters; None is the default."""
         if value is None:
             return default
         if not isinstance(value, str):
@@ -225,13 +227,13 @@ class DocumentReader:
         return " ".join(value.split())
 
     def read_unit(self, value: object, place: str) -> str:
-        """A unit symbol; ``1`` for none."""
+        """Read a unit symbol; ``1`` for none."""
         if value is None or (value == 1 and not isinstance(value, bool)):
             return "1"
         return self.read_text(value, place, "1", 40) or "1"
 
     def read_choice(self, value: object, options: tuple[str, ...], place: str) -> str:
-        """One of some words; the first if it is none of them."""
+        """Read one of some words; the first, with a fault, if it is none of them."""
         if isinstance(value, str) and value in options:
             return value
         quoted = ", ".join(repr(option) for option in options)
@@ -241,7 +243,7 @@ class DocumentReader:
         return options[0]
 
     def read_expression(self, value: object, place: str) -> str:
-        """The text of an expression; a bare number is one, too."""
+        """Read the text of an expression; a bare number is one, too."""
         if isinstance(value, int | float) and not isinstance(value, bool):
             return repr(self.read_number(value, place))
         if not isinstance(value, str):

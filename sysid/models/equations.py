@@ -1,4 +1,4 @@
-"""Equations and outputs of a document: trees, order of computation, memory."""
+"""Equations and outputs of a document: their trees, order of computation and memory."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ _ZERO = Number(0.0)
 
 
 class OutputText(NamedTuple):
-    """An output as written."""
+    """Text and unit of an output as written."""
 
     expression: str
     unit: str | None
@@ -26,7 +26,7 @@ class OutputText(NamedTuple):
 def read_equations(
     reader: DocumentReader, value: object, scope: Scope
 ) -> tuple[dict[str, str], tuple[Expression, ...]]:
-    """Texts, and one tree per state in the states' order."""
+    """Read the equations: their texts, and one tree for each state, in the states' order."""
     fields = reader.read_section(value, "/equations", most=MAX_EQUATIONS)
     for name in fields:
         if name not in scope.states:
@@ -41,45 +41,45 @@ def read_equations(
             )
             continue
         texts[state] = reader.read_expression(fields[state], place)
-        found = check_expression(texts[state], scope)
-        add_faults(reader, found, place)
-        _check_own_present(reader, found, state, scope)
-        trees.append(found.tree or _ZERO)
+        checked = check_expression(texts[state], scope)
+        add_faults(reader, checked, place)
+        _check_own_present(reader, checked, state, scope)
+        trees.append(checked.tree or _ZERO)
     return texts, tuple(trees)
 
 
-def add_faults(reader: DocumentReader, found: CheckedExpression, place: str) -> None:
-    """Hand the faults of a text to the reader."""
-    for column, detail in found.faults:
+def add_faults(reader: DocumentReader, checked: CheckedExpression, place: str) -> None:
+    """Add the faults of an expression to the reader."""
+    for column, detail in checked.faults:
         reader.add_fault(place, detail, column)
 
 
 def read_outputs(
     reader: DocumentReader, value: object, scope: Scope, states: Sequence[ModelSignal]
 ) -> tuple[tuple[str, ...], tuple[Output, ...]]:
-    """Texts, and the outputs. One that is just a state has the state's unit."""
+    """Read the outputs and their texts; an output that is just a state has the state's unit."""
     fields = reader.read_section(value, "/outputs", most=MAX_EQUATIONS)
     if not fields:
         reader.add_fault("/outputs", "is missing; name the measured channel, such as {y: x}")
     units = {state.name: state.unit for state in states}
-    texts, found = [], []
+    texts, outputs = [], []
     for name, entry in fields.items():
         place = join_pointer("outputs", name)
         written = _read_output_text(reader, entry, place)
-        at = place + "/expression" if isinstance(entry, Mapping) else place
+        pointer = place + "/expression" if isinstance(entry, Mapping) else place
         checked = check_expression(written.expression, scope)
-        add_faults(reader, checked, at)
+        add_faults(reader, checked, pointer)
         tree = checked.tree or _ZERO
-        own = units.get(tree.name) if isinstance(tree, PastValue) else None
+        state_unit = units.get(tree.name) if isinstance(tree, PastValue) else None
         texts.append(written.expression)
-        found.append(Output(name, tree, written.unit or own or "1"))
-    return tuple(texts), tuple(found)
+        outputs.append(Output(name, tree, written.unit or state_unit or "1"))
+    return tuple(texts), tuple(outputs)
 
 
 def order_states(
     reader: DocumentReader, trees: Sequence[Expression], scope: Scope
 ) -> tuple[int, ...]:
-    """Indices of the states, each after those whose present value it uses."""
+    """Order the states (as indices): each follows those whose present value it reads."""
     if scope.form == "differential":
         return tuple(range(len(trees)))
     needs = {
@@ -90,20 +90,20 @@ def order_states(
         }
         for number, tree in enumerate(trees)
     }
-    done: list[int] = []
-    while len(done) < len(trees):
-        ready = [n for n in needs if n not in done and needs[n] <= {*done, n}]
+    ordered: list[int] = []
+    while len(ordered) < len(trees):
+        ready = [n for n in needs if n not in ordered and needs[n] <= {*ordered, n}]
         if not ready:
-            circle = ", ".join(scope.states[n] for n in needs if n not in done)
+            circle = ", ".join(scope.states[n] for n in needs if n not in ordered)
             detail = f"the present values of {circle} depend on each other; use (k-1) in one"
             reader.add_fault("/equations", detail)
             return tuple(range(len(trees)))
-        done.append(ready[0])
-    return tuple(done)
+        ordered.append(ready[0])
+    return tuple(ordered)
 
 
 def compute_memory(trees: Sequence[Expression]) -> int:
-    """Largest fixed offset of any past value, in samples."""
+    """Compute the largest fixed offset of any past value, in samples."""
     return max((value.offset for tree in trees for value in collect_past_values(tree)), default=0)
 
 
@@ -112,23 +112,23 @@ def _describe_form(scope: Scope) -> str:
 
 
 def _may_read_present(value: PastValue, scope: Scope) -> bool:
-    """Whether a state's value may touch the sample that is being computed."""
+    """Whether a past value may reach the sample that is being computed."""
     if value.kind == "input" or value.offset > 0:
         return False
     return value.delay is None or bound_expression(value.delay, scope.parameters)[0] < 1
 
 
 def _check_own_present(
-    reader: DocumentReader, found: CheckedExpression, state: str, scope: Scope
+    reader: DocumentReader, checked: CheckedExpression, state: str, scope: Scope
 ) -> None:
-    if scope.form == "differential" or found.tree is None:
+    if scope.form == "differential" or checked.tree is None:
         return
-    for value, column in found.uses:
+    for value, column in checked.uses:
         if value.name == state and _may_read_present(value, scope):
-            what = "is" if value.delay is None else "may reach"
+            verb = "is" if value.delay is None else "may reach"
             detail = (
-                f"this {what} the present {state}(k), which the equation is to give; "
-                f"write {state}(k-1…), or bounds that keep the lag at one sample or more"
+                f"this {verb} the present {state}(k), which the equation computes; "
+                f"write {state}(k-1…), or bounds that keep the delay at one sample or more"
             )
             reader.add_fault(join_pointer("equations", state), detail, column)
 

@@ -1,9 +1,4 @@
-"""A checked model: equations as trees, parameters with bounds, how to start and how to solve.
-
-Terms of a polynomial, how many of them are wanted, and what a selection has found.
-
-Initial states that are to be estimated, as parameters: once for each experiment.
-"""
+"""A checked model: equations as trees, parameters, initial states, solver, polynomial terms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +13,7 @@ ErrorKind = Literal["one-step", "simulation"]
 
 
 class Term(NamedTuple):
-    """A product of past values; the empty one is the constant 1."""
+    """A product of past values; the empty product is the constant 1."""
 
     factors: tuple[PastValue, ...]
 
@@ -40,20 +35,20 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TermRule:
-    """How the terms of a model are to be selected on the data.
+    """Rule for the selection of a polynomial's terms on data.
 
     Attributes
     ----------
     keep : int
-        Number of terms; with `err` or `criterion` the largest number.
+        Number of terms to select; with `err` or `criterion` the largest number.
     err : float or None
-        Stop when the share of the output's squares that is not explained falls below this.
+        Stop when the unexplained share of the output's sum of squares falls below this.
     criterion : {"none", "bic"}
-        ``bic``: the number of terms with the least Bayesian information criterion.
+        ``bic``: choose the number of terms with the smallest Bayesian information criterion.
     exchange : bool
-        Whether a taken term may give way to a better one afterwards.
+        Whether a selected term may be replaced by a better one afterwards.
     error : {"one-step", "simulation"}
-        Which error the terms are to explain; the latter begins with the former.
+        Error that the terms explain; ``simulation`` starts from the one-step selection.
     """
 
     keep: int
@@ -64,18 +59,18 @@ class TermRule:
 
 
 class SelectedTerm(NamedTuple):
-    """One term in the order of selection.
+    """A term in the order of selection.
 
     Attributes
     ----------
     err : float
-        Error-reduction ratio: the share of the output's squares that this term explains beyond
-        the terms before it.
+        Error-reduction ratio: the share of the output's sum of squares that this term explains
+        in addition to the terms before it.
     cumulated : float
         Share explained with all terms so far.
     coefficient : float
-        Coefficient in the model of all selected terms, before the search: by least squares one
-        step ahead, or on the free run where the terms were selected by that.
+        Coefficient in the model of all selected terms, before the search. It comes from one-step
+        least squares, or from the free run if that selected the terms.
     """
 
     term: str
@@ -86,13 +81,13 @@ class SelectedTerm(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What a selection has found.
+    """Result of a selection of terms.
 
     Attributes
     ----------
     terms : tuple of SelectedTerm
     lags : mapping of str to float
-        Values of the unknown lags at which the terms explain most.
+        Values of the unknown delays at which the terms explain most.
     samples : int
         Rows of the regression.
     """
@@ -127,14 +122,14 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class FixedInitial:
-    """The state starts at a known value."""
+    """Initial value of a state that is a fixed number."""
 
     value: float
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatedInitial:
-    """The state's start is estimated, for each experiment on its own, inside these bounds."""
+    """Initial value of a state that is estimated inside these bounds, for each experiment."""
 
     lower: float
     upper: float
@@ -142,10 +137,10 @@ class EstimatedInitial:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredInitial:
-    """The state starts at the first measured value of the output that equals it.
+    """Initial value of a state that is the first measured value of the output that equals it.
 
-    For a state that is the time derivative of a measured one (its equation is that state's
-    rate), at the first difference of the measurement.
+    A state that is the time derivative of a measured state starts at the first difference of the
+    measurement.
     """
 
 
@@ -154,21 +149,21 @@ InitialState = FixedInitial | EstimatedInitial | MeasuredInitial
 
 @dataclass(frozen=True, slots=True)
 class Solver:
-    """How a differential model is integrated and how past values are read.
+    """Integration method of a differential model, and reading of past values.
 
     Attributes
     ----------
     method : {"rk4", "euler", "semi-implicit"}
-        ``semi-implicit`` updates the states in their order, each using those already updated.
+        ``semi-implicit`` updates the states in order, each with those already updated.
     step : float or None
         Grid of the simulation in s; None: the sampling period of the outputs.
     substeps : int
-        Integration steps in one grid step. In the difference form `k` counts these and `h` is
-        their length, so that a stiff recursion may be finer than the sampling.
+        Integration steps in one grid step. In the difference form `k` counts these steps and `h`
+        is their length. So a stiff recursion may be finer than the sampling.
     history : {"constant", "zero"}
         States before the start: their initial value, or zero.
     interpolation : {"linear", "cubic", "nearest"}
-        How a value between two grid points is read.
+        Interpolation between two grid points.
     """
 
     method: SolverMethod = "rk4"
@@ -182,16 +177,16 @@ class Solver:
 class Model:
     """A model whose document has passed all checks.
 
-    A polynomial document becomes its difference equation here; `form` still says ``polynomial``.
-    `equations` holds one tree per state, in the states' order: dx/dt, or x(k). In the difference
-    form a tree may use another state at the present sample; the order in which the states are to
-    be computed is `order` (indices into `states`). `memory` is the largest fixed offset of any
-    past value (difference form): the first `memory` samples are given, not computed.
-    `document` is the normal form, from which the model can be built again.
+    A polynomial document becomes a difference equation; `form` remains ``polynomial``.
+    `equations` holds one tree for each state, in the states' order: dx/dt, or x(k). In the
+    difference form a tree may read another state at the present sample. `order` (indices into
+    `states`) is the order of computation. `memory` is the largest fixed offset of any past value
+    (difference form): the first `memory` samples are measured or initial values. `document` is
+    the normal form, from which the model can be built again.
 
-    Of a polynomial, `terms` are its terms, in the order of their coefficients. With a `rule` they
-    are candidates only: `sysid.selection.select.select_model_terms` resolves it on records, and
-    what it has found is the resolved model's `selection`.
+    `terms` are the terms of a polynomial, in the order of their coefficients. With a `rule` they
+    are candidates. `sysid.selection.select.select_model_terms` selects among them on records. Its
+    result is the resolved model's `selection`.
     """
 
     name: str
@@ -213,12 +208,12 @@ class Model:
 
 
 def name_initial_state(state: str, experiment: int) -> str:
-    """Name of an estimated initial state: ``x(0)``, in the second experiment ``x(0)[2]``."""
+    """Name an estimated initial state: ``x(0)``, in the second experiment ``x(0)[2]``."""
     return f"{state}(0)" if experiment == 0 else f"{state}(0)[{experiment + 1}]"
 
 
 def build_initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
-    """The initial states to be estimated, for each experiment on its own."""
+    """Build the parameters of the estimated initial states, for each experiment."""
     return tuple(
         Parameter(name_initial_state(state.name, e), start.lower, start.upper, state.unit)
         for e in range(experiments)

@@ -1,4 +1,4 @@
-"""The normal form of a document: every default filled in, so that equal models read equal."""
+"""Normal form of a document: every default filled in, so that equal models are equal texts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,14 +10,14 @@ _TEXT_FIELDS = ("description", "source")
 
 
 def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
-    """Document from which the same model is built; it is its own normal form.
+    """Build the normal form of a model's document; it is its own normal form.
 
     Parameters
     ----------
     fields : mapping
-        The document as given, checked.
+        The checked document as written.
     model : Model
-        What it describes.
+        The model that it describes.
     """
     head: dict[str, Any] = {"name": model.name, "title": model.title}
     for key in _TEXT_FIELDS:
@@ -60,7 +60,7 @@ def _write_polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]
     if fields.get("degree") is not None:
         body["degree"] = int(fields["degree"])
     if fields.get("lags") is not None:
-        body["lags"] = {k: [_write_text(one) for one in v] for k, v in fields["lags"].items()}
+        body["lags"] = {k: [_write_text(entry) for entry in v] for k, v in fields["lags"].items()}
     body["coefficients"] = {k: _write_value(v) for k, v in fields["coefficients"].items()}
     body["constant"] = bool(fields.get("constant", False))
     body["terms"] = _write_terms(fields.get("terms", "all"), model)
@@ -69,12 +69,14 @@ def _write_polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]
 
 def _write_terms(written: Any, model: Model) -> object:
     if model.rule is None:
-        return written if isinstance(written, str) else [_write_text(one) for one in written]
+        return written if isinstance(written, str) else [_write_text(term) for term in written]
     rule: dict[str, Any] = {"select": written["select"], "keep": model.rule.keep}
     if model.rule.err is not None:
         rule["err"] = model.rule.err
     candidates = written.get("candidates", "all")
-    listed = candidates if isinstance(candidates, str) else [_write_text(one) for one in candidates]
+    listed = (
+        candidates if isinstance(candidates, str) else [_write_text(term) for term in candidates]
+    )
     rule |= {"criterion": model.rule.criterion, "exchange": model.rule.exchange}
     rule["error"] = model.rule.error
     return {**rule, "candidates": listed}

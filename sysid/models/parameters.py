@@ -1,4 +1,4 @@
-"""A quantity to identify and the interval in which it is sought."""
+"""Parameters to identify, with their search intervals."""
 
 import re
 from collections.abc import Mapping, Set
@@ -15,7 +15,7 @@ _INITIAL_STATE_NAME = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One quantity to identify.
+    """A quantity to identify.
 
     Attributes
     ----------
@@ -26,12 +26,12 @@ class Parameter:
     unit : str
         Unit symbol; ``"1"`` for a dimensionless quantity.
     scale : {"linear", "log"}
-        How the interval is divided by the chromosome; ``"log"`` where it spans decades.
+        Spacing of the coded values in the interval; ``"log"`` if it spans decades.
     fixed : float or None
-        A known value; the parameter is then not searched.
+        Fixed value; the parameter is then not searched.
     tied : str or None
-        What it is in terms of other parameters, such as ``"2*a"``; it is then not searched, and
-        its bounds say nothing.
+        Expression of other parameters, such as ``"2*a"``. The parameter is then not searched, and
+        its bounds have no effect.
 
     Raises
     ------
@@ -69,24 +69,24 @@ _CHANGEABLE_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
 def override_parameters(
     parameters: tuple[Parameter, ...], changes: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Parameter, ...]:
-    """Parameters with some bounds, scales, fixed values or ties replaced.
+    """Replace bounds, scales, fixed values or ties of some parameters.
 
-    Both bounds make a parameter free that its model fixes or ties.
+    A change of both bounds frees a parameter that its model fixes or ties.
 
     Raises
     ------
     InvalidSettings
-        If a name or a field is unknown, a value is not a number, a parameter is fixed outside its
-        bounds, or it is tied and something else as well.
+        If a name or a field is unknown, or a value is not a number. Also if a parameter is fixed
+        outside its bounds, or tied with other changes.
     InvalidBounds
         If the result is not a usable interval.
     """
-    known = {p.name for p in parameters}
+    valid_names = {p.name for p in parameters}
     for name, fields in changes.items():
-        if name not in known:
+        if name not in valid_names:
             raise InvalidSettings(
                 f"/parameters/{name}",
-                f"the model has no parameter {name!r}{_suggest_parameter(name, known)}",
+                f"the model has no parameter {name!r}{_suggest_parameter(name, valid_names)}",
             )
         for field, value in fields.items():
             _check_field(f"/parameters/{name}/{field}", field, value)
@@ -98,17 +98,21 @@ def override_parameters(
     return tuple(_change_parameter(p, changes.get(p.name, {})) for p in parameters)
 
 
-def _suggest_parameter(name: str, known: Set[str]) -> str:
-    """What there is instead of an unknown name."""
-    start = _INITIAL_STATE_NAME.fullmatch(name)
-    if start is None:
-        return suggest_name(name, known)
-    state, first = start[1], f"{start[1]}(0)"
-    if first in known:
-        starts = sum(other == first or other.startswith(f"{first}[") for other in known)
-        return f": the records hold {starts} start(s) of {state!r}, {first} and so on"
+def _suggest_parameter(name: str, valid_names: Set[str]) -> str:
+    """Suggest a parameter for an unknown name."""
+    match = _INITIAL_STATE_NAME.fullmatch(name)
+    if match is None:
+        return suggest_name(name, valid_names)
+    state, initial_state = match[1], f"{match[1]}(0)"
+    if initial_state in valid_names:
+        count = sum(
+            other == initial_state or other.startswith(f"{initial_state}[") for other in valid_names
+        )
+        return (
+            f": the records have {count} initial state(s) of {state!r}: {initial_state} and so on"
+        )
     return (
-        f": a start is one where the model's document has bounds for it, "
+        f": an initial state is a parameter if the model's document gives it bounds, "
         f"initial: {{{state}: {{lower: …, upper: …}}}}"
     )
 
@@ -131,7 +135,7 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
         return replace(parameter, tied=fields["tied"], fixed=None)
     values: dict[str, Any] = {k: v if k == "scale" else float(v) for k, v in fields.items()}
     if {"lower", "upper"} <= values.keys() and "fixed" not in values:
-        values |= {"fixed": None, "tied": None}  # an interval to search frees what the model gives
+        values |= {"fixed": None, "tied": None}  # an interval to search frees the parameter
     fixed = values.get("fixed")
     if fixed is not None:
         values["tied"] = None
@@ -140,6 +144,6 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
         raise InvalidSettings(
             f"/parameters/{parameter.name}/fixed",
             f"{fixed:g} lies outside the bounds [{lower:g}, {upper:g}] of {parameter.name!r}; give "
-            "a value inside them, or give 'lower' and 'upper' that hold it",
+            "a value inside them, or wider 'lower' and 'upper'",
         )
     return replace(parameter, **values)

@@ -1,4 +1,4 @@
-"""Model documents: from YAML or JSON data to a checked `Model`, every fault at once."""
+"""Parsing of model documents: from YAML or JSON data to a checked `Model`."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ _MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def parse_model(document: object) -> Model:
-    """The model that a document describes.
+    """Parse a document to a model; all faults are reported at once.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def parse_model(document: object) -> Model:
     Raises
     ------
     InvalidModel
-        With every fault, each with its JSON pointer and, inside an equation, its column.
+        With every fault: its JSON pointer and, inside an equation, its column.
     """
     reader = DocumentReader()
     if not isinstance(document, Mapping):
@@ -93,18 +93,18 @@ def parse_model(document: object) -> Model:
 
 
 def keep_terms(model: Model, labels: Sequence[str]) -> Model:
-    """The polynomial with only these of its terms (``"1"``: the constant), in this order."""
+    """Restrict a polynomial to some of its terms (``"1"``: the constant), in this order."""
     listed = [label for label in labels if label != "1"]
     document = {**model.document, "terms": listed, "constant": "1" in labels}
     return parse_model(document)
 
 
 def _read_form(reader: DocumentReader, document: Mapping[str, Any]) -> ModelForm:
-    found = reader.require_field(document, "form", "", f"it is one of {', '.join(_FORMS)}")
-    if found is not None:
-        found = reader.read_choice(found, _FORMS, "/form")
-    reader.raise_faults()  # without the form it is not known which fields belong here
-    return cast(ModelForm, found)
+    form = reader.require_field(document, "form", "", f"it is one of {', '.join(_FORMS)}")
+    if form is not None:
+        form = reader.read_choice(form, _FORMS, "/form")
+    reader.raise_faults()  # the allowed fields depend on the form
+    return cast(ModelForm, form)
 
 
 def _read_head(reader: DocumentReader, fields: Mapping[str, Any]) -> None:
@@ -124,9 +124,9 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
             "/states", "is missing; name at least one state and its unit, such as {x: m}"
         )
     inputs = read_signals(reader, fields.get("inputs"), "/inputs")
-    found = read_parameters(reader, fields.get("parameters"))
-    known = read_constants(reader, fields.get("constants"))
-    scope = _build_scope(form, states, inputs, found, fields, known)
+    parameters = read_parameters(reader, fields.get("parameters"))
+    constants = read_constants(reader, fields.get("constants"))
+    scope = _build_scope(form, states, inputs, parameters, fields, constants)
     check_names(
         reader,
         form,
@@ -134,16 +134,16 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
             "states": scope.states,
             "inputs": scope.inputs,
             "parameters": tuple(scope.parameters),
-            "constants": tuple(known),
+            "constants": tuple(constants),
         },
     )
     _, trees = eq.read_equations(reader, fields.get("equations"), scope)
     _, outputs = eq.read_outputs(reader, fields.get("outputs"), scope, states)
     _check_output_names(reader, outputs, scope)
-    starts = read_initial_states(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
-    settings = read_solver(reader, fields.get("solver"), form)
+    initial = read_initial_states(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
+    solver = read_solver(reader, fields.get("solver"), form)
     reader.raise_faults()
-    _check_measured_starts(reader, starts, trees, outputs, scope)
+    _check_measured_starts(reader, initial, trees, outputs, scope)
     return Model(
         name=fields["name"],
         title=reader.read_text(fields.get("title"), "/title", fields["name"]),
@@ -151,12 +151,12 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
         inputs=inputs,
         states=states,
         outputs=outputs,
-        parameters=found,
+        parameters=parameters,
         equations=trees,
-        initial=starts,
+        initial=initial,
         order=eq.order_states(reader, trees, scope),
         memory=eq.compute_memory(trees) if form == "difference" else 0,
-        solver=settings,
+        solver=solver,
         document={},
     )
 
@@ -165,17 +165,17 @@ def _build_scope(
     form: EquationForm,
     states: tuple[ModelSignal, ...],
     inputs: tuple[ModelSignal, ...],
-    found: tuple[Parameter, ...],
+    parameters: tuple[Parameter, ...],
     fields: Mapping[str, Any],
-    known: Mapping[str, float],
+    constants: Mapping[str, float],
 ) -> Scope:
     declared = fields.get("parameters")
-    # A parameter with faults is still declared: its name in an equation is not one fault more.
+    # A parameter with faults is still declared: its use in an equation is not another fault.
     intervals = dict.fromkeys(declared, (1.0, 1.0)) if isinstance(declared, Mapping) else {}
     intervals = {name: ends for name, ends in intervals.items() if isinstance(name, str)}
-    intervals |= {parameter.name: get_interval(parameter) for parameter in found}
-    named = [tuple(one.name for one in group) for group in (states, inputs)]
-    return Scope(form, named[0], named[1], intervals, known)
+    intervals |= {parameter.name: get_interval(parameter) for parameter in parameters}
+    named = [tuple(signal.name for signal in group) for group in (states, inputs)]
+    return Scope(form, named[0], named[1], intervals, constants)
 
 
 def _check_output_names(reader: DocumentReader, outputs: tuple[Output, ...], scope: Scope) -> None:
@@ -183,7 +183,7 @@ def _check_output_names(reader: DocumentReader, outputs: tuple[Output, ...], sco
         if output.name in scope.inputs:
             reader.add_fault(
                 join_pointer("outputs", output.name),
-                f"{output.name!r} is an input, too; a channel is one or the other",
+                f"{output.name!r} is also an input; a channel is one or the other",
             )
 
 
@@ -194,15 +194,15 @@ def _check_measured_starts(
     outputs: tuple[Output, ...],
     scope: Scope,
 ) -> None:
-    """A measured start needs an output that is that state, or whose rate the state is."""
-    seen = {name for o in outputs if (name := match_plain_state(o.expression))}
+    """Check that a measured initial state has an output that is that state or its integral."""
+    measured = {name for o in outputs if (name := match_plain_state(o.expression))}
     if scope.form == "differential":
-        rates = (trees[scope.states.index(name)] for name in tuple(seen))
-        seen |= {name for tree in rates if (name := match_plain_state(tree))}
+        rates = (trees[scope.states.index(name)] for name in tuple(measured))
+        measured |= {name for tree in rates if (name := match_plain_state(tree))}
     for name, start in zip(scope.states, starts, strict=True):
-        if isinstance(start, MeasuredInitial) and name not in seen:
+        if isinstance(start, MeasuredInitial) and name not in measured:
             detail = (
-                f"no output is just {name}, nor has {name} as its rate, so its start is not "
+                f"no output measures {name} or its integral, so its initial value is not "
                 "measured; give a number, or {lower, upper} to estimate it"
             )
             reader.add_fault(join_pointer("initial", name), detail)
@@ -210,10 +210,10 @@ def _check_measured_starts(
 
 def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) -> Model:
     inputs = read_signals(reader, fields.get("inputs"), "/inputs")
-    found = read_parameters(reader, fields.get("parameters"))
-    known = read_constants(reader, fields.get("constants"))
+    parameters = read_parameters(reader, fields.get("parameters"))
+    constants = read_constants(reader, fields.get("constants"))
     output = _read_single_output(reader, fields.get("output"))
-    scope = _build_scope("difference", (output,), inputs, found, fields, known)
+    scope = _build_scope("difference", (output,), inputs, parameters, fields, constants)
     check_names(
         reader,
         "difference",
@@ -221,12 +221,12 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
             "output": scope.states,
             "inputs": scope.inputs,
             "parameters": tuple(scope.parameters),
-            "constants": tuple(known),
+            "constants": tuple(constants),
         },
     )
-    found_terms = expand_polynomial(reader, fields, scope)
-    starts = read_initial_states(reader, fields.get("initial"), scope.states, MeasuredInitial())
-    settings = read_solver(reader, fields.get("solver"), "polynomial")
+    equation = expand_polynomial(reader, fields, scope)
+    initial = read_initial_states(reader, fields.get("initial"), scope.states, MeasuredInitial())
+    solver = read_solver(reader, fields.get("solver"), "polynomial")
     reader.raise_faults()
     return Model(
         name=fields["name"],
@@ -235,24 +235,24 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         inputs=inputs,
         states=(output,),
         outputs=(Output(output.name, PastValue(output.name, "state"), output.unit),),
-        parameters=(*found_terms.coefficients, *found),
-        equations=(found_terms.tree,),
-        initial=starts,
+        parameters=(*equation.coefficients, *parameters),
+        equations=(equation.tree,),
+        initial=initial,
         order=(0,),
-        memory=eq.compute_memory((found_terms.tree,)),
-        solver=settings,
+        memory=eq.compute_memory((equation.tree,)),
+        solver=solver,
         document={},
-        terms=found_terms.terms,
-        rule=found_terms.rule,
+        terms=equation.terms,
+        rule=equation.rule,
     )
 
 
 def _read_single_output(reader: DocumentReader, value: object) -> ModelSignal:
-    """The output of a polynomial: ``y``, or ``{y: V}`` with its unit."""
+    """Read the output of a polynomial: ``y``, or ``{y: V}`` with its unit."""
     if isinstance(value, str):
         return ModelSignal(value)
-    found = read_signals(reader, value, "/output")
-    if len(found) != 1:
+    signals = read_signals(reader, value, "/output")
+    if len(signals) != 1:
         reader.add_fault("/output", "need the name of the one output, such as y or {y: V}")
         return ModelSignal("y")
-    return found[0]
+    return signals[0]

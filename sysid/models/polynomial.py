@@ -1,6 +1,6 @@
-"""Kolmogorov–Gabor polynomials: a document of lags and a degree to one difference equation.
+"""Kolmogorov–Gabor polynomials: from lags and a degree to one difference equation.
 
-The paper's Eq. 2–3 sum over all index pairs, which counts each mixed product twice. Here each
+The paper's Eq. 2–3 sum over all index pairs and count each mixed product twice. Here each
 monomial occurs once, i ≤ j ≤ …: C(s + m, m) - 1 coefficients for s past values and degree m.
 """
 
@@ -25,7 +25,7 @@ from sysid.models.sections import MAX_PARAMETERS
 POLYNOMIAL_FIELDS = ("output", "degree", "lags", "coefficients", "constant", "terms")
 
 MAX_CANDIDATES = 512
-"""Terms that a selection may choose from."""
+"""Most candidate terms of a selection."""
 
 _MAX_DEGREE = 9
 _SELECTORS = ("frols",)
@@ -33,24 +33,25 @@ _RULE_FIELDS = ("select", "keep", "err", "criterion", "exchange", "error", "cand
 
 
 def check_candidate_count(candidates: int, samples: int) -> None:
-    """Raise if a selection has more candidates than samples to tell them apart by.
+    """Raise if a selection has more candidates than samples.
 
     Raises
     ------
     InvalidSettings
+        If so.
     """
     if samples < candidates:
         raise InvalidSettings(
             "/model/terms",
-            f"{candidates} candidates cannot be told apart by {samples} samples; give longer "
+            f"{candidates} candidates cannot be distinguished with {samples} samples; give longer "
             "records, a lower degree or fewer lags",
         )
 
 
 class PolynomialEquation(NamedTuple):
-    """The right-hand side of y(k) = …, its coefficients and terms.
+    """Right-hand side of y(k) = …, with its coefficients and terms.
 
-    With a rule the terms are candidates, and so are the coefficients.
+    With a rule, terms and coefficients are those of the candidates.
     """
 
     tree: Expression
@@ -62,8 +63,8 @@ class PolynomialEquation(NamedTuple):
 def expand_polynomial(
     reader: DocumentReader, fields: Mapping[str, Any], scope: Scope
 ) -> PolynomialEquation:
-    """What a document's lags, degree and terms say."""
-    known, written = reader.count_faults(), fields.get("terms", "all")
+    """Build the equation from a document's lags, degree and terms."""
+    faults_before, written = reader.count_faults(), fields.get("terms", "all")
     selects = isinstance(written, Mapping)
     terms = (
         _read_candidates(reader, fields, scope) if selects else _read_terms(reader, fields, scope)
@@ -74,8 +75,8 @@ def expand_polynomial(
         detail = f"gives {len(terms)} coefficients; at most {MAX_PARAMETERS} are allowed"
         reader.add_fault("/terms", detail)
         terms = ()
-    # Where lags or degree are at fault it is not known how many candidates there will be.
-    candidates = len(terms) if reader.count_faults() == known else 0
+    # With faults in lags or degree the number of candidates is unknown.
+    candidates = len(terms) if reader.count_faults() == faults_before else 0
     rule = _read_rule(reader, written, candidates) if selects else None
     coefficients = _read_coefficients(reader, fields.get("coefficients"), terms)
     return PolynomialEquation(
@@ -96,9 +97,9 @@ def _read_rule(reader: DocumentReader, written: Mapping[str, Any], candidates: i
     if keep is None and err is None and fields.get("criterion", "none") == "none":
         reader.add_fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
     error = reader.read_choice(fields.get("error", "one-step"), get_args(ErrorKind), "/terms/error")
-    # Without candidates, that is the fault to tell.
-    all_of_them = keep is None or most == 0
-    number = max(most, 1) if all_of_them else _read_term_count(reader, keep, candidates, most)
+    # Without candidates another fault has been reported already.
+    keeps_all = keep is None or most == 0
+    number = max(most, 1) if keeps_all else _read_term_count(reader, keep, candidates, most)
     return TermRule(number, err, cast(Criterion, criterion), exchange, cast(ErrorKind, error))
 
 
@@ -113,12 +114,12 @@ def _read_share(reader: DocumentReader, written: object) -> float:
 def _read_term_count(reader: DocumentReader, keep: object, candidates: int, most: int) -> int:
     is_whole = isinstance(keep, int) and not isinstance(keep, bool)
     if is_whole and cast(int, keep) > most:
-        few = (
+        limit = (
             f"the document has {candidates} candidate terms"
             if most == candidates
             else (f"a model may have {most} coefficients")
         )
-        reader.add_fault("/terms/keep", f"found {keep}, but {few}; need 1 to {most}")
+        reader.add_fault("/terms/keep", f"found {keep}, but {limit}; need 1 to {most}")
         return most
     return reader.read_whole_number(keep, "/terms/keep", 1, most)
 
@@ -139,10 +140,10 @@ def _wants_constant(reader: DocumentReader, fields: Mapping[str, Any]) -> bool:
     return _read_flag(reader, fields.get("constant", False), "/constant")
 
 
-def _read_flag(reader: DocumentReader, found: object, place: str) -> bool:
-    if not isinstance(found, bool):
-        reader.add_fault(place, f"{quote_value(found)} is not true or false")
-    return found is True
+def _read_flag(reader: DocumentReader, value: object, place: str) -> bool:
+    if not isinstance(value, bool):
+        reader.add_fault(place, f"{quote_value(value)} is not true or false")
+    return value is True
 
 
 def _read_terms(
@@ -154,7 +155,7 @@ def _read_terms(
             return ()  # the constant alone
         return _read_listed_terms(reader, written, scope, "/terms", MAX_PARAMETERS)
     if written != "all":
-        need = "is not 'all' or a list of terms, nor asks for a selection"
+        need = "is not 'all', a list of terms or a selection"
         reader.add_fault("/terms", f"{quote_value(written)} {need}")
     return _build_all_terms(reader, fields, scope, MAX_PARAMETERS)
 
@@ -169,10 +170,10 @@ def _build_all_terms(
     values = _read_regressors(reader, fields, scope)
     count = comb(len(values) + degree, degree) - 1
     if count > most:
-        what = "coefficients" if most == MAX_PARAMETERS else "candidates"
+        kind = "coefficients" if most == MAX_PARAMETERS else "candidates"
         detail = (
-            f"degree {degree} of {len(values)} past values gives {count} {what}; at most "
-            f"{most} are allowed: lower it, or list the terms"
+            f"degree {degree} of {len(values)} past values gives {count} {kind}; at most "
+            f"{most} are allowed. Lower the degree, or list the terms."
         )
         reader.add_fault("/degree", detail)
         return ()
@@ -186,11 +187,11 @@ def _build_all_terms(
 def _read_regressors(
     reader: DocumentReader, fields: Mapping[str, Any], scope: Scope
 ) -> tuple[PastValue, ...]:
-    """V1 … Vs of Eq. 2: the past values that the document's lags name."""
+    """Read the regressors V1 … Vs of Eq. 2 from the document's lags."""
     lags = reader.require_field(
         fields, "lags", "", "name the past values, such as {y: [1], u: [1]}"
     )
-    found: list[PastValue] = []
+    regressors: list[PastValue] = []
     for name, entries in reader.read_section(lags, "/lags").items():
         place = join_pointer("lags", name)
         if name not in scope.signals:
@@ -198,39 +199,42 @@ def _read_regressors(
         elif not isinstance(entries, list | tuple) or not entries:
             reader.add_fault(place, f"{quote_value(entries)} is not a list of lags in samples")
         else:
-            found += [
+            regressors += [
                 value
                 for number, entry in enumerate(entries)
                 if (value := _read_regressor(reader, name, entry, f"{place}/{number}", scope))
             ]
-    for number, value in enumerate(found):
-        if value in found[:number]:
+    for number, value in enumerate(regressors):
+        if value in regressors[:number]:
             reader.add_fault(
                 join_pointer("lags", value.name), f"{format_expression(value)} is listed twice"
             )
-    return tuple(found)
+    return tuple(regressors)
 
 
 def _read_regressor(
     reader: DocumentReader, name: str, entry: object, place: str, scope: Scope
 ) -> PastValue | None:
-    known = reader.count_faults()
-    silent = Scope("difference", parameters=scope.parameters, constants=scope.constants)
-    checked = check_expression(reader.read_expression(entry, place), silent)
+    faults_before = reader.count_faults()
+    parameter_scope = Scope("difference", parameters=scope.parameters, constants=scope.constants)
+    checked = check_expression(reader.read_expression(entry, place), parameter_scope)
     add_faults(reader, checked, place)
-    if reader.count_faults() > known or checked.tree is None:
+    if reader.count_faults() > faults_before or checked.tree is None:
         return None
-    found = split_index(Binary("-", Symbol("k", "index"), checked.tree), scope)
-    if isinstance(found, str):
-        reader.add_fault(place, found)
+    index = split_index(Binary("-", Symbol("k", "index"), checked.tree), scope)
+    if isinstance(index, str):
+        reader.add_fault(place, index)
         return None
-    value = PastValue(name, "state" if name in scope.states else "input", *found)
+    value = PastValue(name, "state" if name in scope.states else "input", *index)
     return _reject_present(reader, value, place)
 
 
 def _reject_present(reader: DocumentReader, value: PastValue, place: str) -> PastValue | None:
     if value.kind == "state" and value.offset == 0:
-        detail = f"{format_expression(value)} may reach the present {value.name}(k); need a lag of 1 or more"
+        detail = (
+            f"{format_expression(value)} may reach the present {value.name}(k); "
+            "need a lag of 1 or more"
+        )
         reader.add_fault(place, detail)
         return None
     return value
@@ -244,11 +248,11 @@ def _read_listed_terms(
         reader.add_fault(where, "the list is empty; name at least one term, such as y(k-1)")
     if len(written) > most:
         reader.add_fault(where, f"has {len(written)} terms; at most {most} are allowed")
-    for number, one in enumerate(written[:most]):
-        place, known = f"{where}/{number}", reader.count_faults()
-        checked = check_expression(reader.read_expression(one, place), scope)
+    for number, entry in enumerate(written[:most]):
+        place, faults_before = f"{where}/{number}", reader.count_faults()
+        checked = check_expression(reader.read_expression(entry, place), scope)
         add_faults(reader, checked, place)
-        if checked.tree is None or reader.count_faults() > known:
+        if checked.tree is None or reader.count_faults() > faults_before:
             continue
         factors = _split_factors(checked.tree)
         if factors is None:
@@ -262,7 +266,7 @@ def _read_listed_terms(
 
 
 def _split_factors(tree: Expression) -> tuple[PastValue, ...] | None:
-    """The past values whose product a tree is, states first; None if it is none."""
+    """Split a product into its past values, states first; None if it is not such a product."""
     match tree:
         case PastValue():
             return (tree,)
@@ -282,7 +286,7 @@ def _split_factors(tree: Expression) -> tuple[PastValue, ...] | None:
 def _read_coefficients(
     reader: DocumentReader, entry: object, terms: Sequence[Term]
 ) -> tuple[Parameter, ...]:
-    known = reader.count_faults()
+    faults_before = reader.count_faults()
     fields = reader.read_section(entry, "/coefficients", ("lower", "upper", "scale", "unit"))
     ends = {}
     for bound in ("lower", "upper"):
@@ -292,7 +296,7 @@ def _read_coefficients(
     scale = reader.read_choice(
         fields.get("scale", "linear"), ("linear", "log"), "/coefficients/scale"
     )
-    if reader.count_faults() > known:
+    if reader.count_faults() > faults_before:
         return ()
     try:
         return tuple(
@@ -316,7 +320,7 @@ def _build_product(term: Term) -> Expression:
 
 
 def _build_sum(terms: Sequence[Expression]) -> Expression:
-    """The sum in halves: hundreds of terms, yet a shallow tree."""
+    """Add terms in halves, so that the tree of hundreds of terms stays shallow."""
     if not terms:
         return Number(0.0)
     if len(terms) == 1:

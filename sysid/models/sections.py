@@ -1,4 +1,4 @@
-"""The parts of a model document that every form has: names, parameters, start and solver."""
+"""Sections of a model document that all forms share: names, parameters, initial, solver."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ _DIFFERENTIAL_FIELDS = ("method", "step")
 def check_names(
     reader: DocumentReader, form: EquationForm, sections: Mapping[str, Sequence[str]]
 ) -> None:
-    """Fault every name that is not one, is taken by the language, or is declared twice."""
+    """Add a fault for every name that is invalid, reserved, or declared twice."""
     taken: dict[str, str] = {}
     words = list_reserved_names(form)
     for section, names in sections.items():
@@ -50,7 +50,7 @@ def check_names(
 
 
 def read_signals(reader: DocumentReader, value: object, place: str) -> tuple[ModelSignal, ...]:
-    """Signals with their units: ``{q: N}``."""
+    """Read signals with their units: ``{q: N}``."""
     fields = reader.read_section(value, place, most=MAX_EQUATIONS)
     return tuple(
         ModelSignal(k, reader.read_unit(v, place + join_pointer(k))) for k, v in fields.items()
@@ -58,20 +58,20 @@ def read_signals(reader: DocumentReader, value: object, place: str) -> tuple[Mod
 
 
 def read_constants(reader: DocumentReader, value: object) -> dict[str, float]:
-    """Known numbers: ``{m: 1.0}``."""
+    """Read constants: ``{m: 1.0}``."""
     fields = reader.read_section(value, "/constants")
     return {k: reader.read_number(v, join_pointer("constants", k)) for k, v in fields.items()}
 
 
 def read_parameters(reader: DocumentReader, value: object) -> tuple[Parameter, ...]:
-    """Parameters; one with faults is left out."""
+    """Read parameters; those with faults are left out."""
     fields = reader.read_section(value, "/parameters", most=MAX_PARAMETERS)
-    found = (_read_parameter(reader, name, entry) for name, entry in fields.items())
-    return tuple(parameter for parameter in found if parameter is not None)
+    parameters = (_read_parameter(reader, name, entry) for name, entry in fields.items())
+    return tuple(parameter for parameter in parameters if parameter is not None)
 
 
 def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Parameter | None:
-    place, known = join_pointer("parameters", name), reader.count_faults()
+    place, faults_before = join_pointer("parameters", name), reader.count_faults()
     fields = reader.read_section(entry, place, _PARAMETER_FIELDS)
     if isinstance(entry, Mapping) or entry is None:
         for bound in ("lower", "upper"):
@@ -91,7 +91,7 @@ def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Paramet
         reader.add_fault(
             place + "/tied", "a parameter is either fixed or tied; leave one of them out"
         )
-    if reader.count_faults() > known:
+    if reader.count_faults() > faults_before:
         return None
     try:
         return Parameter(name, unit=unit, scale=cast(ParameterScale, scale), tied=tied, **numbers)
@@ -101,7 +101,7 @@ def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Paramet
 
 
 def get_interval(parameter: Parameter) -> tuple[float, float]:
-    """Values a parameter can take: its bounds, or the one value at which it is fixed."""
+    """Return the interval of a parameter: its bounds, or twice its fixed value."""
     if parameter.fixed is not None:
         return (parameter.fixed, parameter.fixed)
     return (parameter.lower, parameter.upper)
@@ -110,7 +110,7 @@ def get_interval(parameter: Parameter) -> tuple[float, float]:
 def read_initial_states(
     reader: DocumentReader, value: object, states: Sequence[str], default: InitialState
 ) -> tuple[InitialState, ...]:
-    """How each state starts."""
+    """Read the initial value of each state."""
     fields = reader.read_section(value, "/initial")
     for name in fields:
         if name not in states:
@@ -131,33 +131,37 @@ def _read_initial_state(reader: DocumentReader, value: object, place: str) -> In
     if isinstance(value, Mapping):
         fields = reader.read_section(value, place, ("lower", "upper"))
         for bound in ("lower", "upper"):
-            reader.require_field(fields, bound, place, "an estimated start needs both bounds")
+            reader.require_field(
+                fields, bound, place, "an estimated initial state needs both bounds"
+            )
         lower, upper = (reader.read_number(fields.get(b) or 0.0, place) for b in ("lower", "upper"))
         if len(fields) == 2 and not lower < upper:
             reader.add_fault(place, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
         return EstimatedInitial(lower, upper)
     if isinstance(value, bool) or not isinstance(value, int | float):
         need = "need a number, {lower, upper} to estimate it, or measured"
-        reader.add_fault(place, f"{quote_value(value)} is no start of a state; {need}")
+        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {need}")
         return FixedInitial(0.0)
     return FixedInitial(reader.read_number(value, place))
 
 
 def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solver:
-    """How the model is integrated and how past values are read.
+    """Read the integration method and how past values are read.
 
-    A difference equation may take several steps in a sampling period (`substeps`); the terms of
-    a polynomial are samples, so it may not.
+    A difference equation may take several steps in a sampling period (`substeps`). A polynomial
+    may not, because its terms are samples.
     """
     fields = reader.read_section(value, "/solver", _SOLVER_FIELDS)
     for name in (name for name in _list_foreign_fields(form) if name in fields):
         detail = "belongs to the differential form; a difference equation steps by samples"
         if name == "substeps":
-            detail = "is of no use to a polynomial, whose terms are samples"
+            detail = "has no effect on a polynomial, whose terms are samples"
         reader.add_fault(join_pointer("solver", name), detail)
-    plain = Solver()
+    defaults = Solver()
     choices: dict[str, Any] = {
-        name: reader.read_choice(fields.get(name, getattr(plain, name)), options, "/solver/" + name)
+        name: reader.read_choice(
+            fields.get(name, getattr(defaults, name)), options, "/solver/" + name
+        )
         for name, options in (
             ("method", get_args(SolverMethod)),
             ("history", get_args(HistoryKind)),
@@ -170,7 +174,7 @@ def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solve
 
 
 def _list_foreign_fields(form: ModelForm) -> tuple[str, ...]:
-    """Fields of a solver that mean nothing in this form."""
+    """List the solver fields that do not apply to this form."""
     fields = {"difference": _DIFFERENTIAL_FIELDS, "polynomial": (*_DIFFERENTIAL_FIELDS, "substeps")}
     return fields.get(form, ())
 

@@ -1,8 +1,8 @@
-"""Parameters tied to others: ``b = 2*a``, put into the model's equations before they are compiled.
+"""Ties between parameters, such as ``b = 2*a``; substituted into the equations before compiling.
 
 A tie is an expression of other parameters and the model's constants, in the language of the
-equations. Those others may be free, fixed, or tied themselves, as long as no circle arises. In the
-end every tie says what a parameter is in terms of parameters that are not tied.
+equations. The other parameters may be free, fixed or tied themselves, as long as the ties are not
+circular. A resolved tie contains only parameters that are not tied.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,24 +18,24 @@ from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 
 Ties = Mapping[str, Expression]
-"""What each tied parameter is, in terms of free and fixed ones."""
+"""Expression of each tied parameter, in free and fixed ones."""
 
 
 def resolve_ties(model: Model, parameters: Sequence[Parameter]) -> Ties:
-    """The ties of a problem's parameters, resolved.
+    """Resolve the ties of a problem's parameters.
 
     Parameters
     ----------
     model : Model
-        For its constants.
+        Its constants may occur in ties.
     parameters : sequence of Parameter
-        All of the problem's.
+        All parameters of the problem.
 
     Raises
     ------
     InvalidSettings
-        With the pointer of a tie that does not parse, names what is not there, changes with time
-        or leads back to its own parameter.
+        With the pointer of a tie that cannot be parsed, has unknown names, changes with time or is
+        circular.
     """
     written = {
         p.name: _parse_tie(model, parameters, p.name, p.tied)
@@ -49,7 +49,7 @@ def resolve_ties(model: Model, parameters: Sequence[Parameter]) -> Ties:
 
 
 def apply_ties(model: Model, ties: Ties) -> Model:
-    """The model with every tied parameter replaced, in the lags of past values too."""
+    """Replace every tied parameter in a model, also in the delays of past values."""
     if not ties:
         return model
     return replace(
@@ -63,43 +63,43 @@ def apply_ties(model: Model, ties: Ties) -> Model:
 
 
 def _substitute_ties(tree: Expression, ties: Ties) -> Expression:
-    def tied(node: Expression) -> Expression | None:
+    def find_tie(node: Expression) -> Expression | None:
         match node:
             case Symbol(name, "parameter"):
                 return ties.get(name)
             case _:
                 return None
 
-    return substitute(tree, tied)
+    return substitute(tree, find_tie)
 
 
 def _parse_tie(model: Model, parameters: Sequence[Parameter], name: str, text: str) -> Expression:
     pointer = f"/parameters/{name}/tied"
-    own = {p.name for p in model.parameters}
-    if name not in own:
+    own_names = {p.name for p in model.parameters}
+    if name not in own_names:
         raise InvalidSettings(
             pointer, f"{name!r} is an initial state, which cannot be tied; fix it or leave it free"
         )
-    others = {p.name: (p.lower, p.upper) for p in parameters if p.name in own}
+    others = {p.name: (p.lower, p.upper) for p in parameters if p.name in own_names}
     constants = {key: float(v) for key, v in model.document.get("constants", {}).items()}
-    found = check_expression(text, Scope("differential", parameters=others, constants=constants))
-    if found.tree is None:
-        column, detail = found.faults[0]
+    checked = check_expression(text, Scope("differential", parameters=others, constants=constants))
+    if checked.tree is None:
+        column, detail = checked.faults[0]
         raise InvalidSettings(pointer, f"column {column} of {text!r}: {detail}")
-    if mentions_time(found.tree):
+    if mentions_time(checked.tree):
         raise InvalidSettings(pointer, f"{text!r} changes with time; tie it to parameters only")
-    return found.tree
+    return checked.tree
 
 
 def _resolve_tie(
     name: str, written: Ties, resolved: dict[str, Expression], path: tuple[str, ...]
 ) -> None:
-    """Put the ties that a tie names into it, theirs first."""
+    """Substitute the ties that a tie refers to, after theirs are resolved."""
     if name in path:
         circle = " → ".join((*path[path.index(name) :], name))
         raise InvalidSettings(
             f"/parameters/{name}/tied",
-            f"the ties go in a circle, {circle}; leave one of these parameters free or fix it",
+            f"the ties are circular, {circle}; leave one of these parameters free or fix it",
         )
     if name in resolved:
         return
@@ -109,7 +109,7 @@ def _resolve_tie(
 
 
 def collect_parameter_names(tree: Expression) -> set[str]:
-    """Names of the parameters in an expression, and in the lags of its past values."""
+    """Collect the parameters of an expression, including the delays of its past values."""
     return {
         node.name for node in walk(tree) if isinstance(node, Symbol) and node.kind == "parameter"
     }

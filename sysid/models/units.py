@@ -1,18 +1,14 @@
-"""Whether the channels of all records are in the units of the model, and of one another.
+"""Unit checks: delays, time constants, and the channels of records.
 
-Whether parameters in another unit of time than seconds are read in seconds.
+A model treats units as labels. ``u(t - L)`` reads L in seconds, whatever its unit. A delay in
+minutes would be estimated in seconds and reported in minutes, so it is refused.
 
-Units are labels to a model: dx/dt is per second, so ``(u - x)/T`` reads T in seconds, whatever its
-unit says. A time constant in minutes would be estimated in seconds and told in minutes. Equations
-that convert it, as ``(u - x)/(60*T)``, multiply it by a number wherever they read it, or the sum in
-which it stands; those that read it as it stands, or within a function, may do so on purpose: they
-are warned of, not refused. Of a ratio of two such parameters nothing is to be converted.
-Lags, which have nothing but a time in them, are refused (`sysid.models.units`).
+dx/dt is per second, so ``(u - x)/T`` reads T in seconds. Equations that convert T, such as
+``(u - x)/(60*T)``, multiply it, or the sum that contains it, by a number. Equations that read T
+without a factor, or inside a function, may do so on purpose. They get a warning. A ratio of two
+such parameters needs no conversion.
 
-Whether the unit of an unknown lag is the one in which lags are counted.
-
-Units are labels to a model: ``u(t - L)`` reads L in seconds, whatever its unit says. A lag in
-minutes would be estimated in seconds and told in minutes.
+Channels of all records must have the units of the model, and the same units in every record.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -41,28 +37,30 @@ _SECONDS = "s"
 
 
 def check_delay_units(reader: DocumentReader, model: Model) -> None:
-    """Report each parameter that is a lag as it stands, in another unit than that of lags."""
-    units = {one.name: one.unit for one in model.parameters}
+    """Add a fault for each parameter that is a delay without a factor, in a wrong unit."""
+    units = {signal.name: signal.unit for signal in model.parameters}
     form: EquationForm = "differential" if model.form == "differential" else "difference"
-    told = set()
-    for tree in (*model.equations, *(one.expression for one in model.outputs)):
+    reported = set()
+    for tree in (*model.equations, *(signal.expression for signal in model.outputs)):
         for past in collect_past_values(tree):
             for name, in_periods in _find_bare_delays(past):
                 size = find_conversion_factor(units.get(name, "1"), _SECONDS)
                 in_seconds = form == "differential" or in_periods
-                if size is None or (size == 1.0 and in_seconds) or name in told:
+                if size is None or (size == 1.0 and in_seconds) or name in reported:
                     continue
-                told.add(name)
+                reported.add(name)
                 detail = _describe_delay_unit(name, units[name], size, form, in_periods=in_periods)
                 reader.add_fault(join_pointer("parameters", name, "unit"), detail)
 
 
 def _find_bare_delays(past: PastValue) -> Iterator[tuple[str, bool]]:
-    """Parameters that a lag adds without a factor, and whether they are divided by the period."""
+    """Find parameters that a delay adds without a factor, and if they are divided by h."""
     if past.delay is None:
         return
     for monomial, coefficient in collect_terms(past.delay).items():
-        name = _match_single_parameter(tuple(one for one in monomial if one != _INVERSE_PERIOD))
+        name = _match_single_parameter(
+            tuple(factor for factor in monomial if factor != _INVERSE_PERIOD)
+        )
         if name is not None and coefficient == 1.0:
             yield name, _INVERSE_PERIOD in monomial
 
@@ -79,53 +77,56 @@ def _describe_delay_unit(
     name: str, unit: str, size: float, form: EquationForm, *, in_periods: bool
 ) -> str:
     if size == 1.0:
-        return f"found {unit!r}, but this lag counts samples: write {name}/h, or the unit samples"
+        return f"found {unit!r}, but this delay is in samples: write {name}/h, or the unit samples"
     clock = "t" if form == "differential" else "k"
     right = f"{clock} - {size:.12g}*{name}" + ("" if form == "differential" else "/h")
     if form == "difference" and not in_periods:
-        return f"found {unit!r}, but this lag counts samples: write {right}, or the unit samples"
-    return f"found {unit!r}, but this lag counts seconds: give it in s, or write {right}"
+        return f"found {unit!r}, but this delay is in samples: write {right}, or the unit samples"
+    return f"found {unit!r}, but this delay is in seconds: give it in s, or write {right}"
 
 
 def list_time_unit_warnings(model: Model) -> list[str]:
-    """One sentence for each parameter of a differential model that is read as if in seconds."""
+    """List warnings: parameters of a differential model that are read as if in seconds."""
     if model.form != "differential":
         return []
-    sizes = {one.name: find_conversion_factor(one.unit, "s") for one in model.parameters}
-    units = {one.name: one.unit for one in model.parameters}
-    known = {name: size for name, size in sizes.items() if size is not None}
-    bare = {name for tree in model.equations for name in _find_bare_parameters(tree, known)}
+    sizes = {
+        parameter.name: find_conversion_factor(parameter.unit, "s")
+        for parameter in model.parameters
+    }
+    units = {parameter.name: parameter.unit for parameter in model.parameters}
+    time_sizes = {name: size for name, size in sizes.items() if size is not None}
+    bare = {name for tree in model.equations for name in _find_bare_parameters(tree, time_sizes)}
     return [
-        f"{name} has the unit {units[name]}, but the equations read it as it stands, and their "
-        f"rates are per second: unless that is meant, give it in s, or write {size:.12g}*{name}"
+        f"{name} has the unit {units[name]}, but the equations read it unconverted, and their "
+        f"rates are per second. Unless that is intended, give it in s, or write {size:.12g}*{name}."
         for name, size in sizes.items()
         if name in bare and size not in (None, 1.0)
     ]
 
 
 def _find_bare_parameters(tree: Expression, sizes: Mapping[str, float]) -> Iterator[str]:
-    """Parameters that a term has without a number to multiply them; `sizes` in seconds."""
+    """Find parameters that a term contains without a numeric factor; `sizes` in seconds."""
     for monomial, coefficient in collect_terms(tree).items():
         if abs(coefficient) == 1.0:
             yield from _collect_uncancelled_names(monomial, sizes)
-        for one, _ in monomial:
-            for part in _list_inner_terms(one):
+        for factor, _ in monomial:
+            for part in _list_inner_terms(factor):
                 yield from _find_bare_parameters(part, sizes)
 
 
 def _collect_uncancelled_names(monomial: Monomial, sizes: Mapping[str, float]) -> list[str]:
-    """Parameters of a product, none where their units cancel out."""
-    found = {
-        one.name: power
-        for one, power in monomial
-        if isinstance(one, Symbol) and one.kind == "parameter" and one.name in sizes
+    """Collect the parameters of a product; none if their units cancel out."""
+    powers = {
+        factor.name: power
+        for factor, power in monomial
+        if isinstance(factor, Symbol) and factor.kind == "parameter" and factor.name in sizes
     }
-    cancel = isclose(prod(sizes[name] ** power for name, power in found.items()), 1.0)
-    return [] if cancel else list(found)
+    cancel = isclose(prod(sizes[name] ** power for name, power in powers.items()), 1.0)
+    return [] if cancel else list(powers)
 
 
 def _list_inner_terms(node: Expression) -> tuple[Expression, ...]:
-    """Of what stands in a product as a whole, the terms inside."""
+    """List the terms inside a factor of a product."""
     match node:
         case PastValue():
             return ()
@@ -139,53 +140,52 @@ _MAX_SHOWN = 40  # characters of a unit in a message
 
 
 class SignalUnits:
-    """Unit of every signal of a model: its own, or where it has none that of the first record.
+    """Unit of every signal of a model: the model's, else that of the first record.
 
-    A channel without a unit, with the unit 1, or with one that cannot be read may be anything.
+    A channel may be in any unit if its unit is missing, 1, or cannot be parsed.
     """
 
     def __init__(self, model: Model) -> None:
-        signals = [(one.name, one.unit) for one in model.inputs]
-        signals += [(one.name, one.unit) for one in model.outputs]
-        whose = f"model {model.name!r}"
-        self._known = {name: (unit, whose) for name, unit in signals if not is_blank_unit(unit)}
+        signals = [(signal.name, signal.unit) for signal in model.inputs]
+        signals += [(signal.name, signal.unit) for signal in model.outputs]
+        owner = f"model {model.name!r}"
+        self._known = {name: (unit, owner) for name, unit in signals if not is_blank_unit(unit)}
 
     def describe_mismatch(self, signal: str, channel: str, unit: str | None, where: str) -> str:
-        """What is wrong with the unit of a channel that is to be a signal; empty if nothing is.
+        """Describe how a channel's unit differs from its signal's; empty if it does not.
 
         Parameters
         ----------
         channel, unit : str
-            Of the record; `where` says which it is.
+            Of the record, which `where` names.
         """
         if unit is None or is_blank_unit(unit):
             return ""
-        own, whose = self._known.setdefault(signal, (unit, where))
-        if is_readable_unit(unit) and not is_readable_unit(
-            own
-        ):  # which tells more of the records that follow
+        expected, owner = self._known.setdefault(signal, (unit, where))
+        # A readable unit checks more of the records that follow.
+        if is_readable_unit(unit) and not is_readable_unit(expected):
             self._known[signal] = (unit, where)
-        found = describe_difference(unit, own)
-        if not found:
+        difference = describe_difference(unit, expected)
+        if not difference:
             return ""
-        if find_conversion_factor(unit, own) is None:
-            cure = "correct the one that is wrong"
+        if find_conversion_factor(unit, expected) is None:
+            cure = "correct the wrong unit"
         else:
-            cure = f'convert the data, by the derivation {{"unit": {{"{channel}": "{own}"}}}}'
+            cure = f'convert the data with the derivation {{"unit": {{"{channel}": "{expected}"}}}}'
         role = "" if channel == signal else f" (signal {signal!r})"
         return (
-            f"channel {channel!r}{role} is in {unit} in {where}, but in {whose} it is in {own}: "
-            f"{found}; {cure}"
+            f"channel {channel!r}{role} is in {unit} in {where}, but in {owner} it is in {expected}: "
+            f"{difference}; {cure}"
         )
 
 
 def check_signal_units(model: Model, records: Sequence[Record]) -> None:
-    """Raise if a channel is in another unit than the model has, or than a record before has.
+    """Raise if a channel's unit differs from the model's, or from an earlier record's.
 
     Raises
     ------
     InvalidRecord
-        Naming the channel and both units.
+        If so; the message names the channel and both units.
     """
     units = SignalUnits(model)
     for number, record in enumerate(records, 1):
@@ -197,55 +197,53 @@ def check_signal_units(model: Model, records: Sequence[Record]) -> None:
 
 
 def list_unknown_unit_warnings(channels: Iterable[Channel]) -> list[str]:
-    """What to say of channels whose units nobody knows, such as ``bat`` for ``bar``."""
+    """List warnings: channels with unknown units, such as ``bat`` for ``bar``."""
     return [
-        f"channel {one.name!r}: {_quote_unit(one.unit)} is no known unit, so it is kept as it is "
-        f"written and compared with no other{suggest_unit(one.unit)}"
-        for one in channels
-        if not (is_blank_unit(one.unit) or is_known_unit(one.unit))
+        f"channel {channel.name!r}: {_quote_unit(channel.unit)} is no known unit, so it is not compared "
+        f"with other units{suggest_unit(channel.unit)}"
+        for channel in channels
+        if not (is_blank_unit(channel.unit) or is_known_unit(channel.unit))
     ]
 
 
 def list_unread_unit_warnings(model: Model, records: Sequence[Record]) -> list[str]:
-    """Channels of which nobody can tell whether they are in the unit of the model."""
-    found = {}
-    known = {one.name: one.unit for one in model.inputs}
-    known |= {one.name: one.unit for one in model.outputs}
+    """List warnings: channels whose unit cannot be compared with the model's."""
+    warnings = {}
+    model_units = {text.name: text.unit for text in model.inputs}
+    model_units |= {text.name: text.unit for text in model.outputs}
     for record in records:
         for channel in (*record.inputs, *record.outputs):
-            unit, own = channel.unit, known.get(channel.name, "")
-            unread = [one for one in (unit, own) if not is_readable_unit(one)]
+            unit, expected = channel.unit, model_units.get(channel.name, "")
+            unread = [text for text in (unit, expected) if not is_readable_unit(text)]
             if unread and not (
-                is_blank_unit(unit) or is_blank_unit(own) or unit.strip() == own.strip()
+                is_blank_unit(unit) or is_blank_unit(expected) or unit.strip() == expected.strip()
             ):
-                found[channel.name, unit] = (
-                    f"channel {channel.name!r} is in {unit}, and in the model it is in {own}: "
-                    f"{' and '.join(unread)} could not be read as a unit, so they were not compared"
+                warnings[channel.name, unit] = (
+                    f"channel {channel.name!r} is in {unit}, but in {expected} in the model. The units were not "
+                    f"compared, because {' and '.join(unread)} could not be read as a unit."
                 )
-    return list(found.values())
+    return list(warnings.values())
 
 
 def list_mixed_unit_warnings(model: Model, records: Sequence[Record]) -> list[str]:
-    """Channels of one quantity in two units, where the model does not give the units of both.
+    """List warnings: one quantity in two units, if the model does not declare both units.
 
-    What is found then holds for these units: a gain of 1 between kPa and Pa is one of 1000.
+    The estimates hold for these units: a gain of 1 between kPa and Pa is a gain of 1000.
     """
-    free = {one.name for one in model.inputs if is_blank_unit(one.unit)}
-    free |= {one.name for one in model.outputs if is_blank_unit(one.unit)}
+    undeclared = {signal.name for signal in model.inputs if is_blank_unit(signal.unit)}
+    undeclared |= {signal.name for signal in model.outputs if is_blank_unit(signal.unit)}
     units: dict[str, str] = {}
-    for (
-        record
-    ) in records:  # those of the first stand for all: `check_signal_units` has compared them
+    for record in records:  # the first unit stands for all: `check_signal_units` has compared them
         for channel in (*record.inputs, *record.outputs):
             if not is_blank_unit(channel.unit):
                 units.setdefault(channel.name, channel.unit)
     return [
-        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not say in "
-        "which units both are: the numbers were taken as they are, so a gain between the two is in "
-        f"these units, whatever stands beside it ({describe_difference(units[a], units[b])}); to have both "
-        f'in one unit, convert the data, by the derivation {{"unit": {{"{a}": "{units[b]}"}}}}'
+        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not declare "
+        "both units, so a gain between them is in these units "
+        f"({describe_difference(units[a], units[b])}). "
+        f'To convert, derive the data with {{"unit": {{"{a}": "{units[b]}"}}}}.'
         for a, b in combinations(units, 2)
-        if free & {a, b} and find_conversion_factor(units[a], units[b]) not in (None, 1.0)
+        if undeclared & {a, b} and find_conversion_factor(units[a], units[b]) not in (None, 1.0)
     ]
 
 

@@ -66,8 +66,8 @@ class Actuator:
         if self.F_max < self.F_c:
             raise InvalidSettings(
                 "/parameters/F_max",
-                f"{self.F_max:g} N·m is below the Coulomb friction of {self.F_c:g} N·m; need as "
-                "much or more",
+                f"{self.F_max:g} N·m is below the Coulomb friction of {self.F_c:g} N·m; need at "
+                "least as much",
             )
 
 
@@ -96,7 +96,9 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
     if not 2 <= times.size <= MAX_SAMPLES:
         raise InvalidRecord(f"found {times.size} samples; need from 2 to {MAX_SAMPLES}")
     if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):
-        raise InvalidRecord("the supply pressure needs a value at every time, and later times")
+        raise InvalidRecord(
+            "the supply pressure needs a finite value at every time, and increasing times"
+        )
     _check_duration(float(times[-1]) - float(times[0]))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
         found = _simulate_samples(_ActuatorState(actuator), supply)
@@ -115,7 +117,7 @@ def _check_duration(duration: float) -> None:
         raise InvalidSettings(
             "/sample_time",
             f"the record lasts {duration:g} s; the actuator can be simulated for "
-            f"{MAX_WORK * _MAX_PIECE:g} s at most: ask for fewer samples or a smaller sample_time",
+            f"at most {MAX_WORK * _MAX_PIECE:g} s. Request fewer samples or a smaller sample_time.",
         )
 
 
@@ -131,7 +133,7 @@ def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
             raise InvalidSettings(
                 "/parameters",
                 f"with these values the actuator's state is not finite at t = {times[k + 1]:g} s; "
-                "choose others nearer to its own, or a smaller supply pressure",
+                "choose values nearer to the defaults, or a smaller supply pressure",
             )
         found[k + 1] = plant.state[_THETA], plant.state[_P]
     return found
@@ -208,8 +210,8 @@ class _ActuatorState:
         if self._work > MAX_WORK:
             raise InvalidSettings(
                 "/samples",
-                f"the arm stops and breaks away so often that the state would be advanced more "
-                f"than {MAX_WORK} times; ask for fewer samples, or parameters nearer to its own",
+                f"the arm stops and breaks away so often that the simulation takes more than "
+                f"{MAX_WORK} steps. Request fewer samples, or choose parameters nearer to the defaults.",
             )
         key = (self._way, time)
         matrix = self._known.get(key)

@@ -88,8 +88,8 @@ class Tube:
             raise InvalidSettings(
                 "/parameters/cells",
                 f"found {self.cells}, each {self.length_m / self.cells:g} m long; need "
-                f"{ceil(self.length_m / _MAX_CELL_LENGTH)} or more for {self.length_m:g} m, or 0: "
-                "as many as are right for its length",
+                f"{ceil(self.length_m / _MAX_CELL_LENGTH)} or more for {self.length_m:g} m, or 0 "
+                "for the default number",
             )
 
     @property
@@ -140,7 +140,7 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
     if not np.all(np.isfinite(found)):
         raise InvalidRecord(
             "the flow in the tube becomes too fast for this scheme; give smaller or slower "
-            "changes of pressure"
+            "pressure changes"
         )
     ends = found - ATMOSPHERE
     return Recording(
@@ -158,8 +158,8 @@ def _count_substeps(tube: Tube, samples: int, period: float) -> int:
     if not work <= MAX_WORK:
         raise InvalidSettings(
             "/samples",
-            f"{samples} samples of {tube.n_cells} cells take {work:.2g} cell steps, and may "
-            f"take {MAX_WORK:.2g}; ask for fewer samples or cells",
+            f"{samples} samples of {tube.n_cells} cells take {work:.2g} cell steps; at "
+            f"most {MAX_WORK:.2g} are allowed. Request fewer samples or cells.",
         )
     return ceil(substeps)
 
@@ -172,7 +172,7 @@ def _check_inlet_period(inlet: Channel) -> float:
     if not lowest > -0.9 * ATMOSPHERE:
         raise InvalidRecord(
             f"the inlet pressure falls to {lowest:g} Pa above atmosphere; need more than "
-            f"{-0.9 * ATMOSPHERE:g} Pa, at every sample"
+            f"{-0.9 * ATMOSPHERE:g} Pa at every sample"
         )
     return float(times[-1] - times[0]) / (times.size - 1)
 

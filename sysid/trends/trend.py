@@ -119,8 +119,8 @@ def fit_trend(
         if not laws:
             return Trend(
                 reason=f"the {different} values of x, {np.min(places):g} to {np.max(places):g}, "
-                "or the estimates there, are too far apart in size for doubles: no law is "
-                "determined; write x in a unit in which they are of like size"
+                "or the estimates there, are too far apart in size for doubles. No law is "
+                "determined. Give x in a unit that makes them similar in size."
             )
         chosen = min(laws, key=lambda law: law.aic)  # of equals the line, which comes first
         return Trend(

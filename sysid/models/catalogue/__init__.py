@@ -1,1 +1,1 @@
-"""The built-in systems, as documents in the model language."""
+"""Built-in systems, as documents in the model language."""

@@ -1,4 +1,4 @@
-"""The catalogue of built-in models, and loading a model from wherever it is."""
+"""Catalogue of built-in models; loading of models by name, document or file."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -16,26 +16,26 @@ _CATALOGUE_FOLDER = Path(__file__).parent
 
 @cache
 def catalogue() -> tuple[str, ...]:
-    """Names of the built-in models, in alphabetical order."""
+    """List the names of the built-in models, in alphabetical order."""
     return tuple(sorted(path.stem for path in _CATALOGUE_FOLDER.glob("*.yaml")))
 
 
 def copy_catalogue_document(name: str) -> dict[str, Any]:
-    """The document of a built-in model, to read or to change.
+    """Return a copy of a built-in model's document.
 
     Raises
     ------
     UnknownModel
-        With the nearest known name.
+        If there is none; the message suggests the nearest name.
     """
     return deepcopy(_load_catalogue_document(name))
 
 
 def load_model(source: str | Mapping[str, Any] | Path) -> Model:
-    """A model of the catalogue by its name, of a document, or of a YAML or JSON file.
+    """Load a model: by its name in the catalogue, from a document, or from a YAML or JSON file.
 
-    A text is only ever a name: files are read for a `Path` alone, so that a name that came over
-    a network cannot open one.
+    A text is always a name. Only a `Path` reads a file, so that a name from a network request
+    cannot open one.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def load_model(source: str | Mapping[str, Any] | Path) -> Model:
 
 
 def read_document(path: Path) -> Any:
-    """The data of a YAML or JSON file.
+    """Read the data of a YAML or JSON file.
 
     Raises
     ------
@@ -81,5 +81,5 @@ def _load_catalogue_model(name: str) -> Model:
 def _load_catalogue_document(name: str) -> dict[str, Any]:
     if name not in catalogue():
         raise UnknownModel(name, catalogue())
-    found: dict[str, Any] = read_document(_CATALOGUE_FOLDER / f"{name}.yaml")
-    return found
+    document: dict[str, Any] = read_document(_CATALOGUE_FOLDER / f"{name}.yaml")
+    return document

@@ -236,7 +236,7 @@ def test_options_that_cannot_be_used_are_refused() -> None:
         Problem.build(model, data, parameters={"q": {"fixed": 1.0}})
     with pytest.raises(InvalidBounds):
         Problem.build(model, data, parameters={"c": {"lower": 2.0}})
-    with pytest.raises(InvalidSettings, match=r"need \(P, 4\)"):
+    with pytest.raises(InvalidSettings, match=r"Need \(P, 4\)"):
         Problem.build(model, data).evaluate_fitness(np.zeros((3, 5)))
     tiny_steps = lag_element(solver={"step": 1e-9})
     with pytest.raises(InvalidSettings, match="the limit is"):
