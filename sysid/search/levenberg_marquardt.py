@@ -1,6 +1,6 @@
-"""A step of Levenberg–Marquardt inside the box of places: differences, equations, damped steps.
+"""Levenberg–Marquardt steps within bounds: differences, normal equations, damped steps.
 
-With the soft-l1 loss the residuals are weighted by 1/√(1 + (e/s)²) (iteratively reweighted
+With the soft-l1 loss the residuals are weighted by 1/√(1 + (e/s)²) (iteratively reweighted least
 squares).
 """
 
@@ -14,29 +14,29 @@ from sysid.simulation.loss import compute_loss_weight as _plain_weight
 compute_loss = jit_compile(_plain_loss)
 _compute_loss_weight = jit_compile(_plain_weight)
 
-FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below what curvature needs
+FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below the scale of curvature
 
 
 @jit_compile
-def compute_inner_product(one: FloatArray, other: FloatArray, count: int) -> float:
-    """Inner product of the first `count` entries, as four sums that do not wait for each other."""
+def compute_inner_product(first: FloatArray, second: FloatArray, count: int) -> float:
+    """Compute the inner product of the first `count` entries, as four independent sums."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     whole = count // 4 * 4
     for m in range(0, whole, 4):
-        a += one[m] * other[m]
-        b += one[m + 1] * other[m + 1]
-        c += one[m + 2] * other[m + 2]
-        d += one[m + 3] * other[m + 3]
+        a += first[m] * second[m]
+        b += first[m + 1] * second[m + 1]
+        c += first[m + 2] * second[m + 2]
+        d += first[m + 3] * second[m + 3]
     for m in range(whole, count):
-        a += one[m] * other[m]
+        a += first[m] * second[m]
     return (a + b) + (c + d)
 
 
 @jit_compile
 def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArray]:
-    """A point (D,) and its D neighbours (D + 1, D), each one parameter off, and these' distances.
+    """Return a point (D,) with its D neighbours, (D + 1, D), and their signed distances (D,).
 
-    They lie away from the nearer bound.
+    Each neighbour differs in one parameter, away from the nearer bound.
     """
     n = point.size
     places, steps = np.empty((n + 1, n)), np.empty(n)
@@ -52,16 +52,16 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
 def form_normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ, its lower half, and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss."""
+    """Form JᵀJ (lower half) and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss."""
     d, n = columns.shape
     if scale > 0.0:
-        rooted, rows = np.empty(n), np.empty((d, n))
+        weighted_error, weighted_columns = np.empty(n), np.empty((d, n))
         for m in range(n):
-            root = np.sqrt(_compute_loss_weight(error[m], scale))
-            rooted[m] = root * error[m]
+            weight_root = np.sqrt(_compute_loss_weight(error[m], scale))
+            weighted_error[m] = weight_root * error[m]
             for i in range(d):
-                rows[i, m] = root * columns[i, m]
-        error, columns = rooted, rows
+                weighted_columns[i, m] = weight_root * columns[i, m]
+        error, columns = weighted_error, weighted_columns
     matrix, gradient = np.zeros((d, d)), np.empty(d)
     for i in range(d):
         gradient[i] = compute_inner_product(columns[i], error, n)
@@ -74,10 +74,10 @@ def form_normal_equations(
 def factor_damped(
     matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float
 ) -> FloatArray:
-    """Lower Cholesky factor of A + λ diag A, with zero rows for parameters that stay.
+    """Compute the lower Cholesky factor of A + λ diag A, with zero rows for parameters that stay.
 
-    These are the parameters at a bound that would leave the box, those to which the output is
-    insensitive, and those whose effect is a combination of others' (no positive pivot).
+    These are parameters at a bound that would leave it, parameters without effect on the output,
+    and parameters whose effect is a combination of others' (no positive pivot).
     """
     n = point.size
     factor = np.zeros((n, n))
@@ -113,7 +113,7 @@ def _move_within_bounds(point: FloatArray, step: FloatArray, place: FloatArray) 
 
 @jit_compile
 def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
-    """The step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
+    """Solve the step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
     step = np.zeros(gradient.size)
     for d in range(gradient.size):
         if factor[d, d] > 0.0:
@@ -131,7 +131,7 @@ def write_damped_step(
 ) -> float:
     """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
 
-    Gives −gᵀ of what is left of the step there: its promised gain, in the loss's linear part.
+    Returns the promised gain, −gᵀ times the step within the bounds: the linear part of the loss.
     """
     step = solve_step(factor_damped(matrix, gradient, point, damping), gradient)
     _move_within_bounds(point, step, place)
@@ -147,7 +147,8 @@ def write_spread_place(
 ) -> None:
     """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
 
-    Long where the output is insensitive, short across the valley. `factor` is that of A.
+    The distance is long where the output is insensitive, and short across the valley. `factor` is
+    that of A.
     """
     _solve_transposed(factor, deviation)
     _move_within_bounds(point, deviation, place)

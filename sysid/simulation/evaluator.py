@@ -16,7 +16,7 @@ from sysid.kernels.layout import HEAD_FIELDS
 
 
 class Evaluator(NamedTuple):
-    """A problem as compiled code sees it; passed to Numba functions as it is.
+    """A problem as compiled code reads it, passed unchanged to Numba functions.
 
     Attributes
     ----------

@@ -172,7 +172,7 @@ class Problem:
 
     @property
     def loss(self) -> Loss:
-        """What is minimised."""
+        """Loss that is minimised."""
         return self.settings.loss
 
     @property
@@ -191,24 +191,24 @@ class Problem:
         return Problem.from_settings, (self.untied_model, self.records, self.settings)
 
     def replace_outputs(self, records: Sequence[Record]) -> "Problem":
-        """What `build` would make of records that differ in the values of their outputs only.
+        """Build the problem again for records that differ in the values of their outputs only.
 
-        Where their noise is all that runs have of their own, most of the work is done once.
+        If runs differ in their noise only, most of the work is done once.
         """
-        skip, since = self.settings.skip, self.settings.scored_from
+        skip, scoring_starts = self.settings.skip, self.settings.scored_from
         per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
         experiments = tuple(
             replace_outputs(
-                laid,
+                placed,
                 self.model,
                 record,
                 e,
                 self.all_parameters,
                 per_output,
                 skip,
-                -np.inf if since is None else since[e],
+                -np.inf if scoring_starts is None else scoring_starts[e],
             )
-            for e, (laid, record) in enumerate(zip(self.experiments, records, strict=True))
+            for e, (placed, record) in enumerate(zip(self.experiments, records, strict=True))
         )
         evaluator = _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
         return replace(
@@ -220,7 +220,7 @@ class Problem:
         )
 
     def evaluate_fitness(self, theta: FloatArray) -> FloatArray:
-        """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""
+        """Compute J of individuals (P, D) → (P,); smaller is better, ``inf`` if one diverged."""
         return evaluate_population(
             self.evaluator, _check_population(theta, len(self.free_parameters))
         )
