@@ -197,6 +197,7 @@ def _to_law_out(law: TrendLaw, is_chosen: bool) -> LawOut:
         law=law.kind,
         formula=FORMULAS[law.kind],
         is_chosen=is_chosen,
+        birge=law.birge_ratio,
         coefficients=[
             dict(zip(names, coefficient, strict=True)) for coefficient in law.coefficients
         ],

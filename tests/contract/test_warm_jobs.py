@@ -29,7 +29,7 @@ class KeepingCrew(InlineExecutor):
         self.warm = {}
 
     def submit_pack(self, pack, keys, shared):
-        self.warm_starts.update({item.run: item.spec.warm for item in pack})
+        self.warm.update({item.run: item.spec.warm_starts for item in pack})
         return super().submit_pack(pack, keys, shared)
 
 

@@ -250,7 +250,7 @@ def test_steps_that_are_too_long_for_a_stable_loop_are_not_blamed_on_its_gain(
         served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422, "invalid"
     )
     assert fault["pointer"] == "/sample_time"
-    assert "the loop is stable, but steps of 10 s are too long to simulate it" in fault["detail"]
+    assert "The loop is stable, but steps of 10 s are too long to simulate it" in fault["detail"]
     wild = {**body, "control": {**CONTROL, "gain": 1e30}}
     [fault] = refused(
         served.server.post(f"/v1/runs/{served.lag}:simulate", json=wild), 422, "invalid"

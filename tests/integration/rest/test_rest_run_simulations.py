@@ -254,7 +254,7 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
         ),
         ({"inputs": {"P_a": STEP}}, "/inputs/P_a", "the controller computes this input"),
         ({"inputs": {"u": STEP}}, "/inputs/u", "no input 'u'"),
-        ({"control": None}, "/inputs/P_a", "give input 'P_a'"),
+        ({"control": None}, "/inputs/P_a", "input 'P_a' is missing"),
         ({"parameters": {"Fc": 1.0}}, "/parameters/Fc", "did you mean 'F_c'"),
         ({"samples": 1}, "/samples", "2"),
         ({"samples": 2_000_000}, "/samples", "1000000"),
@@ -349,4 +349,4 @@ def test_a_lag_that_would_look_ahead_is_refused(served: Served) -> None:
             given = {**body, "model": "fopdt", "sample_time": 0.1, "parameters": values}
         [fault] = refused(served.server.post(path, json=given), 422, "invalid")
         assert fault["pointer"] == "/parameters/L"
-        assert "found -1; with it the lag of" in fault["detail"]
+        assert "u(t - L) can be as small as -1 s" in fault["detail"]
