@@ -1,1 +1,1 @@
-"""The paper's tables and figures as real jobs; used by its command alone."""
+"""Reproduce the paper's tables and figures by real jobs; only `lagid paper` uses it."""

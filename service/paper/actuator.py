@@ -1,4 +1,4 @@
-"""Table 4, Figures 20 and 21: the pneumatic actuator, open loop and in a closed loop."""
+"""Table 4, Figures 20 and 21: the pneumatic actuator in open and closed loop."""
 
 from collections.abc import Mapping
 from math import pi
@@ -14,14 +14,14 @@ from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.oscillators import format_estimate
 
 TITLE = "Table 4, Figures 20 and 21: pneumatic actuator"
-# The paper's proposed column, with k_b = k_a: only then do six numbers follow from P_a and θ. It
-# gives no A_m and no B; those of the catalogue stand in.
+# The paper's proposed column, with k_b = k_a: only then P_a and θ determine the parameters. The
+# paper has no A_m and no B; the catalogue's values replace them.
 TRUE_PARAMETERS = {
     name: published.TABLE_4.proposed[name] for name in ("J", "F_c", "F_max", "k_a", "k_c")
 }
 PARAMETER_NAMES = (*TRUE_PARAMETERS, "k_b")
 SIGMA, SAMPLES, SAMPLE_TIME = 1e-3, 800, 0.01
-# Waves that break the arm away and let it stick again and again.
+# Waves that make the arm break away and stick repeatedly.
 INPUT_EXPRESSION = (
     "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.7*t + 1) + 0.5*sin(14.5*t + 2) + 0.5*sin(1.1*t*t))"
 )
@@ -32,7 +32,7 @@ SEPARATE_K_B = {"k_b": {"lower": 5, "upper": 500, "scale": "log"}}
 
 
 def record_body() -> dict[str, Any]:
-    """Body of the record: the reference plant, exact between its events, not the model fitted."""
+    """Build the request of the record: the reference plant, exact between events, not the model."""
     return {
         "name": "paper Table 4: actuator",
         "plant": "actuator",
@@ -45,7 +45,7 @@ def record_body() -> dict[str, Any]:
 
 
 def job_body(record: str, parameters: Mapping[str, Any], reading: str) -> dict[str, Any]:
-    """Body of the job; the arm starts at rest in the middle."""
+    """Build the request of the job; the arm starts at rest in the middle."""
     return {
         "name": f"paper Table 4: {reading}",
         "model": "actuator",
@@ -56,7 +56,7 @@ def job_body(record: str, parameters: Mapping[str, Any], reading: str) -> dict[s
 
 
 def loop_body(parameters: Mapping[str, float]) -> dict[str, Any]:
-    """Body of the simulation of Figure 21: a step of 90° under P control through the tube."""
+    """Build the request of Figure 21: a step of 90° under P control through the tube."""
     return {
         "samples": LOOP_SAMPLES,
         "sample_time": SAMPLE_TIME,
@@ -73,7 +73,7 @@ def loop_body(parameters: Mapping[str, float]) -> dict[str, Any]:
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
-    """The corrected reading with its closed loop, then the equations as printed."""
+    """Build the corrected reading with its closed loop, then the equations as printed."""
     record = bench.client.simulate_dataset(record_body())["id"]
     return [_corrected_section(bench, record), _printed_section(bench, record)]
 
@@ -88,10 +88,10 @@ def _corrected_section(bench: StudyBench, record: str) -> Section:
     return Section(
         f"{TITLE}, k_b = k_a and A_m given",
         "Model `actuator` (Eq. 23 to 25) from the pressure difference to the angle of the arm. "
-        "The paper's records are not published, so the reference plant makes one with its own "
-        f"estimates as the truth, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. The "
-        "paper gives neither A_m nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs "
-        "from k_a, which no record of P_a and θ can show apart from A_m (next section).",
+        "The paper's records are not published. The reference plant simulates one with the paper's "
+        f"estimates as true values, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. The "
+        "paper has neither A_m nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs "
+        "from k_a. No record of P_a and θ can determine k_b separately from A_m (next section).",
         [_estimates_table(found, "Table 4"), _step_table(steps, exact)],
         _build_plots(found, steps, exact),
         _build_checks(found, steps, exact),
@@ -108,18 +108,18 @@ def _printed_section(bench: StudyBench, record: str) -> Section:
         if one["value"] is not None
     )
     return Section(
-        f"{TITLE}, as printed: k_b sought beside k_a",
-        "The six numbers of Table 4 sought together, as printed. Multiplying k_b and k_c, and J, "
-        "F_c, F_max and B, by one factor leaves the angle nearly as it is (B is fixed here and "
-        "hardly shows), so the data hold five numbers and a ridge."
-        + (f" What lagid names instead of the single values: {told}." if told else ""),
+        f"{TITLE}, as printed: k_b and k_a both estimated",
+        "The six numbers of Table 4 are estimated together, as printed. Multiply k_b, k_c, J, F_c, "
+        "F_max and B by one factor: the angle nearly stays the same. (B is fixed here and has "
+        "little effect.) So the data determine five numbers, and the sixth direction is a ridge."
+        + (f" lagid reports combinations instead of the single values: {told}." if told else ""),
         [_estimates_table(found, "Table 4, as printed")],
         [
             Plot(
                 "Figure 20, as printed: RMS of the best individual",
                 figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
                 "Paper: falls gradually under the proposed search. Ours: "
-                f"{_format_final_rms(found)}. A low RMS does not make six numbers out of five.",
+                f"{_format_final_rms(found)}. A low RMS does not determine six numbers.",
             )
         ],
         links=[found["improved"].run["job"]],
@@ -154,8 +154,8 @@ def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
         title,
         [*headings, *(f"ours, {m}" for m in METHODS)],
         rows,
-        "k_a, k_b are rates in 1/s and k_c is in Pa/rad (printed without its kilo); the table of "
-        "the paper says N·m/Pa of all three.",
+        "k_a and k_b are rates in 1/s. k_c is in Pa/rad (printed without its kilo). The paper's "
+        "table has N·m/Pa for all three.",
     )
 
 
@@ -215,15 +215,15 @@ def _build_plots(
         Plot(
             "Figure 21: step response under P control",
             figures.plot_lines(data, "time [s]", "angle θ [°]"),
-            "Paper: the response of the proposed search's model lies on the experiment's, that "
-            "of the simple search beside it. Ours: the loop closed around each identified "
-            "model, against the true parameters in place of the experiment.",
+            "Paper: the response of the proposed search's model lies on the experiment's. That of "
+            "the simple search lies near it. Ours: the loop closed around each identified model, "
+            "compared with the true parameters instead of the experiment.",
         ),
         Plot(
             "Response to the record's input",
             figures.plot_responses(found),
-            "Not in the paper: the record itself, with breaks in its course where the arm "
-            "sticks, and what is left of it.",
+            "Not in the paper: the record itself, with breaks where the arm sticks, and the "
+            "residuals.",
         ),
     ]
 
@@ -253,7 +253,7 @@ def _build_checks(
 
 
 def _greatest_distance(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
-    """Greatest distance in degrees between two responses that may be thinned differently."""
+    """Greatest difference (degrees) between two responses, which may be thinned differently."""
     a, b = one["outputs"][0], other["outputs"][0]
     there = np.interp(a["times"], b["times"], b["values"])
     return _to_degrees(float(np.max(np.abs(np.asarray(a["values"]) - there))))

@@ -1,4 +1,4 @@
-"""Submits the jobs of the study, waits for them, and reads what the figures need."""
+"""Submit the jobs of the study, wait for them, and read the data of the figures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,22 +38,22 @@ class MethodRun:
     response: Document
 
     def get_estimate(self, name: str) -> float:
-        """An estimate."""
+        """Return the estimate of a parameter."""
         return float(self.get_parameter(name)["value"])
 
     def get_standard_error(self, name: str) -> float | None:
-        """Its standard error; None where there is none."""
+        """Return the standard error of a parameter; None if there is none."""
         found = self.get_parameter(name)["stderr"]
         return None if found is None else float(found)
 
     def get_parameter(self, name: str) -> Document:
-        """The entry of one parameter."""
+        """Return the entry of one parameter."""
         return next(one for one in self.run["parameters"] if one["name"] == name)
 
 
 @dataclass(frozen=True, slots=True)
 class StudyBench:
-    """The service that does the work. `quick` asks for smaller studies; `say` tells what is on."""
+    """Client of the service for the study; `quick` requests smaller jobs, `say` shows progress."""
 
     client: Client
     quick: bool
@@ -76,20 +76,20 @@ class StudyBench:
         return self.client.runs(job["id"])
 
     def compare_methods(self, body: Document) -> dict[str, MethodRun]:
-        """One job that compares the three methods on one problem: method → what it found."""
+        """Run one job that compares the three methods on one problem: method → its run."""
         axes = [{"path": "/algorithm/method", "values": list(METHODS)}]
         runs = self.run_job({**body, "sweep": {"axes": axes}})
         return {run["cell"]["/algorithm/method"]: self.read_run(run) for run in runs}
 
     def read_run(self, run: Document) -> MethodRun:
-        """A run with its history and response."""
+        """Read a run with its history and response."""
         history = self.client.history(run["id"])
         response = self.client.response(run["id"], max_points=RESPONSE_POINTS)
         return MethodRun(run, champion_history(history), response)
 
 
 def champion_history(history: Document) -> list[ArchipelagoImprovement]:
-    """The best of all islands over the generations, from the history of each island."""
+    """Compute the best of all islands over the generations, from each island's history."""
     points = [one for island in history["islands"] for one in island]
     kept: list[ArchipelagoImprovement] = []
     for point in sorted(points, key=lambda one: (one["generation"], -one["rms"])):

@@ -19,10 +19,11 @@ def cramer_rao_bound(
     sigma: float,
     times: NDArray[np.float64],
 ) -> dict[str, float]:
-    """Least standard deviation that an unbiased estimator can reach, parameter by parameter.
+    """Compute each parameter's smallest standard deviation that an unbiased estimator can reach.
 
-    The square roots of the diagonal of σ²(SᵀS)⁻¹, S the central differences of the first output
-    by each parameter of `true`, for white Gaussian measurement noise of deviation `sigma`.
+    For white Gaussian measurement noise of standard deviation `sigma`, these are the square roots
+    of the diagonal of σ²(SᵀS)⁻¹. S has the central differences of the first output by each
+    parameter of `true`.
     """
 
     def output(name: str, shift: float) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a report is made of: tables, figures and text, as plain values."""
+"""Parts of a report as plain values: tables, figures and text."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ class ReportTable:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A figure and its caption: what the paper shows, what ours shows."""
+    """A figure, and a caption that compares it with the paper's."""
 
     title: str
     figure: Mapping[str, Any]
@@ -26,7 +26,7 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A statement that the study was to bear out, and whether it did."""
+    """A statement that the study checks, and whether it holds."""
 
     text: str
     holds: bool
@@ -45,7 +45,7 @@ class Section:
 
 
 def to_markdown(section: Section) -> str:
-    """The tables and statements of a section for the terminal; figures are in the report."""
+    """Write the tables and checks of a section for the terminal; figures are in the report."""
     blocks = [f"## {section.title}"]
     if section.text:
         blocks.append(section.text)
@@ -59,7 +59,7 @@ def to_markdown(section: Section) -> str:
 
 
 def describe_check(check: Check) -> str:
-    """How a check is announced."""
+    """Describe the outcome of a check."""
     return "holds" if check.holds else "does NOT hold"
 
 

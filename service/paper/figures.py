@@ -1,4 +1,4 @@
-"""Figures of the study that compare methods; their looks are those of `service.figures.plotly`."""
+"""Draw the study's figures that compare methods, in the layout of `service.figures.plotly`."""
 
 from collections.abc import Mapping, Sequence
 from math import ceil, floor, log10
@@ -19,16 +19,16 @@ _METHOD_STYLES: Mapping[str, dict[str, Any]] = {
     "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
 }
 HEIGHT_PX = 320
-PLOT_GAP = 0.07  # half the room between two plots, as a share of the width
+PLOT_GAP = 0.07  # half the gap between two plots, as a share of the width
 
 
 def method_style(method: str) -> dict[str, Any]:
-    """Colour and dash of a method, the same in every figure."""
+    """Return colour and dash of a method, the same in every figure."""
     return dict(_METHOD_STYLES[method])
 
 
 def line_trace(name: str, x: Sequence[float], y: Sequence[float | None], **looks: Any) -> Line:
-    """A line of a figure."""
+    """Build a line of a figure."""
     values = to_json_numbers(float("nan") if v is None else v for v in y)
     return {
         "type": "scatter",
@@ -41,12 +41,12 @@ def line_trace(name: str, x: Sequence[float], y: Sequence[float | None], **looks
 
 
 def make_axis(title: str, **more: Any) -> dict[str, Any]:
-    """An axis with its title."""
+    """Build an axis with its title."""
     return {"title": {"text": title}, **more}
 
 
 def plot_lines(data: list[Line], x: str, y: str, **more: Any) -> Figure:
-    """One pair of axes."""
+    """Draw lines in one pair of axes."""
     return {
         "data": data,
         "layout": base_layout(HEIGHT_PX, **{"xaxis": make_axis(x), "yaxis": make_axis(y), **more}),
@@ -56,7 +56,7 @@ def plot_lines(data: list[Line], x: str, y: str, **more: Any) -> Figure:
 def plot_convergence(
     found: Mapping[str, MethodRun], names: Sequence[str], true: Mapping[str, float]
 ) -> Figure:
-    """Champion's parameters over the generations, method by method, one plot a parameter."""
+    """Draw the champion's parameters over the generations, by method, one plot per parameter."""
     end = _last_generation(found)
     data: list[Line] = []
     axes: dict[str, Any] = {}
@@ -88,9 +88,9 @@ def plot_convergence(
 def plot_rms_history(
     found: Mapping[str, MethodRun], unit: str, noise: float | None = None, *, scale: float = 1.0
 ) -> Figure:
-    """RMS of the champion over the generations, method by method, and the noise's deviation.
+    """Draw the champion's RMS over the generations, by method, and the noise's deviation.
 
-    `scale` turns the results' unit into `unit`, which is also that of `noise`.
+    `scale` converts the results' unit into `unit`, which is also the unit of `noise`.
     """
     end = _last_generation(found)
     data = []
@@ -111,7 +111,7 @@ def plot_rms_history(
 
 
 def decade_marks(low: float, high: float) -> list[float]:
-    """Marks 1, 2, 5, 10 … of a logarithmic axis around what is drawn; Plotly's own drop zeros."""
+    """Compute ticks 1, 2, 5, 10 … of a logarithmic axis; Plotly's own ticks omit the zeros."""
     if not 0 < low <= high:
         return []
     first, last = floor(log10(low)) - 1, ceil(log10(high)) + 1
@@ -123,7 +123,7 @@ def decade_marks(low: float, high: float) -> list[float]:
 
 
 def plot_responses(found: Mapping[str, MethodRun], experiment: int = 0) -> Figure:
-    """The measured output and what each method's model gives; below, what is left of it."""
+    """Draw the measured output and each method's model output; below, the residuals."""
     first = next(iter(found.values())).response["experiments"][experiment]["measured"][0]
     dots = {"mode": "markers", "marker": {"color": theme.GREY, "size": 4}}
     data = [line_trace("measured", first["times"], first["values"], **dots)]
@@ -154,7 +154,7 @@ def _to_array(values: Sequence[float | None]) -> Floats:
 def band_trace(
     x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str
 ) -> Line:
-    """The area between two lines, in the method's colour."""
+    """Draw the area between two lines in the method's colour."""
     colour = theme.SHADE if method == "" else theme.fade(method_style(method)["color"], 0.16)
     around = [*x, *reversed(x)], [*upper, *reversed(lower)]
     return line_trace(
@@ -169,7 +169,7 @@ def band_trace(
 
 
 def marker_trace(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Line:
-    """Single runs of a method."""
+    """Draw single runs of a method."""
     marker = {"color": method_style(method)["color"], "size": 4, "opacity": 0.45}
     return line_trace(name, x, y, mode="markers", marker=marker, showlegend=False)
 

@@ -1,4 +1,4 @@
-"""Figure 15 with the noise where the equations have it: as a force, and as Eq. 16 prints it."""
+"""Figure 15 with noise inside the equation: as a force, and as printed in Eq. 16."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,14 +13,14 @@ from service.paper.oscillators import EXAMPLE_1
 
 FORCE_SIGMAS = (0.1, 0.5, 1.0, 2.0)
 PRINTED_SIGMAS = (0.01, 0.1)  # m
-# φ(t) in Eq. 13 is a force, so it comes into the recursion with h²/m; Eq. 16 adds it bare.
+# φ(t) in Eq. 13 is a force, so the recursion needs it with h²/m; Eq. 16 adds it without.
 BARE_TERM = "q(k-2))/m"
 NOISE_TERMS = {
     "force": ("q(k-2) - sigma*phi(k-2))/m", "N"),
     "printed": ("q(k-2))/m + sigma*phi(k-2)", "m"),
 }
 N_DRAWS = 20
-# Draws of unit deviation, one a channel; the models scale them.
+# Draws of unit deviation, one per channel; the models scale them.
 NOISE_MODEL = {
     "name": "noise",
     "form": "difference",
@@ -33,11 +33,11 @@ SAMPLING = {"samples": published.SAMPLES, "sample_time": published.SAMPLE_TIME}
 
 
 def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Example 1's recursion with φ as a second input."""
+    """Build Example 1's recursion with φ as a second input."""
     after, unit = NOISE_TERMS[kind]
     equation = str(known["equations"]["x"])
     if equation.count(BARE_TERM) != 1:
-        raise ValueError(f"the recursion {equation!r} has no {BARE_TERM!r} to put the noise beside")
+        raise ValueError(f"the recursion {equation!r} must contain {BARE_TERM!r} exactly once")
     return {
         **known,
         "name": f"duffing-{kind}-noise",
@@ -48,7 +48,7 @@ def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def build_section(bench: StudyBench, exact: str) -> Section:
-    """Both ways; `exact` is the dataset without any noise."""
+    """Build the section for both kinds of noise; `exact` is the dataset without noise."""
     draws = 3 if bench.quick else 8
     known = bench.client.model(EXAMPLE_1.recursion)["document"]
     bench.say("paper Figure 15: records with noise inside the equation")
@@ -83,10 +83,10 @@ def build_section(bench: StudyBench, exact: str) -> Section:
     }
     return Section(
         "Figure 15, the noise inside the equation",
-        "Eq. 13 has φ(t) beside the force q(t), so in Eq. 16 it ought to be h²φ(k)/m; there it "
-        f"moves the mass and cannot be told from its dynamics. {len(records)} records of "
-        f"{draws} draws for each σ, identified without knowledge of φ, the error taken against "
-        "the response without φ. As printed, φ(k) is added to the displacement at every step.",
+        "Eq. 13 adds φ(t) to the force q(t), so Eq. 16 should have h²φ(k)/m. Such noise moves the "
+        f"mass and cannot be separated from its dynamics. {len(records)} records, {draws} draws "
+        "for each σ, are identified without φ. The error is against the response without φ. As "
+        "printed, φ(k) is added to the displacement at every step.",
         [
             ReportTable(
                 "φ as a force: median error of the identified response [m]",
@@ -107,8 +107,8 @@ def build_section(bench: StudyBench, exact: str) -> Section:
                 "Figure 15: φ as a force",
                 _plot_errors(runs, medians),
                 "Paper: low up to σ about 0.5, then rising. Ours: medians and single runs. Force "
-                "noise bends the estimates of every method alike, since a search for the free "
-                "run's error takes the motion that φ made for the system's own.",
+                "noise biases the estimates of every method alike. Minimising the simulation error "
+                "treats motion caused by φ as the system's own.",
             )
         ],
         links=[runs[0]["job"]],
@@ -116,7 +116,7 @@ def build_section(bench: StudyBench, exact: str) -> Section:
 
 
 def job_body(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]:
-    """Body of the job: every record with every method."""
+    """Build the request of the job: every record with every method."""
     return {
         "name": "paper Figure 15: force noise",
         "model": EXAMPLE_1.recursion,
@@ -139,7 +139,7 @@ def job_body(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]
 def _simulate_record(
     bench: StudyBench, model: dict[str, Any], noise: str, sigma: float, draw: int
 ) -> str | None:
-    """A record of the model driven by q and by a draw of φ; None if it diverges."""
+    """Simulate the model driven by q and by a draw of φ; None if it diverges."""
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": published.OMEGA}
     phi = {"kind": "dataset", "dataset": noise, "channel": f"phi_{draw}"}
     try:

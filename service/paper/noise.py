@@ -20,7 +20,7 @@ QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True, slots=True)
 class ReplicateErrors:
-    """What the replicates of one σ and one method gave."""
+    """Errors of the replicates of one σ and one method."""
 
     sigma: float
     values: Sequence[float]
@@ -28,7 +28,7 @@ class ReplicateErrors:
 
 
 def noise_free_body(samples: int) -> dict[str, Any]:
-    """Body of a record without noise."""
+    """Build the request of a record without noise."""
     return {
         **record_body(EXAMPLE_1, list_readings(EXAMPLE_1)[0]),
         "name": "paper example 1, no noise",
@@ -38,9 +38,10 @@ def noise_free_body(samples: int) -> dict[str, Any]:
 
 
 def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
-    """Body of the sweep: noise is added to `record`, and the RMS on `exact` is the model's error.
+    """Build the request of the sweep: noise is added to `record`; `exact` gives the model's error.
 
-    They must be two datasets; one has a sample more.
+    The error is the RMS on `exact`. The two must be different datasets, so one has an additional
+    sample.
     """
     together = {"range": [0, replicates], "zip": "replicate"}
     return {
@@ -63,7 +64,7 @@ def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
 def group_replicates(
     runs: Sequence[dict[str, Any]], field: str
 ) -> dict[str, list[ReplicateErrors]]:
-    """Quantiles of one field of the results over the replicates, by method and σ."""
+    """Compute quantiles of one result field over the replicates, by method and σ."""
     found: dict[str, list[ReplicateErrors]] = {}
     for method in METHODS:
         for sigma in SIGMAS:
@@ -80,12 +81,12 @@ def group_replicates(
 
 
 def response_floor(sigma: float) -> float:
-    """Error of the response (RMS) when the parameters reach the Cramér–Rao bound: σ √(p/N)."""
+    """Compute the response's RMS error at the parameters' Cramér–Rao bound: σ √(p/N)."""
     return sigma * sqrt(len(EXAMPLE_1.true) / published.SAMPLES)
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
-    """The sweep as a table and two figures."""
+    """Build the section of the sweep: a table and two figures."""
     replicates = 3 if bench.quick else 20
     record, exact = (
         bench.client.simulate_dataset(noise_free_body(published.SAMPLES + more))["id"]
@@ -96,8 +97,8 @@ def build_sections(bench: StudyBench) -> list[Section]:
     return [
         Section(
             "Figure 15: noise and RMS error",
-            f"Example 1, Eq. 16 with cos(ωhk); white Gaussian noise on the displacement, "
-            f"{replicates} draws of noise and of the search for each σ, {len(runs)} identifications "
+            f"Example 1, Eq. 16 with cos(ωhk), with white Gaussian noise on the displacement. "
+            f"{replicates} draws of noise and search seed for each σ: {len(runs)} identifications "
             "in one job. Error: the identified response against the response without noise.",
             [_median_table(errors)],
             [
@@ -105,19 +106,21 @@ def build_sections(bench: StudyBench) -> list[Section]:
                     "Figure 15: error of the identified response",
                     plot_spread(errors, True),
                     "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
-                    "10 to 90 % (band) and single runs (points). The error of `improved` grows in "
-                    "proportion to σ from the start, along the floor σ√(p/N), without a knee. The "
-                    "two methods of the paper have an error of their search besides, which hides "
-                    "that of the noise while σ is small: a flat part and a rise like the paper's. "
-                    "Where the noise is great a search that stops early does not follow the noise "
-                    "either, so there the simple one is no worse; the parameters' bounds hold all "
-                    "below the floor, which knows no bounds.",
+                    "10 to 90 % (band) and single runs (points). The error of `improved` is "
+                    "proportional to σ from the start, along the bound σ√(p/N), without a knee. "
+                    "The paper's two methods also have a search error. It hides the noise's error "
+                    "at small σ: a flat part and a rise like the paper's. At large noise, a "
+                    "search that stops early does not fit the noise, so the simple one is no "
+                    "worse. "
+                    "The parameters' bounds keep all errors below the Cramér–Rao bound, which "
+                    "ignores them.",
                 ),
                 Plot(
                     "Figure 15, measured otherwise: RMS against the noisy record",
                     plot_spread(fits, False),
-                    "The paper does not say against which record. Against the noisy one every RMS "
-                    "is at least about σ, so it shows the noise and not the identification.",
+                    "The paper does not say which record it compares with. Against the noisy one, "
+                    "every RMS is at least about σ. It then shows the noise, not the "
+                    "identification.",
                 ),
             ],
             _build_checks(errors),
@@ -128,7 +131,7 @@ def build_sections(bench: StudyBench) -> list[Section]:
 
 
 def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
-    """Median, band and points over σ."""
+    """Draw median, band and points over σ."""
     data = []
     for method, spread in found.items():
         x = [one.sigma for one in spread]
@@ -140,7 +143,7 @@ def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> di
             figures.line_trace(method, x, middle, line=figures.method_style(method)),
         ]
     level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
-    name = "Cramér–Rao floor σ√(p/N)" if with_floor else "σ"
+    name = "Cramér–Rao bound σ√(p/N)" if with_floor else "σ"
     least = [response_floor(s) if with_floor else s for s in SIGMAS]
     data.append(figures.line_trace(name, list(SIGMAS), least, line=level))
     return figures.plot_lines(data, "standard deviation of the noise σ [m]", "RMS error [m]")
@@ -155,7 +158,7 @@ def _median_table(found: dict[str, list[ReplicateErrors]]) -> ReportTable:
         ]
         for n, sigma in enumerate(SIGMAS)
     ]
-    return ReportTable("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao floor"], rows)
+    return ReportTable("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao bound"], rows)
 
 
 def _build_checks(found: dict[str, list[ReplicateErrors]]) -> list[Check]:
@@ -174,7 +177,7 @@ def _build_checks(found: dict[str, list[ReplicateErrors]]) -> list[Check]:
             worst < 1,
         ),
         Check(
-            "the median of `improved` stays within twice the Cramér–Rao floor (greatest ratio "
+            "the median of `improved` stays within twice the Cramér–Rao bound (greatest ratio "
             f"{max(ratios):.2f})",
             max(ratios) <= 2,
         ),

@@ -1,4 +1,4 @@
-"""Examples 1 and 2 (Tables 1 and 2, Figures 7 to 14), under each reading of the equations."""
+"""Examples 1 and 2 (Tables 1 and 2, Figures 7 to 14), for each reading of the equations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class EquationReading:
-    """How the equations are read: the model, and the input's frequency as rad/s."""
+    """A reading of the equations: the model, and the input's frequency in rad/s."""
 
     title: str
     model: str
@@ -64,7 +64,7 @@ EXAMPLE_2 = Example(
 
 
 def list_readings(example: Example) -> list[EquationReading]:
-    """The corrected reading first, then the differential equation, then the letter."""
+    """List the corrected reading, the differential equation, and the literal reading."""
     return [
         EquationReading(
             "Eq. 16 with cos(ωhk)",
@@ -88,7 +88,7 @@ def list_readings(example: Example) -> list[EquationReading]:
 
 
 def record_body(example: Example, reading: EquationReading) -> dict[str, Any]:
-    """Body of the record: the reading's model with the true parameters and measurement noise."""
+    """Build the request of the record: the reading's model, true parameters, measurement noise."""
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": reading.omega}
     return {
         "name": f"paper example {example.number}, {reading.title}",
@@ -102,7 +102,7 @@ def record_body(example: Example, reading: EquationReading) -> dict[str, Any]:
 
 
 def job_body(example: Example, reading: EquationReading, record: str) -> dict[str, Any]:
-    """Body of the job, with the settings of section 4."""
+    """Build the request of the job, with the settings of section 4."""
     return {
         "name": f"paper Table {example.table}: {reading.title}",
         "model": reading.model,
@@ -112,7 +112,7 @@ def job_body(example: Example, reading: EquationReading, record: str) -> dict[st
 
 
 def build_sections(bench: StudyBench, example: Example) -> list[Section]:
-    """One section for each reading."""
+    """Build one section for each reading."""
     return [_build_section(bench, example, reading) for reading in list_readings(example)]
 
 
@@ -133,7 +133,7 @@ def _build_section(bench: StudyBench, example: Example, reading: EquationReading
 
 
 def reading_bound(example: Example, reading: EquationReading) -> dict[str, float]:
-    """The Cramér–Rao bound of the reading's record."""
+    """Compute the Cramér–Rao bound of the reading's record."""
     times = np.arange(published.SAMPLES, dtype=np.float64) * published.SAMPLE_TIME
     force: Floats = published.AMPLITUDE * np.cos(reading.omega * times)
     inputs = [Channel("q", times, force, "N")]
@@ -143,7 +143,7 @@ def reading_bound(example: Example, reading: EquationReading) -> dict[str, float
 def estimates_table(
     example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
 ) -> ReportTable:
-    """The paper's columns beside ours, with standard errors and the bound."""
+    """Build the table of the paper's columns and ours, with standard errors and the bound."""
     rows = []
     for name, true in example.true.items():
         unit = found["improved"].get_parameter(name)["unit"]
@@ -179,13 +179,13 @@ def estimates_table(
             "Cramér–Rao sd",
         ],
         rows,
-        "Ours: estimate ± standard error. The paper's draw of the noise is not known; its columns "
+        "Ours: estimate ± standard error. The paper's noise draw is not published. Its columns "
         f"are the same under every reading. {_compare_with_bound(example, least)}",
     )
 
 
 def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
-    """How the paper's errors compare with what any unbiased estimator can reach on average."""
+    """Compare the paper's errors with the Cramér–Rao bound."""
     ratios = {
         name: abs(example.columns.proposed[name] - true) / least[name]
         for name, true in example.true.items()
@@ -194,20 +194,20 @@ def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
     told = f"The paper's proposed errors over the Cramér–Rao sd of this record: {text}"
     if below := [name for name, ratio in ratios.items() if ratio < 0.5]:
         return (
-            f"{told}. Below half of it ({', '.join(below)}) is less than an ideal estimator has on "
-            "average: a lucky draw, or less noise than this."
+            f"{told}. Errors below half of it ({', '.join(below)}) are smaller than an ideal "
+            "estimator's on average: a lucky draw, or less noise than here."
         )
     return f"{told}."
 
 
 def format_estimate(found: MethodRun, name: str) -> str:
-    """An estimate with its standard error; why there is none where there is none."""
+    """Format an estimate with its standard error, or with its status if there is none."""
     text = join_estimate(found.get_estimate(name), found.get_standard_error(name))
     return text if "±" in text else f"{text} ({found.get_parameter(name)['status']})"
 
 
 def efforts_table(found: Mapping[str, MethodRun]) -> ReportTable:
-    """RMS and number of simulations of each method."""
+    """Build the table of RMS and number of simulations of each method."""
     return ReportTable(
         "Search",
         ["", *METHODS],
@@ -219,7 +219,7 @@ def efforts_table(found: Mapping[str, MethodRun]) -> ReportTable:
 
 
 def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
-    """The four figures of an example."""
+    """Draw the four figures of an example."""
     names = list(example.true)
     firsts, lasts, rms, response = example.figures
     ends = {method: _absolute_errors(found[method], example.true) for method in METHODS}
@@ -228,7 +228,7 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
         Plot(
             f"Figure {number}: convergence of {' and '.join(pair)}",
             figures.plot_convergence(found, pair, example.true),
-            "Paper: the proposed search goes on to the true values after the simple one has "
+            "Paper: the proposed search continues to the true values after the simple one has "
             f"stopped. Ours: {_describe_ends(ends, pair)}",
         )
         for number, pair in ((firsts, names[:2]), (lasts, names[2:]))
@@ -237,7 +237,7 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
             f"Figure {rms}: RMS of the best individual",
             figures.plot_rms_history(found, "m", published.SIGMA),
             f"Paper: the simple search {example.simple_search_remark}"
-            ", the proposed one goes on in steps. Ours: "
+            ", the proposed one continues in steps. Ours: "
             + ", ".join(f"{method} ends at {value:.5f} m" for method, value in reached.items())
             + f"; the noise alone has {published.SIGMA:g} m.",
         ),
@@ -267,7 +267,7 @@ def _describe_ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) ->
 def build_checks(
     example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
 ) -> list[Check]:
-    """What this study says about the paper's claim and about the data."""
+    """Check the paper's claim and the estimates of `improved`."""
     rms = {method: found[method].run["rms"] for method in METHODS}
     ours = found["improved"]
     within = {

@@ -1,9 +1,9 @@
-"""Numbers printed in the paper (Asakura and Guo), and what its figures are said to show."""
+"""Numbers printed in the paper (Asakura and Guo)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-# Section 4: the parameters that made the data of Examples 1 and 2, and the input q(t) (Eq. 15).
+# Section 4: the true parameters of Examples 1 and 2, and the input q(t) (Eq. 15).
 TRUE_1 = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
 TRUE_2 = {"c": 0.2, "L": 0.5, "b": 5.0, "mu": 0.5}
 AMPLITUDE, OMEGA, SAMPLE_TIME, SAMPLES = 10.0, 5.0, 0.02, 300
@@ -33,7 +33,7 @@ TABLE_2 = PublishedColumns(
     simple={"c": 0.233822, "L": 0.532747, "b": 4.877810, "mu": 0.466276},
     proposed={"c": 0.215445, "L": 0.517107, "b": 4.956012, "mu": 0.520039},
 )
-# By pattern; the gain has no unit, whatever the table's heading says (G(0) = 1 is physics).
+# By pattern. The gain has no unit, in spite of the table's heading (physically G(0) = 1).
 TABLE_3 = (
     PublishedColumns(
         {"K": 0.9892, "T": 0.2854, "L": 0.2385}, {"K": 0.9902, "T": 0.3402, "L": 0.1193}

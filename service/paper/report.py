@@ -1,4 +1,4 @@
-"""The study as one HTML file that needs no server and no network."""
+"""Render the study as one HTML file that needs no server and no network."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -12,7 +12,7 @@ from service.paper.document import Plot, Section, describe_check
 
 
 def render_report(sections: Sequence[Section], *, quick: bool) -> str:
-    """The report: tables, figures with captions, and what held."""
+    """Render the report: tables, figures with captions, and checks."""
     return render_template(
         "paper.html",
         sections=sections,

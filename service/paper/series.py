@@ -11,7 +11,7 @@ from service.paper.document import Plot, ReportTable, Section
 
 RATE, END_TIME = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)
-# As printed, y(kT+1) follows y(kT): one second later. That is a step only where T is one second.
+# As printed, y(kT+1) follows y(kT), one second later. That is one step only if T is one second.
 READINGS = (
     ("as printed: y(kT + 1), so T = 1 s", 1.0),
     ("as corrected: y((k + 1)T), T = 0.02 s", 0.02),
@@ -19,7 +19,7 @@ READINGS = (
 
 
 def model_document(n: int) -> dict[str, Any]:
-    """Model document of Eq. 7 with terms up to power n."""
+    """Build the model document of Eq. 7 with terms up to power n."""
     powers = [f"(L*h*(k-1))**{i}/{factorial(i)}" for i in range(1, n + 1)]
     return {
         "name": f"exponential-{n}",
@@ -33,12 +33,12 @@ def model_document(n: int) -> dict[str, Any]:
 
 
 def exact_solution(t: float) -> float:
-    """The solution of Eq. 4 that starts at 0."""
+    """Compute the solution of Eq. 4 that starts at 0."""
     return (exp(RATE * t) - 1) / RATE
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
-    """One section with both readings."""
+    """Build one section with both readings."""
     rows, plots = [], []
     for title, period in READINGS:
         bench.say(f"paper Figures 2 and 3, {title}")
@@ -50,15 +50,15 @@ def build_sections(bench: StudyBench) -> list[Section]:
     return [
         Section(
             "Figures 2 and 3: truncated exponential series",
-            f"dy/dt = exp(Lt), L = {RATE:g} 1/s, from y(0) = 0 to {END_TIME:g} s; the paper gives "
-            "neither T nor the span.",
+            f"dy/dt = exp(Lt), L = {RATE:g} 1/s, from y(0) = 0 to {END_TIME:g} s. The paper "
+            "states neither T nor the span.",
             [
                 ReportTable(
                     f"Error at {END_TIME:g} s",
                     ["reading", *(f"n = {n}" for n in TERMS)],
                     rows,
-                    "More terms help until the step itself (Euler's) is the greater error: with "
-                    "T = 1 s a longer series cannot mend it.",
+                    "More terms help until the error of Euler's step is greater. With T = 1 s, a "
+                    "longer series cannot reduce it.",
                 )
             ],
             plots,
@@ -96,9 +96,10 @@ def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) 
         Plot(
             f"Figure 2, {title}",
             figures.plot_lines(outputs, "time [s]", "y"),
-            "Paper: the broken lines of the series near the solid exact solution as n grows. "
-            f"Ours too; n = {TERMS[-1]} reaches "
-            f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % of it at {END_TIME:g} s.",
+            "Paper: the dashed lines of the series approach the solid exact solution as n grows. "
+            f"Ours too: n = {TERMS[-1]} reaches "
+            f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % "
+            f"of it at {END_TIME:g} s.",
         ),
         Plot(
             f"Figure 3, {title}",

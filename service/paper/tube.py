@@ -19,7 +19,7 @@ L_TOLERANCE_S, T_TOLERANCE = 0.010, 0.03
 
 
 def find_records_folder() -> Path | None:
-    """The folder below LAGID_DATA that has the reference records; None where they are absent."""
+    """Find the folder of the reference records below LAGID_DATA; None if they are absent."""
     data = os.environ.get("LAGID_DATA")
     found = Path(data or Path("..") / "shared" / "data") / "tube_reference"
     return found if all(one.is_file() for one in _record_files(found)) else None
@@ -27,7 +27,7 @@ def find_records_folder() -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class TubeRecords:
-    """One dataset for each pattern, the names of their channels, and where they come from."""
+    """One dataset for each pattern, the names of their channels, and their origin."""
 
     datasets: list[str]
     inlet: str
@@ -36,7 +36,7 @@ class TubeRecords:
 
 
 def store_records(bench: StudyBench) -> TubeRecords:
-    """The reference records of LAGID_DATA, or, where they are absent, the plant's own."""
+    """Store the reference records of LAGID_DATA or, if absent, records of the reference plant."""
     source = find_records_folder()
     if source is not None:
         ids = [bench.client.add_dataset(one, name=one.stem)["id"] for one in _record_files(source)]
@@ -60,7 +60,7 @@ def _record_files(source: Path) -> list[Path]:
 
 
 def job_body(records: TubeRecords) -> dict[str, Any]:
-    """Body of the job: both patterns, each by itself, with every method."""
+    """Build the request of the job: each pattern by itself, with every method."""
     labels = [{"pattern": float(n)} for n in (1, 2)]
     return {
         "name": f"paper Table 3: tube {LENGTH_M} m",
@@ -82,7 +82,7 @@ def job_body(records: TubeRecords) -> dict[str, Any]:
 
 
 def build_sections(bench: StudyBench) -> list[Section]:
-    """The section."""
+    """Build the section."""
     records = store_records(bench)
     runs = bench.run_job(job_body(records))
     found: list[dict[str, MethodRun]] = [{}, {}]
@@ -92,9 +92,9 @@ def build_sections(bench: StudyBench) -> list[Section]:
     return [
         Section(
             TITLE,
-            "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
-            f"other. {records.origin}: a gas-dynamic model of the paper's tube with gauges of 12 bit "
-            "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
+            "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to the "
+            f"pressure at the other. {records.origin}: a gas-dynamic model of the paper's tube "
+            "with 12-bit gauges and noise of 0.5 kPa. The paper's own records are not published.",
             [_estimates_table(found)],
             [plot for n, one in enumerate(found) for plot in _build_plots(bench, n, one, records)],
             build_checks(found),
@@ -125,8 +125,8 @@ def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
         "Table 3",
         ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)],
         rows,
-        "A first-order model of a long tube leaves structure in the residuals; the standard errors "
-        "allow for their colour.",
+        "A first-order model of a long tube leaves autocorrelated residuals. The standard errors "
+        "account for this.",
     )
 
 
@@ -139,13 +139,13 @@ def _build_plots(
         Plot(
             f"Figure 17: input and output, pattern {pattern}",
             _plot_signals(bench, found, records, number),
-            "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
-            "response of the model that `improved` found.",
+            "Paper: the outlet follows the inlet late and smoothed. Ours: the same, with the "
+            "response of the model identified by `improved`.",
         ),
         Plot(
             f"Figure 18: RMS of the best individual, pattern {pattern}",
             figures.plot_rms_history(found, "kPa", scale=1e-3),
-            f"Paper: the error of the proposed search is the smaller. Ours: {rms}.",
+            f"Paper: the error of the proposed search is smaller. Ours: {rms}.",
         ),
     ]
 
@@ -176,7 +176,7 @@ def _to_kilo(values: list[float | None]) -> list[float | None]:
 
 
 def build_checks(found: list[dict[str, MethodRun]]) -> list[Check]:
-    """Whether the two patterns give the same tube."""
+    """Check that the two patterns give the same tube."""
     first, second = (one["improved"] for one in found)
     lag = abs(first.get_estimate("L") - second.get_estimate("L"))
     constant = abs(first.get_estimate("T") - second.get_estimate("T")) / first.get_estimate("T")
