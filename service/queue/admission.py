@@ -1,4 +1,4 @@
-"""Which jobs get in: those that a dispatcher takes, and those that a project may still submit."""
+"""Admission of jobs: those that a dispatcher claims, and those that a project may submit."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from service.storage.tables import Job
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """What a dispatcher that has its hands full still takes: short jobs, and more urgent ones.
+    """Jobs that a busy dispatcher still claims: short ones, and more urgent ones.
 
     Attributes
     ----------
-    most_runs : int
-        A job of so many runs is short.
-    above : int
+    max_runs : int
+        A job with at most this many runs is short.
+    above_priority : int
         A job of a higher priority is urgent.
     """
 
@@ -25,20 +25,20 @@ class Admission:
     above_priority: int
 
     def admits(self, job: type[Job]) -> ColumnElement[bool]:
-        """Condition that a row of `jobs` gets in."""
+        """Return the condition that a row of `jobs` is admitted."""
         return or_(job.n_runs <= self.max_runs, job.priority > self.above_priority)
 
 
 @dataclass(frozen=True, slots=True)
 class UnfinishedWork:
-    """Jobs of a project that wait or run, and their runs that are not done."""
+    """Queued and running jobs of a project, and their unfinished runs."""
 
     jobs: int
     runs: int
 
 
 def count_unfinished(session: Session, project_id: str) -> UnfinishedWork:
-    """What a project has queued or running."""
+    """Count the unfinished jobs and runs of a project."""
     query = select(func.count(), func.coalesce(func.sum(Job.n_runs - Job.n_done), 0)).where(
         Job.state.in_(OPEN_STATES), Job.project_id == project_id
     )
@@ -47,9 +47,9 @@ def count_unfinished(session: Session, project_id: str) -> UnfinishedWork:
 
 
 def count_running_jobs() -> Subquery:
-    """How many jobs of each project dispatchers have in hand, counted once: who has fewest is next.
+    """Count the running jobs of each project; the project with the fewest is next.
 
-    Columns ``project_id`` and ``n``; a project that has none is not among them.
+    Columns ``project_id`` and ``n``. A project without running jobs is not among them.
     """
     count = func.count().label("n")
     running = select(Job.project_id, count).where(Job.state == JobState.RUNNING)

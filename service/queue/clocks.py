@@ -1,4 +1,4 @@
-"""The clock by which leases are given and reaped: one for all who share a database."""
+"""The clock of leases: one for all processes that share a database."""
 
 from collections.abc import Callable
 from datetime import datetime
@@ -14,12 +14,15 @@ Clock = Callable[[], datetime]
 
 
 def choose_database_clock(session: Session) -> Clock:
-    """PostgreSQL's own clock: those of its hosts may differ. SQLite is used on one host only."""
+    """Return the clock of PostgreSQL, or for SQLite that of this host.
+
+    The clocks of several hosts may differ. SQLite is used on one host only.
+    """
     if session.get_bind().dialect.name == "postgresql":
         return partial(_read_server_time, session)
     return columns.utc_now
 
 
 def _read_server_time(session: Session) -> datetime:
-    # Not now(), which is when the transaction began: it may have waited since.
+    # Not now(), the start of the transaction: it may have waited since.
     return session.scalars(select(func.clock_timestamp(type_=UtcDateTime))).one()

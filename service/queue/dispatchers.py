@@ -1,4 +1,4 @@
-"""Which dispatchers are alive."""
+"""Heartbeats of the dispatchers."""
 
 from datetime import timedelta
 
@@ -12,7 +12,7 @@ from service.storage.tables import DispatcherHeartbeat
 
 _FORGET_AFTER = timedelta(days=1)
 LEASE_SECONDS_KEY = "lease_seconds"
-"""Under this name a dispatcher tells how long its leases are."""
+"""Key of the lease length in the details of a dispatcher."""
 
 
 class DispatcherRepository:
@@ -22,7 +22,7 @@ class DispatcherRepository:
         self._session, self._clock = session, clock or choose_database_clock(session)
 
     def add_dispatcher(self, owner: str, details: Document) -> None:
-        """Tell that a dispatcher has started, and forget those long silent."""
+        """Record that a dispatcher has started, and delete those without a heartbeat for a day."""
         now = self._clock()
         row = {"owner": owner, "details": details, "started_at": now, "seen_at": now}
         upsert(self._session, DispatcherHeartbeat, [row])
@@ -31,26 +31,30 @@ class DispatcherRepository:
         )
 
     def record_heartbeat(self, owner: str) -> None:
-        """Tell that a dispatcher is still there; goes with the heartbeat of its leases."""
-        seen = update(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner)
-        self._session.execute(seen.values(seen_at=self._clock()))
+        """Record a heartbeat of a dispatcher, together with the renewal of its leases."""
+        statement = update(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner)
+        self._session.execute(statement.values(seen_at=self._clock()))
 
     def remove_dispatcher(self, owner: str) -> None:
-        """Tell that a dispatcher has stopped."""
+        """Record that a dispatcher has stopped."""
         self._session.execute(delete(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner))
 
     def list_all(self) -> list[DispatcherHeartbeat]:
-        """Every dispatcher that has not taken leave, by name."""
+        """List every dispatcher that has not stopped, by name."""
         return list(
             self._session.scalars(select(DispatcherHeartbeat).order_by(DispatcherHeartbeat.owner))
         )
 
     def list_alive(self) -> list[DispatcherHeartbeat]:
-        """Dispatchers seen within the length of their leases, by name."""
+        """List the dispatchers with a heartbeat within the length of their leases, by name."""
         now = self._clock()
-        return [one for one in self.list_all() if one.seen_at >= now - find_lease_length(one)]
+        return [
+            dispatcher
+            for dispatcher in self.list_all()
+            if dispatcher.seen_at >= now - find_lease_length(dispatcher)
+        ]
 
 
 def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta:
-    """How long the leases of a dispatcher are."""
+    """Return the length of the leases of a dispatcher."""
     return timedelta(seconds=dispatcher.details[LEASE_SECONDS_KEY])

@@ -1,12 +1,12 @@
-"""The queue: leases on jobs, fenced by the attempt.
+"""The job queue: leases on jobs, with the attempt as fencing token.
 
-A dispatcher claims a job for a time and renews all its leases with one statement. When it falls
-silent, the reaper gives its jobs back. Each claim raises the job's `attempt`, and every later
-write carries it: a dispatcher that comes back late hits no row and learns that it must stop.
+A dispatcher claims a job for some time and renews all its leases with one statement. When its
+heartbeat stops, the reaper gives its jobs back. Each claim increments the `attempt` of the job, and
+every later write carries it. So a dispatcher that comes back late changes no row and learns that it
+must stop.
 
-Times are those of the one clock that all have: PostgreSQL's, or with SQLite that of the host.
-A wrong clock delays or hastens the reaper, but which dispatcher may write is decided by the
-attempt alone.
+All times come from one clock: that of PostgreSQL, or with SQLite that of the host. A wrong clock
+makes the reaper late or early. But the attempt alone decides which dispatcher may write.
 """
 
 from collections.abc import Collection, Mapping
@@ -41,15 +41,19 @@ from service.storage.tables import Checkpoint, Job, Run
 
 DEFAULT_LEASE = timedelta(seconds=10)
 MAX_LEASE_LENGTHS = 2
-"""No lease ends later than after so many of its lengths, unless a clock was stepped back."""
+"""A lease ends within this many of its lengths, unless a clock was stepped back."""
 HUNG_AFTER = timedelta(seconds=60)
-"""A dispatcher whose process lives keeps its jobs so long after its lease has ended: it waits for
-the database, and lost nothing. Then it counts as hung."""
+"""How long a dispatcher with a living process keeps its jobs after the end of its lease.
+
+It probably waits for the database and has lost nothing. After this time it counts as hung.
+"""
 SPARED_LOSS_FACTOR = 4
-"""So many times as many losses without progress a job may have while others of the same dispatcher
-come further: then it is hardly this one over which the dispatchers die."""
+"""Factor on the allowed losses of a job while other jobs of the same dispatcher progress.
+
+Then this job is hardly the reason why the dispatchers die.
+"""
 _DEFER_SPEC = defer(Job.spec)
-"""A specification of many cells has megabytes; it is read where it is wanted."""
+"""A specification of many cells has megabytes; it is loaded only where it is needed."""
 FinalState = Literal[JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED]
 
 
@@ -62,13 +66,13 @@ class Lease:
     owner: str
 
     def fence(self) -> tuple[ColumnElement[bool], ...]:
-        """Condition under which a row of `jobs` is still this lease's."""
+        """Return the condition that a row of `jobs` still belongs to this lease."""
         return Job.id == self.job_id, Job.attempt == self.attempt, Job.state == JobState.RUNNING
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A job that was just claimed, and the lease on it."""
+    """A newly claimed job and its lease."""
 
     lease: Lease
     job: Job
@@ -84,7 +88,7 @@ class RenewedLease:
 
 @dataclass(frozen=True, slots=True)
 class JobProgress:
-    """How far a job has come, over all its runs."""
+    """Progress of a job over all its runs."""
 
     evaluations: int
     generation: int = 0
@@ -94,14 +98,14 @@ class JobProgress:
 
 @dataclass(frozen=True, slots=True)
 class LeaseOwners:
-    """What is known of those who hold leases.
+    """Information about the owners of leases.
 
     Attributes
     ----------
-    gone, living : frozenset of str
-        Known to have ended, and known to be there and awake; of others only their leases tell.
-    lengths : mapping
-        How long the leases of each are.
+    ended, awake : frozenset of str
+        Owners that have ended, and those that run and are awake. Leases decide on all others.
+    lease_lengths : mapping
+        Length of the leases of each owner.
     """
 
     ended: frozenset[str] = frozenset()
@@ -111,7 +115,7 @@ class LeaseOwners:
 
 @dataclass(frozen=True, slots=True)
 class ReapResult:
-    """What became of the jobs whose leases had expired, and whose they were."""
+    """Fate of the jobs whose leases had expired, and the owners of these leases."""
 
     requeued: tuple[str, ...] = ()
     failed: tuple[str, ...] = ()
@@ -129,20 +133,19 @@ class LeaseQueue:
     def claim_job(
         self, owner: str, lease: timedelta = DEFAULT_LEASE, admission: Admission | None = None
     ) -> Claim | None:
-        """Take the first queued job that `admission` lets in; None if none waits.
+        """Claim the first queued job that `admission` accepts; None if none waits.
 
-        First comes the highest priority, then the project that has fewest jobs running, then the
-        oldest.
+        The order is: highest priority, then fewest running jobs of the project, then oldest.
         """
-        waiting, mates = aliased(Job), count_running_jobs()
+        waiting, running_jobs = aliased(Job), count_running_jobs()
         first = (
             select(waiting.id)
-            .outerjoin(mates, mates.c.project_id == waiting.project_id)
+            .outerjoin(running_jobs, running_jobs.c.project_id == waiting.project_id)
             .where(waiting.state == JobState.QUEUED)
             .where(true() if admission is None else admission.admits(waiting))
-            .order_by(waiting.priority.desc(), func.coalesce(mates.c.n, 0), waiting.id)
+            .order_by(waiting.priority.desc(), func.coalesce(running_jobs.c.n, 0), waiting.id)
             .limit(1)
-            # Rivals take the next one; SQLite has no rivals.
+            # Rivals take the next job; SQLite has no rivals.
             .with_for_update(skip_locked=True, of=waiting)
         )
         now = self._read_clock()
@@ -165,28 +168,28 @@ class LeaseQueue:
         return Claim(Lease(job.id, job.attempt, owner), job)
 
     def recover_claim(self, owner: str, held: Collection[str]) -> Claim | None:
-        """A job that this owner has claimed without learning of it; None if there is none.
+        """Return a job that this owner claimed without receiving the answer; None if there is none.
 
         Parameters
         ----------
         held : collection of str
-            The jobs that it knows to be its own.
+            Jobs that the owner knows as its own.
         """
-        mine = (Job.lease_owner == owner, Job.state == JobState.RUNNING, Job.id.not_in(held))
-        job = self._session.scalar(select(Job).where(*mine).limit(1).with_for_update())
+        conditions = (Job.lease_owner == owner, Job.state == JobState.RUNNING, Job.id.not_in(held))
+        job = self._session.scalar(select(Job).where(*conditions).limit(1).with_for_update())
         return None if job is None else Claim(Lease(job.id, job.attempt, owner), job)
 
     def renew_leases(
         self, held: Collection[Lease], lease: timedelta = DEFAULT_LEASE
     ) -> tuple[RenewedLease, ...]:
-        """Renew these leases; those that do not come back are lost.
+        """Renew leases; those that are not returned are lost.
 
-        A lease that its dispatcher has dropped is not among them, so that the reaper finds it.
+        A dispatcher passes no lease that it has dropped, so that the reaper finds it.
         """
-        owners = {one.job_id: one.owner for one in held}
+        owners = {item.job_id: item.owner for item in held}
         renewed = (
             update(Job)
-            .where(or_(false(), *(and_(*one.fence()) for one in held)))
+            .where(or_(false(), *(and_(*item.fence()) for item in held)))
             .values(lease_until=self._read_clock() + lease)
             .returning(Job.id, Job.attempt, Job.cancel_requested)
         )
@@ -196,12 +199,12 @@ class LeaseQueue:
         )
 
     def lock_job(self, lease: Lease) -> Job:
-        """The job, locked against every other writer until the transaction ends.
+        """Lock the job against every other writer until the transaction ends, and return it.
 
         Raises
         ------
         LeaseLost
-            When the job has another attempt or is no longer running.
+            If the job has another attempt or is no longer running.
         """
         held = select(Job).where(*lease.fence()).with_for_update(key_share=True)
         job = self._session.scalar(
@@ -212,7 +215,7 @@ class LeaseQueue:
         return job
 
     def write_progress(self, lease: Lease, progress: JobProgress) -> None:
-        """Write how far the job has come, and tell it as an event."""
+        """Write the progress of the job, and append it as an event."""
         values: dict[str, Any] = {
             "evaluations": progress.evaluations,
             "generation": progress.generation,
@@ -225,23 +228,25 @@ class LeaseQueue:
         self._events.append_event(job.id, "progress", {**values, "best_rms": job.best_rms, **data})
 
     def append_event(self, lease: Lease, kind: EventKind, data: Document) -> None:
-        """Add an event to the job, such as a line of its log."""
+        """Append an event to the job, such as a line of its log."""
         self.lock_job(lease)
         self._events.append_event(lease.job_id, kind, data)
 
     def write_floors(self, lease: Lease, floors: Document) -> None:
-        """Write what the runs of the job are measured by."""
+        """Write the noise bounds to which the runs of the job are compared."""
         self._update_job(lease, {"floors": floors})
 
     def finish_job(self, lease: Lease, state: FinalState, error: str | None = None) -> Job:
-        """End a job. Its unfinished runs end with it, unless it succeeded: then none may be left.
+        """End a job, and with it its unfinished runs.
+
+        A job that succeeds must have none.
 
         Raises
         ------
         LeaseLost
-            When the job is no longer this lease's; nothing is written.
-        Conflict
-            When the job is to succeed and has runs that did not finish.
+            If the lease is no longer held; nothing is written.
+        RowConflict
+            If the job is to succeed but has unfinished runs.
         """
         job = self._update_job(
             lease,
@@ -263,17 +268,17 @@ class LeaseQueue:
         return job
 
     def has_progressed(self, owner: str) -> bool:
-        """Whether a job that this owner holds has come further under its lease."""
-        found = select(Job.id).where(Job.lease_owner == owner, Job.state == JobState.RUNNING)
-        return bool(self._session.scalar(select(found.where(_has_progressed()).exists())))
+        """Return whether a job that this owner holds has progressed under its lease."""
+        held = select(Job.id).where(Job.lease_owner == owner, Job.state == JobState.RUNNING)
+        return bool(self._session.scalar(select(held.where(_has_progressed()).exists())))
 
     def release_job(self, lease: Lease, *, lost: bool = False, beside_others: bool = False) -> None:
-        """Give a job back, because the dispatcher is shutting down, or has `lost` its workers.
+        """Give a job back when the dispatcher shuts down, or has `lost` its workers.
 
         Parameters
         ----------
         beside_others : bool
-            Whether a job of the same owner came further meanwhile.
+            Whether another job of the same owner progressed meanwhile.
         """
         job = self.lock_job(lease)
         if lost:
@@ -284,84 +289,86 @@ class LeaseQueue:
             self._requeue_job(job)
 
     def has_expired(self, owners: LeaseOwners) -> bool:
-        """Whether a lease is to be reaped, or seems to end later than any that is given."""
+        """Return whether a lease is to be reaped, or ends later than any valid lease."""
         now = self._read_clock()
-        wrong = or_(_is_expired(now, owners), _ends_too_late(now, owners))
-        found = select(exists().where(Job.state == JobState.RUNNING, wrong))
-        return bool(self._session.scalar(found))
+        is_wrong = or_(_is_expired(now, owners), _ends_too_late(now, owners))
+        query = select(exists().where(Job.state == JobState.RUNNING, is_wrong))
+        return bool(self._session.scalar(query))
 
     def reap_expired(self, owners: LeaseOwners | None = None) -> ReapResult:
         """Give back the jobs whose leases have expired, or end them.
 
-        A job that was to be cancelled is cancelled; one that was lost `max_attempts` times while
-        no run of it went on or ended fails with that reason, or `SPARED_LOSS_FACTOR` times as often
-        where others of its owner did; any other is queued and goes on from its checkpoints. The
-        leases of owners that are gone are not waited for, those of
-        living ones `HUNG_AFTER` longer. A lease that ends more than `MAX_LEASE_LENGTHS` lengths
-        from now was written by a clock that was stepped back since: it is shortened to one, from
-        now.
+        A job with a cancel request is cancelled. A job that was lost `max_attempts` times without
+        any progress of its runs fails. The limit is `SPARED_LOSS_FACTOR` times higher if other jobs
+        of its owner progressed. Any other job is queued and continues from its checkpoints.
+
+        Leases of ended owners are reaped at once, those of living owners `HUNG_AFTER` later. A
+        lease that ends more than `MAX_LEASE_LENGTHS` lengths from now was written before a clock
+        was stepped back. It is shortened to one length from now.
         """
-        now, known = self._read_clock(), owners or LeaseOwners()
-        ahead = update(Job).where(Job.state == JobState.RUNNING, _ends_too_late(now, known))
+        now, current_owners = self._read_clock(), owners or LeaseOwners()
+        ahead = update(Job).where(
+            Job.state == JobState.RUNNING, _ends_too_late(now, current_owners)
+        )
         ends = _choose_by_owner(
-            {one: now + length for one, length in known.lease_lengths.items()}, now
+            {owner: now + length for owner, length in current_owners.lease_lengths.items()}, now
         )
         self._session.execute(ahead.values(lease_until=ends), execution_options=RETURNING_OPTIONS)
         expired = (
             select(Job)
-            .where(Job.state == JobState.RUNNING, _is_expired(now, known))
+            .where(Job.state == JobState.RUNNING, _is_expired(now, current_owners))
             .with_for_update(skip_locked=True, key_share=True)
             .options(_DEFER_SPEC)
         )
         lost = self._session.scalars(expired, execution_options={"populate_existing": True}).all()
-        whose = frozenset(str(job.lease_owner) for job in lost)
-        busy = {owner for owner in whose if self.has_progressed(owner)}
+        lost_owners = frozenset(str(job.lease_owner) for job in lost)
+        busy = {owner for owner in lost_owners if self.has_progressed(owner)}
         fates: dict[JobState, list[str]] = {state: [] for state in JobState}
         for job in lost:
             fates[self._fail_or_retry(job, beside_others=job.lease_owner in busy)].append(job.id)
         queued, failed, cancelled = (
-            tuple(fates[one]) for one in (JobState.QUEUED, JobState.FAILED, JobState.CANCELLED)
+            tuple(fates[state]) for state in (JobState.QUEUED, JobState.FAILED, JobState.CANCELLED)
         )
-        return ReapResult(queued, failed, cancelled, whose)
+        return ReapResult(queued, failed, cancelled, lost_owners)
 
     def _read_clock(self) -> datetime:
-        self._session.connection()  # SQLite may wait here for its turn, and the time goes on
+        self._session.connection()  # SQLite may wait here for the lock, and time passes
         return self._clock()
 
     def _update_job(self, lease: Lease, values: dict[str, Any]) -> Job:
         changed = update(Job).where(*lease.fence()).values(values).returning(Job.id)
         if self._session.scalar(changed, execution_options=RETURNING_OPTIONS) is None:
             raise LeaseLost(lease.job_id, lease.attempt)
-        mine = select(Job).where(Job.id == lease.job_id).options(_DEFER_SPEC)
-        return self._session.scalars(mine, execution_options={"populate_existing": True}).one()
+        query = select(Job).where(Job.id == lease.job_id).options(_DEFER_SPEC)
+        return self._session.scalars(query, execution_options={"populate_existing": True}).one()
 
     def _correct_best_rms(self, job: Job) -> None:
-        """Take the best RMS from the results: while a run goes on it tells its fitness only."""
+        """Take the best RMS from the results; a running run reports its fitness only."""
         best = self._session.scalar(select(func.min(Run.best_rms)).where(Run.job_id == job.id))
         if best is not None:
             job.best_rms = best
 
     def _check_runs_finished(self, job: Job) -> None:
-        """Also those that have not been made yet."""
+        """Check that all runs have finished, including those that are not created yet."""
         ended = select(func.count()).where(Run.job_id == job.id, Run.state.not_in(OPEN_STATES))
         n_left = job.n_runs - (self._session.scalar(ended) or 0)
         if n_left:
             raise RowConflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
     def _fail_or_retry(self, job: Job, *, beside_others: bool) -> JobState:
-        went_on = self._session.scalar(select(Job.id).where(Job.id == job.id, _has_progressed()))
-        job.lost_leases = job.lost_leases + 1 if went_on is None else 1
-        is_spared = beside_others and went_on is None
-        most = job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
+        progressed = self._session.scalar(select(Job.id).where(Job.id == job.id, _has_progressed()))
+        job.lost_leases = job.lost_leases + 1 if progressed is None else 1
+        is_spared = beside_others and progressed is None
+        max_losses = job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
         if job.cancel_requested:
             self._end_job(job, JobState.CANCELLED, None)
-        elif job.lost_leases >= most:
+        elif job.lost_leases >= max_losses:
             self._end_job(
                 job,
                 JobState.FAILED,
-                f"the dispatcher ended or fell silent {job.lost_leases} times, or lost its "
-                f"workers, and the job did not go on between; the last was {job.lease_owner}; "
-                "see its log, and resume the job when the cause is gone",
+                f"gave up after {job.lost_leases} attempts without progress: the dispatcher or its "
+                f"workers stopped. The last dispatcher was {job.lease_owner}. See its log, then "
+                "resume the job.",
             )
         else:
             self._requeue_job(job)
@@ -384,33 +391,35 @@ class LeaseQueue:
 
 
 def _has_progressed() -> ColumnElement[bool]:
-    """Condition that a run of a job ended in its attempt, or came further: it has a checkpoint."""
+    """Return the condition that a run of a job ended or was checkpointed in this attempt."""
     ended = exists().where(
         Run.job_id == Job.id, Run.attempt == Job.attempt, Run.state.not_in(OPEN_STATES)
     )
-    kept = exists().where(Checkpoint.job_id == Job.id, Checkpoint.attempt == Job.attempt)
-    return or_(ended, kept)
+    checkpointed = exists().where(Checkpoint.job_id == Job.id, Checkpoint.attempt == Job.attempt)
+    return or_(ended, checkpointed)
 
 
 def _is_expired(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:
-    """Condition that a job's lease is not waited for any longer."""
+    """Return the condition that the lease of a job has expired."""
     overdue = Job.lease_until < _choose_by_owner(dict.fromkeys(owners.awake, now - HUNG_AFTER), now)
     return or_(overdue, Job.lease_owner.in_(owners.ended))
 
 
 def _ends_too_late(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:
-    """Condition that a job's lease ends later than any that its owner could be given now."""
-    latest = {one: now + MAX_LEASE_LENGTHS * length for one, length in owners.lease_lengths.items()}
+    """Return the condition that a lease ends later than any that its owner could get now."""
+    latest = {
+        owner: now + MAX_LEASE_LENGTHS * length for owner, length in owners.lease_lengths.items()
+    }
     return and_(Job.lease_owner.in_(latest), Job.lease_until > _choose_by_owner(latest, now))
 
 
 def _choose_by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnElement[datetime]:
-    """A time for each owner of a lease, and one for all others."""
-    known = {owner: literal(time, UtcDateTime()) for owner, time in times.items()}
+    """Return the time of each owner of a lease, and one time for all others."""
+    by_owner = {owner: literal(time, UtcDateTime()) for owner, time in times.items()}
     otherwise = literal(other, UtcDateTime())
-    return case(known, value=Job.lease_owner, else_=otherwise) if known else otherwise
+    return case(by_owner, value=Job.lease_owner, else_=otherwise) if by_owner else otherwise
 
 
 def choose_smaller_rms(rms: float) -> ColumnElement[Any]:
-    """The smaller of the job's `best_rms` and this one, for an UPDATE."""
+    """Return the smaller of the job's `best_rms` and this one, for an UPDATE."""
     return case((Job.best_rms <= rms, Job.best_rms), else_=rms)

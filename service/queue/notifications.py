@@ -1,6 +1,7 @@
-"""Waiting for work: woken by PostgreSQL, or by a change of the SQLite file, else by the clock.
+"""Wait for work: notified by PostgreSQL, by a change of the SQLite file, or by a timeout.
 
-Questions a dispatcher asks many times a second: cheap reads that lock nothing.
+It also answers the questions that a dispatcher asks many times a second, with cheap reads that lock
+nothing.
 """
 
 import threading
@@ -23,15 +24,15 @@ _FILE_POLL_SECONDS = 0.05
 
 
 class Notifier(ABC):
-    """Waits until there may be work. It may wake in vain, so the caller looks at the queue."""
+    """Waits until there may be work. It may wake in vain, so the caller must check the queue."""
 
     @abstractmethod
     def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
-        """Whether something may have changed, within that time."""
+        """Wait for a change, at most that long (s); return whether there may be one."""
 
     @abstractmethod
     def close(self) -> None:
-        """Free its connection."""
+        """Close the connection."""
 
     def __enter__(self) -> Self:
         return self
@@ -41,7 +42,7 @@ class Notifier(ABC):
 
 
 def open_notifier(database: Database, stop: threading.Event | None = None) -> Notifier:
-    """A waker for this database, to be used in one thread; `stop` ends a wait at once."""
+    """Open a notifier for this database, for use in one thread; `stop` ends a wait at once."""
     stop = stop or threading.Event()
     return (
         _SqliteNotifier(database, stop)
@@ -52,11 +53,11 @@ def open_notifier(database: Database, stop: threading.Event | None = None) -> No
 
 @final
 class _SqliteNotifier(Notifier):
-    """Glances at SQLite's count of the changes that other connections have committed."""
+    """Polls SQLite's count of the changes that other connections have committed."""
 
     def __init__(self, database: Database, stop: threading.Event) -> None:
         self._stop = stop
-        # Not a pooled connection: the pool would give it to writers, whose changes do not count.
+        # Not a pooled connection: writers would use it too, and its own changes do not count.
         self._connection = database.engine.raw_connection()
         self._connection.detach()
         self._seen = self._read_data_version()
@@ -85,7 +86,7 @@ class _SqliteNotifier(Notifier):
 
 @final
 class _PostgresqlNotifier(Notifier):
-    """Listens on PostgreSQL's channel; a broken connection is replaced at the next wait."""
+    """Listens on a channel of PostgreSQL; a broken connection is replaced at the next wait."""
 
     def __init__(self, database: Database, stop: threading.Event) -> None:
         self._database, self._stop = database, stop
@@ -96,7 +97,7 @@ class _PostgresqlNotifier(Notifier):
         try:
             if self._connection is None:
                 self._open_connection()
-                return True  # what was queued before it listened was not heard
+                return True  # jobs queued before it listened were not notified
             return self._wait_for_notification(self._connection, deadline)
         except psycopg.OperationalError:
             self.close()
@@ -109,8 +110,8 @@ class _PostgresqlNotifier(Notifier):
 
     def _wait_for_notification(self, connection: psycopg.Connection, deadline: float) -> bool:
         while not self._stop.is_set() and (left := deadline - time.monotonic()) > 0:
-            heard = connection.notifies(timeout=min(left, 0.2), stop_after=1)
-            if any(True for _ in heard):
+            notifications = connection.notifies(timeout=min(left, 0.2), stop_after=1)
+            if any(True for _ in notifications):
                 return True
         return self._stop.is_set()
 
@@ -121,8 +122,8 @@ class _PostgresqlNotifier(Notifier):
         self._connection.execute(f"LISTEN {QUEUE_CHANNEL}")
 
 
-# Made once: to make a statement costs more than to carry it out.
-# The key, not every column: so the indexes alone answer.
+# Built once: building a statement costs more than executing it.
+# Only the key, so that the indexes alone can answer.
 _QUEUED_JOBS = select(Job.id).where(Job.state == JobState.QUEUED)
 _CANCELLED_JOBS = select(Job.id).where(
     Job.lease_owner == bindparam("owner"), Job.state == JobState.RUNNING, Job.cancel_requested
@@ -131,7 +132,7 @@ _ANY_QUEUED = select(_QUEUED_JOBS.exists())
 
 
 class QueueStatus(NamedTuple):
-    """Whether a job waits, and which of a dispatcher's jobs are to be cancelled."""
+    """Whether a job waits, and which jobs of a dispatcher are to be cancelled."""
 
     has_waiting_job: bool
     jobs_to_cancel: frozenset[str]
@@ -140,12 +141,12 @@ class QueueStatus(NamedTuple):
 def read_queue_status(
     session: Session, owner: str, admission: Admission | None = None
 ) -> QueueStatus:
-    """What a dispatcher should attend to: waiting jobs that `admission` lets in, and cancelled."""
+    """Read whether `admission` accepts a waiting job, and which own jobs are to be cancelled."""
     admitted = (
         _ANY_QUEUED
         if admission is None
         else select(_QUEUED_JOBS.where(admission.admits(Job)).exists())
     )
     is_waiting = session.scalar(admitted)
-    asked = session.scalars(_CANCELLED_JOBS, {"owner": owner})
-    return QueueStatus(bool(is_waiting), frozenset(asked))
+    cancelled = session.scalars(_CANCELLED_JOBS, {"owner": owner})
+    return QueueStatus(bool(is_waiting), frozenset(cancelled))

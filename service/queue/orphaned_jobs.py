@@ -1,8 +1,8 @@
-"""Jobs whose dispatcher is gone are given back: by every dispatcher, and by the web process.
+"""Give back the jobs of dead dispatchers; every dispatcher and the web process do this.
 
-A lease that has expired tells it of any dispatcher. Of one on this machine its process does, long
-before: it is known by boot, PID namespace, number and start, so that no other is taken for it. One
-that is seen to live and to be awake waits for something, and is not reaped for a while.
+An expired lease reveals any dead dispatcher. On this machine the process reveals it much earlier. A
+process is identified by boot, PID namespace, number and start, so that no other is mistaken for it.
+A process that is alive and awake waits for something, and is not reaped for a while.
 """
 
 import logging
@@ -19,7 +19,7 @@ from service.storage.sessions import Database
 _log = logging.getLogger(__name__)
 
 PAUSE_SECONDS = 1.0
-"""Between two looks of the web process."""
+"""Pause in s between two checks of the web process."""
 
 
 def reap_jobs(
@@ -28,21 +28,21 @@ def reap_jobs(
     *,
     busy_seconds: float | None = None,
 ) -> ReapResult:
-    """Give back, or end, every job that nobody works on; writes only where there is one.
+    """Give back or end every orphaned job; write only if there is one.
 
     Parameters
     ----------
     clock : callable, optional
-        By default the database's.
+        By default that of the database.
     busy_seconds : float, optional
-        How long to wait for the database.
+        How long to wait for a lock of the database.
     """
     with database.read_session() as session:
-        known = DispatcherRepository(session, clock).list_all()
+        rows = DispatcherRepository(session, clock).list_all()
         owners = LeaseOwners(
-            ended=frozenset(one.owner for one in known if is_gone(one.details)),
-            awake=frozenset(one.owner for one in known if is_awake(one.details)),
-            lease_lengths={one.owner: find_lease_length(one) for one in known},
+            ended=frozenset(row.owner for row in rows if is_gone(row.details)),
+            awake=frozenset(row.owner for row in rows if is_awake(row.details)),
+            lease_lengths={row.owner: find_lease_length(row) for row in rows},
         )
         if not owners.ended and not LeaseQueue(session, clock).has_expired(owners):
             return ReapResult()
@@ -61,12 +61,12 @@ def _log_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
     reasons = ", ".join(
         f"{owner} {_explain_reaping(owner, owners)}" for owner in sorted(reaped.owners)
     )
-    taken = (
+    jobs_by_fate = (
         ("queued again", reaped.requeued),
         ("failed", reaped.failed),
         ("cancelled", reaped.cancelled),
     )
-    fates = "; ".join(f"{fate}: {', '.join(jobs)}" for fate, jobs in taken if jobs)
+    fates = "; ".join(f"{fate}: {', '.join(jobs)}" for fate, jobs in jobs_by_fate if jobs)
     _log.warning("%s; its jobs: %s", reasons, fates)
 
 
@@ -75,31 +75,31 @@ def _explain_reaping(owner: str, owners: LeaseOwners) -> str:
         return "has ended"
     if owner in owners.awake:
         return f"lives, but has not renewed its leases for {HUNG_AFTER.total_seconds():g} s"
-    return "was not heard of within its lease"
+    return "sent no heartbeat within its lease"
 
 
 class Reaper:
-    """Reaps from a thread of its own until `stopping` is set."""
+    """Reaps in a separate thread until `stopping` is set."""
 
     def __init__(self, database: Database, stopping: threading.Event) -> None:
         self._database, self._stopping = database, stopping
         self._thread = threading.Thread(target=self._run_loop, name="reaper", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def join(self) -> None:
-        """Wait for the last look to end, once `stopping` is set."""
+        """Wait for the last check to end, once `stopping` is set."""
         self._thread.join(5.0)
 
     def _run_loop(self) -> None:
-        is_cut_off = False
+        is_logged = False
         while not self._stopping.wait(PAUSE_SECONDS):
             try:
                 reap_jobs(self._database)
-                is_cut_off = False
+                is_logged = False
             except SQLAlchemyError as error:  # the database may come back
-                if not is_cut_off:
-                    _log.warning("cannot look for lost jobs: %s", str(error).splitlines()[0])
-                is_cut_off = True
+                if not is_logged:
+                    _log.warning("cannot check for orphaned jobs: %s", str(error).splitlines()[0])
+                is_logged = True

@@ -1,4 +1,4 @@
-"""What a leased job had from its earlier attempts, and what of it must go."""
+"""Progress of a leased job in its earlier attempts, and its deletion."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -14,15 +14,15 @@ from service.storage.tables import Checkpoint, MigrationLog, Run, RunHistory
 
 @dataclass(frozen=True, slots=True)
 class PreviousAttempts:
-    """What is behind a job that is claimed.
+    """Progress of a claimed job in its earlier attempts.
 
     Attributes
     ----------
     evaluations, generations : int
-        Of the runs that have ended: the sum and the largest.
-    reasons : tuple of str
-        Some of those for which runs failed, each once.
-    waiting : dict
+        Over the finished runs: the sum, and the largest number.
+    failure_reasons : tuple of str
+        Some distinct reasons why runs failed.
+    checkpoint_evaluations : dict
         Evaluations in the checkpoints of unfinished runs, by run.
     """
 
@@ -33,30 +33,30 @@ class PreviousAttempts:
 
 
 def summarize_attempts(session: Session, lease: Lease, n_reasons: int) -> PreviousAttempts:
-    """Add up what earlier attempts left; `LeaseLost` when the lease is not held."""
+    """Summarize the results of earlier attempts; `LeaseLost` if the lease is not held."""
     LeaseQueue(session).lock_job(lease)
-    mine = Run.job_id == lease.job_id
+    of_job = Run.job_id == lease.job_id
     sums = select(
         func.coalesce(func.sum(Run.evaluations), 0), func.coalesce(func.max(Run.generations), 0)
-    ).where(mine, Run.state.not_in(OPEN_STATES))
+    ).where(of_job, Run.state.not_in(OPEN_STATES))
     evaluations, generations = session.execute(sums).one()
-    failed = select(Run.error).where(mine, Run.state == JobState.FAILED, Run.error.is_not(None))
+    failed = select(Run.error).where(of_job, Run.state == JobState.FAILED, Run.error.is_not(None))
     first = failed.group_by(Run.error).order_by(func.min(Run.number)).limit(n_reasons)
-    kept = select(Checkpoint.run_id, Checkpoint.evaluations).where(
+    checkpoints = select(Checkpoint.run_id, Checkpoint.evaluations).where(
         Checkpoint.job_id == lease.job_id
     )
     return PreviousAttempts(
         int(evaluations),
         int(generations),
         tuple(str(reason) for reason in session.scalars(first)),
-        dict(session.execute(kept).all()),
+        dict(session.execute(checkpoints).all()),
     )
 
 
 def delete_progress(session: Session, lease: Lease, run_ids: Collection[str]) -> None:
-    """Delete checkpoint and history of runs that begin anew.
+    """Delete checkpoint and history of runs that start again from the beginning.
 
-    Another version of the program may find other numbers, and history is only ever added to.
+    Another version of the program may give other numbers, and history is only appended.
     """
     LeaseQueue(session).lock_job(lease)
     for chunk in split_chunks(run_ids):

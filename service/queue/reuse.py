@@ -1,4 +1,4 @@
-"""Runs that were computed before: found by the hash of their specification, and taken over."""
+"""Reuse earlier runs, which are identified by the hash of their specification."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
@@ -29,7 +29,7 @@ _COPIED_COLUMNS = (
 
 
 def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
-    """Write the hashes of runs' specifications, given by run; `LeaseLost` without the lease."""
+    """Write the specification hashes, passed by run; `LeaseLost` without the lease."""
     LeaseQueue(session).lock_job(lease)
     rows = ({"id": run, "spec_hash": digest} for run, digest in hashes.items())
     update_by_id(session, Run, rows)
@@ -38,11 +38,11 @@ def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> N
 def find_computed_runs(
     session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
 ) -> dict[str, str]:
-    """For each hash that a run of the project has succeeded with, the first such run.
+    """Return the first successful run of the project for each hash that has one.
 
-    Not those of jobs that were deleted: their signals are garbage, and may be gone.
+    Runs of deleted jobs are excluded: their signals are garbage and may be missing.
     """
-    found: dict[str, str] = {}
+    runs: dict[str, str] = {}
     for chunk in split_chunks(hashes):
         first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
         query = first.where(
@@ -50,30 +50,36 @@ def find_computed_runs(
             Run.project_id == project_id,
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
-            Run.signals_sha256.is_not(None),  # one whose signals could not be stored is not whole
+            Run.signals_sha256.is_not(
+                None
+            ),  # a run whose signals could not be stored is incomplete
         )
-        found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})
-    return found
+        runs.update(
+            {str(digest): run for digest, run in session.execute(query.group_by(Run.spec_hash))}
+        )
+    return runs
 
 
 def take_over_runs(session: Session, lease: Lease, sources: Mapping[str, str]) -> list[RunOutcome]:
-    """End runs with the results of others, given by run; gives what was written of them.
+    """End runs with the results of other runs, passed by run; return their outcomes.
 
     History and migrations are copied, so that each run is complete by itself.
     """
-    ledger, taken = RunWriter(session, lease), []
+    writer, all_outcomes = RunWriter(session, lease), []
     for chunk in split_chunks(sources.items()):
         pairs = dict(chunk)
         query = select(Run).where(Run.id.in_(set(pairs.values())))
-        known = {run.id: run for run in session.scalars(query)}
-        outcomes = [_copy_outcome(run, known[source]) for run, source in pairs.items()]
-        written = ledger.record_outcomes(outcomes)
+        source_runs = {run.id: run for run in session.scalars(query)}
+        outcomes = [_copy_outcome(run, source_runs[source]) for run, source in pairs.items()]
+        written = writer.record_outcomes(outcomes)
         for table in (RunHistory, MigrationLog):
             insert_missing(session, table, _copy_rows(session, table, pairs))
-        more = update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
-        session.execute(more, execution_options=RETURNING_OPTIONS)
-        taken += outcomes
-    return taken
+        reused_count = (
+            update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
+        )
+        session.execute(reused_count, execution_options=RETURNING_OPTIONS)
+        all_outcomes += outcomes
+    return all_outcomes
 
 
 def _copy_outcome(run: str, source: Run) -> RunOutcome:

@@ -1,4 +1,4 @@
-"""Runs as the dispatcher writes them. Every write holds the job's lease; most are in bulk."""
+"""Writes of the dispatcher to runs. Every write holds the lease of the job; most are in bulk."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ from service.storage.statements import (
 )
 from service.storage.tables import Checkpoint, Job, MigrationLog, Run, RunHistory
 
-# Every default of the table: with one missing, the rows would take the ORM's slow way.
+# Every default of the table: if one is missing, the slow path of the ORM is used.
 _RUN_DEFAULTS = {
     "state": JobState.QUEUED,
     "attempt": 0,
@@ -35,7 +35,7 @@ _RUN_DEFAULTS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NewRun:
-    """One run to be made: its place in the sweep and what distinguishes it."""
+    """A run to be created: its position in the sweep, and its settings."""
 
     number: int
     cell: Document = field(default_factory=dict)
@@ -48,7 +48,7 @@ class NewRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutcome:
-    """How a run ended. `result` is the document of the run result; None when it failed."""
+    """Outcome of a run. `result` is the document of the run result; None if the run failed."""
 
     run_id: str
     state: FinalState
@@ -70,8 +70,8 @@ class RunOutcome:
 class RunWriter:
     """Writes to the runs of one leased job, in one writing session.
 
-    The first method that is called locks the job's row, or raises `LeaseLost` when the lease is
-    not held; nobody else can change that until the session ends.
+    The first method that is called locks the row of the job, or raises `LeaseLost` if the lease is
+    not held. Nobody else can change the row until the session ends.
     """
 
     def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
@@ -80,31 +80,31 @@ class RunWriter:
         self._held: Job | None = None
 
     def create_runs(self, cells: Iterable[NewRun]) -> None:
-        """Make the job's runs; those that are there already stay, so a second call is harmless."""
+        """Create the runs of the job; existing runs stay, so a second call is harmless."""
         insert_runs(self._session, self._lock_job(), cells)
 
     def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[Run]:
-        """Unfinished runs with a `number` above `after`, in order."""
+        """List unfinished runs with a `number` above `after`, in order."""
         self._lock_job()
-        left = select(Run).where(
+        pending = select(Run).where(
             Run.job_id == self._lease.job_id, Run.state.in_(OPEN_STATES), Run.number > after
         )
-        return list(self._session.scalars(left.order_by(Run.number).limit(limit)))
+        return list(self._session.scalars(pending.order_by(Run.number).limit(limit)))
 
     def list_unfinished(self, numbers: Sequence[int]) -> list[Run]:
-        """Those of the runs of these numbers that are unfinished, in their order."""
+        """List the unfinished runs of these numbers, in their order."""
         self._lock_job()
-        found: list[Run] = []
+        runs: list[Run] = []
         for chunk in split_chunks(numbers):
-            mine = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
-            found += self._session.scalars(select(Run).where(mine, Run.state.in_(OPEN_STATES)))
-        return sorted(found, key=lambda run: run.number)
+            of_job = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
+            runs += self._session.scalars(select(Run).where(of_job, Run.state.in_(OPEN_STATES)))
+        return sorted(runs, key=lambda run: run.number)
 
     def start_runs(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
         self._lock_job()
         for chunk in split_chunks(run_ids):
-            begun = (
+            statement = (
                 update(Run)
                 .where(self._filter_runs(chunk), Run.state == JobState.QUEUED)
                 .values(
@@ -113,10 +113,10 @@ class RunWriter:
                     started_at=func.coalesce(Run.started_at, self._clock()),
                 )
             )
-            self._session.execute(begun, execution_options=RETURNING_OPTIONS)
+            self._session.execute(statement, execution_options=RETURNING_OPTIONS)
 
     def write_kills(self, kills: Mapping[str, int]) -> None:
-        """Write how often in a row a worker died over each of these runs."""
+        """Write how often in a row a worker died in each of these runs."""
         self._lock_job()
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
@@ -128,38 +128,40 @@ class RunWriter:
         history: Iterable[HistoryPoint] = (),
         migrants: Iterable[MigrantPoint] = (),
     ) -> tuple[str, ...]:
-        """End runs: results, states, history, the job's counts, all in this transaction.
+        """End runs: results, states, history and the counts of the job, in one transaction.
 
-        A run that has ended already keeps its result. Gives the identifiers of those written.
+        A run that has ended already keeps its result. Return the identifiers of the written runs.
         """
         self._lock_job()
-        open_ids = self._find_open_ids([one.run_id for one in outcomes])
-        fresh = [one for one in outcomes if one.run_id in open_ids]
+        open_ids = self._find_open_ids([outcome.run_id for outcome in outcomes])
+        fresh = [outcome for outcome in outcomes if outcome.run_id in open_ids]
         self._insert_history(history, migrants)
         if not fresh:
             return ()
         now, attempt = self._clock(), self._lease.attempt
         update_by_id(
-            self._session, Run, (_build_outcome_values(one, now, attempt) for one in fresh)
+            self._session,
+            Run,
+            (_build_outcome_values(outcome, now, attempt) for outcome in fresh),
         )
         self._update_counts(fresh)
         for chunk in split_chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
-        return tuple(one.run_id for one in fresh)
+        return tuple(outcome.run_id for outcome in fresh)
 
     def append_history(
         self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint] = ()
     ) -> None:
-        """Add to the history of runs.
+        """Append to the history of runs.
 
-        A run that goes on from a checkpoint finds the same points again, bit for bit; they count
-        once.
+        A run that continues from a checkpoint computes the same points again, bit for bit. They
+        count once.
         """
         self._lock_job()
         self._insert_history(history, migrants)
 
     def save_checkpoints(self, states: Iterable[tuple[str, int, bytes]]) -> None:
-        """Replace the checkpoints of runs, given as (run, evaluations, state)."""
+        """Replace the checkpoints of runs, passed as (run, evaluations, state)."""
         self._lock_job()
         now = self._clock()
         rows = (
@@ -176,7 +178,7 @@ class RunWriter:
         upsert(self._session, Checkpoint, rows)
 
     def read_checkpoints(self) -> dict[str, bytes]:
-        """The states from which unfinished runs of the job can go on, by run."""
+        """Read the checkpoints of the unfinished runs of the job, by run."""
         self._lock_job()
         query = select(Checkpoint.run_id, Checkpoint.state).where(
             Checkpoint.job_id == self._lease.job_id
@@ -192,11 +194,11 @@ class RunWriter:
         return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)
 
     def _find_open_ids(self, run_ids: Iterable[str]) -> set[str]:
-        found: set[str] = set()
+        open_ids: set[str] = set()
         for chunk in split_chunks(run_ids):
             query = select(Run.id).where(self._filter_runs(chunk), Run.state.in_(OPEN_STATES))
-            found.update(self._session.scalars(query))
-        return found
+            open_ids.update(self._session.scalars(query))
+        return open_ids
 
     def _insert_history(
         self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint]
@@ -207,17 +209,17 @@ class RunWriter:
     def _update_counts(self, ended: Sequence[RunOutcome]) -> None:
         values: dict[str, Any] = {
             "n_done": Job.n_done + len(ended),
-            "n_failed": Job.n_failed + sum(one.state is JobState.FAILED for one in ended),
+            "n_failed": Job.n_failed + sum(outcome.state is JobState.FAILED for outcome in ended),
         }
-        found = [one.best_rms for one in ended if one.best_rms is not None]
-        if found:
-            values["best_rms"] = choose_smaller_rms(min(found))
+        rms = [outcome.best_rms for outcome in ended if outcome.best_rms is not None]
+        if rms:
+            values["best_rms"] = choose_smaller_rms(min(rms))
         changed = update(Job).where(*self._lease.fence()).values(values)
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
 
 
 def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
-    """Make the queued runs of a job, in bulk; those that are there already stay as they are."""
+    """Create the queued runs of a job in bulk; existing runs stay unchanged."""
     now = utc_now()
     for chunk in split_chunks(cells):
         rows = [
@@ -234,12 +236,12 @@ def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
         insert_missing(session, Run, rows)
 
 
-def _build_outcome_values(one: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
-    values = {name: getattr(one, name) for name in RunOutcome.__slots__ if name != "run_id"}
+def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
+    values = {name: getattr(outcome, name) for name in RunOutcome.__slots__ if name != "run_id"}
     return {
         **values,
-        "id": one.run_id,
-        "estimates": _extract_estimates(one.result),
+        "id": outcome.run_id,
+        "estimates": _extract_estimates(outcome.result),
         "attempt": attempt,
         "finished_at": now,
     }
@@ -253,6 +255,6 @@ def _extract_estimates(result: Document | None) -> Document | None:
     if result is None:
         return None
     return {
-        one["name"]: {"value": one["value"], "stderr": one["stderr"]}
-        for one in result["parameters"]
+        parameter["name"]: {"value": parameter["value"], "stderr": parameter["stderr"]}
+        for parameter in result["parameters"]
     }

@@ -1,4 +1,4 @@
-"""Stored recordings: their rows. The samples lie in the object store."""
+"""The rows of stored recordings. The samples are in the object store."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,9 +19,9 @@ from service.storage.tables import DEFAULT_PROJECT, Dataset
 class NewDataset:
     """A recording to store; its object must be in the store already.
 
-    `kind` says how it came: ``upload``, ``simulate`` or ``derive``. `source_key` is a hash of
-    what it was made from: within a project the same source gives the same dataset. `channels`
-    describes each channel, `details` holds anything else (the derivation, labels, segments).
+    `kind` is its origin: ``upload``, ``simulate`` or ``derive``. `source_key` is a hash of the
+    source: within a project the same source gives the same dataset. `channels` describes each
+    channel, `details` holds the rest (derivation, labels, segments).
     """
 
     name: str
@@ -38,14 +38,14 @@ class NewDataset:
 
 @dataclass(frozen=True, slots=True)
 class StoredDataset:
-    """A dataset, and whether it is new or was stored before from the same source."""
+    """A dataset, and whether it is new or existed already from the same source."""
 
     dataset: Dataset
     is_new: bool
 
 
 class DatasetRepository:
-    """One project's datasets in one session. Whoever opened the session commits."""
+    """The datasets of one project in one session. The opener of the session commits."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
@@ -53,29 +53,29 @@ class DatasetRepository:
     def add(
         self, new: NewDataset, *, parents: Iterable[str] = (), relation: Relation = "derived"
     ) -> StoredDataset:
-        """Store a dataset and its lineage, or give the one made from the same source before."""
-        known = self.find_by_source(new.source_key)
-        if known is not None:
-            return StoredDataset(known, False)
+        """Store a dataset and its lineage, or return the existing one of the same source."""
+        existing = self.find_by_source(new.source_key)
+        if existing is not None:
+            return StoredDataset(existing, False)
         try:
-            # Two requests with the same source at once: the later one finds the other's here.
+            # Of two requests with the same source at once, the later one fails here.
             with self._session.begin_nested():
                 dataset = self._insert_row(new)
         except IntegrityError:
-            known = self.find_by_source(new.source_key)
-            if known is None:
+            existing = self.find_by_source(new.source_key)
+            if existing is None:
                 raise
-            return StoredDataset(known, False)
+            return StoredDataset(existing, False)
         LineageRepository(self._session, self._project_id).add_links(dataset.id, parents, relation)
         return StoredDataset(dataset, True)
 
     def find_by_source(self, source_key: str) -> Dataset | None:
-        """The dataset that was made from this source, if there is one."""
+        """Return the dataset of this source, if there is one."""
         query = select(Dataset).where(*self._filter_project(), Dataset.source_key == source_key)
         return self._session.scalar(query)
 
     def get(self, dataset_id: str) -> Dataset:
-        """A dataset of this project that was not deleted; `RowNotFound` otherwise."""
+        """Return an undeleted dataset of this project; else raise `RowNotFound`."""
         dataset = self._session.get(Dataset, dataset_id, populate_existing=True)
         if (
             dataset is None
@@ -86,17 +86,17 @@ class DatasetRepository:
         return dataset
 
     def get_all(self, dataset_ids: Iterable[str]) -> list[Dataset]:
-        """Datasets in the order asked for; `RowNotFound` names the first that is missing."""
+        """Return datasets in the requested order; `RowNotFound` names the first missing one."""
         wanted = list(dataset_ids)
         query = select(Dataset).where(*self._filter_project(), Dataset.id.in_(wanted))
-        found = {dataset.id: dataset for dataset in self._session.scalars(query)}
+        rows = {dataset.id: dataset for dataset in self._session.scalars(query)}
         for dataset_id in wanted:
-            if dataset_id not in found:
+            if dataset_id not in rows:
                 raise RowNotFound("dataset", dataset_id)
-        return [found[dataset_id] for dataset_id in wanted]
+        return [rows[dataset_id] for dataset_id in wanted]
 
     def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[Dataset]:
-        """Datasets, latest first."""
+        """List datasets, latest first."""
         query = (
             select(Dataset)
             .where(*self._filter_project())
@@ -105,11 +105,11 @@ class DatasetRepository:
         )
         if cursor is not None:
             query = query.where(Dataset.id < cursor)
-        found = self._session.scalars(query).all()
-        return make_page(found, limit, (dataset.id for dataset in found))
+        rows = self._session.scalars(query).all()
+        return make_page(rows, limit, (dataset.id for dataset in rows))
 
     def delete(self, dataset_id: str) -> None:
-        """Hide a dataset. Its object becomes garbage when no other row names it."""
+        """Hide a dataset. Its object becomes garbage when no other row refers to it."""
         self.get(dataset_id).deleted_at = utc_now()
         self._session.flush()
 
@@ -126,6 +126,6 @@ class DatasetRepository:
 def build_dataset_row(
     new: NewDataset, dataset_id: str, project_id: str = DEFAULT_PROJECT
 ) -> Dataset:
-    """The row of a recording, of no session: stored, or to be looked at before it is."""
+    """Build the row of a recording without a session: to store it, or to preview it."""
     values = {name: getattr(new, name) for name in NewDataset.__slots__}
     return Dataset(id=dataset_id, project_id=project_id, n_channels=len(new.channels), **values)

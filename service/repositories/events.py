@@ -1,4 +1,4 @@
-"""What happens to a job, in order: the source of the event stream."""
+"""The events of jobs in order: the source of the event stream."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -14,11 +14,11 @@ EventKind = Literal["state", "progress", "log", "end"]
 
 
 class EventRepository:
-    """Events in one session.
+    """The events in one session.
 
-    An event is added only while its job's row is locked by the same transaction. So the events
-    of one job become visible in the order of their numbers, and a reader that asks for those
-    after the last one it saw misses none.
+    An event is added only while the same transaction locks the row of its job. So the events of a
+    job become visible in the order of their numbers. A reader that asks for all events after the
+    last one misses none.
     """
 
     def __init__(self, session: Session) -> None:
@@ -35,21 +35,21 @@ class EventRepository:
         return event
 
     def append_state(self, job: Job) -> None:
-        """Tell the job's new state, and when it is a terminal one, that no event follows."""
+        """Append the new state of a job, and the end of its events if the state is terminal."""
         data = {"state": job.state.value, "attempt": job.attempt, "error": job.error}
         self.append_event(job.id, "state", data)
         if job.state not in OPEN_STATES:
             self.append_event(job.id, "end", data)
 
     def list_after(self, job_id: str, last_id: int = 0, limit: int = 500) -> list[Event]:
-        """A job's events after the one numbered `last_id`, oldest first."""
+        """List the events of a job after number `last_id`, oldest first."""
         newer = select(Event).where(Event.job_id == job_id, Event.id > last_id)
         return list(self._session.scalars(newer.order_by(Event.id).limit(limit)))
 
     def list_latest(
         self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()
     ) -> list[Event]:
-        """A job's last events of these kinds (of all, if none is named), oldest first."""
+        """List the last events of a job of some kinds (by default of all), oldest first."""
         query = select(Event).where(Event.job_id == job_id).order_by(Event.id.desc()).limit(limit)
         if kinds:
             query = query.where(Event.kind.in_(kinds))

@@ -1,8 +1,8 @@
-"""Points of a run's history and lines of its migration log, packed: a part of many is one row.
+"""Pack the points of a history and the lines of a migration log: many of them form one row.
 
-A run writes each point once; where it goes on from a checkpoint it finds the same points again, bit
-for bit, and may write some of them a second time, in another part. So a part is known by its
-content, and who reads the parts of a run takes each number once.
+A run writes each point once. When it continues from a checkpoint, it computes the same points
+again, bit for bit, and may write some of them twice, in another part. So a part is identified by
+its content, and a reader of the parts takes each number once.
 """
 
 import struct
@@ -14,7 +14,7 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 PHASES = ("start", "genetic", "sequence", "migration", "refinement")
-"""What a point may come from. Rows hold the place in this list: add at its end only."""
+"""Origins of a point. Rows store the index in this list: append only."""
 
 _HEAD = "<IIIQdB"  # island, number, generation, evaluations, rms, phase
 _MIGRANT = struct.Struct("<IIIId")  # number, epoch, source, destination, fitness
@@ -23,7 +23,7 @@ _get_run_id = attrgetter("run_id")
 
 
 class HistoryPoint(NamedTuple):
-    """A better champion of an island; `number` counts them on the island from 0."""
+    """An improved champion of an island; `number` counts them on the island from 0."""
 
     run_id: str
     island: int
@@ -47,69 +47,69 @@ class MigrantPoint(NamedTuple):
 
 
 def pack_history(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
-    """Rows of `run_history`: one for the points of each run that follow each other."""
-    for run, mine in groupby(points, _get_run_id):
-        part = list(mine)
+    """Pack consecutive points of each run into one row of `run_history`."""
+    for run, group in groupby(points, _get_run_id):
+        part = list(group)
         count = len(part[0].parameters)
         pack = _make_point_struct(count).pack
         data = b"".join(
             [
                 pack(
-                    one.island,
-                    one.number,
-                    one.generation,
-                    one.evaluations,
-                    one.rms,
-                    _NUMBER_OF[one.phase],
-                    *one.parameters,
+                    point.island,
+                    point.number,
+                    point.generation,
+                    point.evaluations,
+                    point.rms,
+                    _NUMBER_OF[point.phase],
+                    *point.parameters,
                 )
-                for one in part
+                for point in part
             ]
         )
         yield {
             "run_id": run,
             "digest": _hash_part(data),
             "n_parameters": count,
-            "generation": max([int(one.generation) for one in part]),
-            "evaluations": max([int(one.evaluations) for one in part]),
-            "rms": min([float(one.rms) for one in part]),
+            "generation": max([int(point.generation) for point in part]),
+            "evaluations": max([int(point.evaluations) for point in part]),
+            "rms": min([float(point.rms) for point in part]),
             "points": data,
         }
 
 
 def pack_migrants(points: Iterable[MigrantPoint]) -> Iterator[dict[str, Any]]:
-    """Rows of `migrations_log`: one for the migrants of each run that follow each other."""
-    for run, mine in groupby(points, _get_run_id):
-        data = b"".join([_MIGRANT.pack(*one[1:]) for one in mine])
+    """Pack consecutive migrants of each run into one row of `migrations_log`."""
+    for run, group in groupby(points, _get_run_id):
+        data = b"".join([_MIGRANT.pack(*migrant[1:]) for migrant in group])
         yield {"run_id": run, "digest": _hash_part(data), "migrants": data}
 
 
 def unpack_history(run: str, parts: Iterable[tuple[bytes, int]]) -> list[HistoryPoint]:
-    """The points of one run, island by island.
+    """Unpack the points of one run, island by island.
 
     Parameters
     ----------
     parts : iterable of (points, n_parameters)
-        Of its rows, in any order.
+        From the rows of the run, in any order.
     """
-    found: dict[tuple[int, int], HistoryPoint] = {}
+    points: dict[tuple[int, int], HistoryPoint] = {}
     for data, count in parts:
         for values in _make_point_struct(count).iter_unpack(data):
             island, number, generation, evaluations, rms, phase = values[:6]
-            found[island, number] = HistoryPoint(
+            points[island, number] = HistoryPoint(
                 run, island, number, generation, evaluations, rms, PHASES[phase], list(values[6:])
             )
-    return [found[place] for place in sorted(found)]
+    return [points[position] for position in sorted(points)]
 
 
 def unpack_migrants(run: str, parts: Iterable[bytes]) -> list[MigrantPoint]:
-    """The migrants of one run, in their order."""
-    found = {
+    """Unpack the migrants of one run, in order."""
+    migrants = {
         values[0]: MigrantPoint(run, *values)
         for data in parts
         for values in _MIGRANT.iter_unpack(data)
     }
-    return [found[number] for number in sorted(found)]
+    return [migrants[number] for number in sorted(migrants)]
 
 
 @lru_cache(maxsize=64)

@@ -21,7 +21,7 @@ QUEUE_CHANNEL = "lagid_queue"
 
 @dataclass(frozen=True, slots=True)
 class NewJob:
-    """A job to submit: `spec` is the whole validated body, `n_runs` the cells of its sweep."""
+    """A job to submit: `spec` is the validated body, `n_runs` counts the cells of its sweep."""
 
     name: str
     spec: Document
@@ -32,33 +32,33 @@ class NewJob:
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """A job, and whether it is new or was submitted before under the same key."""
+    """A job, and whether it is new or was submitted earlier with the same key."""
 
     job: Job
     is_new: bool
 
 
 class JobRepository:
-    """One project's jobs in one session. Whoever opened the session commits."""
+    """The jobs of one project in one session. The opener of the session commits."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
 
     def submit(self, new: NewJob, *, key: str | None = None, request_hash: str = "") -> Submission:
-        """Queue a job; with a `key` that was used before, give the job of that time.
+        """Queue a job; with a `key` that was used before, return the earlier job.
 
         Raises
         ------
         KeyReused
-            When the key was used with another request.
+            If the key was used before with another request.
         """
         if key is None:
             return Submission(self._insert_job(new), True)
-        known = self._find_by_key(key, request_hash)
-        if known is not None:
-            return Submission(known, False)
+        existing = self._find_by_key(key, request_hash)
+        if existing is not None:
+            return Submission(existing, False)
         try:
-            # Two requests with one key at once: the later one fails here and finds the other's.
+            # Of two requests with one key at once, the later one fails here.
             with self._session.begin_nested():
                 job = self._insert_job(new)
                 self._session.add(
@@ -70,30 +70,30 @@ class JobRepository:
                     )
                 )
         except IntegrityError:
-            known = self._find_by_key(key, request_hash)
-            if known is None:
+            existing = self._find_by_key(key, request_hash)
+            if existing is None:
                 raise
-            return Submission(known, False)
+            return Submission(existing, False)
         return Submission(job, True)
 
     def is_key_used(self, key: str) -> bool:
-        """Whether a job was submitted under this key."""
-        found = select(IdempotencyKey.key).where(
+        """Return whether a job was submitted under this key."""
+        query = select(IdempotencyKey.key).where(
             IdempotencyKey.project_id == self._project_id, IdempotencyKey.key == key
         )
-        return self._session.scalar(found) is not None
+        return self._session.scalar(query) is not None
 
     def get(self, job_id: str) -> Job:
-        """A job of this project that was not deleted; `RowNotFound` otherwise."""
+        """Return an undeleted job of this project; else raise `RowNotFound`."""
         job = self._session.get(Job, job_id, populate_existing=True)
         if job is None or job.project_id != self._project_id or job.deleted_at is not None:
             raise RowNotFound("job", job_id)
         return job
 
     def get_state(self, job_id: str) -> JobState:
-        """The state of such a job, without the rest of it; `RowNotFound` as `get` does."""
-        found = select(Job.state).where(Job.id == job_id, *self._filter_project())
-        state = self._session.scalar(found)
+        """Return only the state of an undeleted job; else raise `RowNotFound`."""
+        query = select(Job.state).where(Job.id == job_id, *self._filter_project())
+        state = self._session.scalar(query)
         if state is None:
             raise RowNotFound("job", job_id)
         return state
@@ -101,28 +101,28 @@ class JobRepository:
     def list_page(
         self, *, cursor: str | None = None, limit: int = 50, states: Sequence[JobState] = ()
     ) -> RowPage[Job]:
-        """Jobs, latest first. The pages stay put while new jobs arrive."""
+        """List jobs, latest first. The pages do not shift while new jobs arrive."""
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
         if states:
             query = query.where(Job.state.in_(states))
-        found = self._session.scalars(query).all()
-        return make_page(found, limit, (job.id for job in found))
+        rows = self._session.scalars(query).all()
+        return make_page(rows, limit, (job.id for job in rows))
 
     def count_states(self) -> dict[JobState, int]:
-        """How many jobs are in each state."""
+        """Count the jobs in each state."""
         query = select(Job.state, func.count()).where(*self._filter_project()).group_by(Job.state)
-        found = dict(self._session.execute(query).all())
-        return {state: found.get(state, 0) for state in JobState}
+        counts = dict(self._session.execute(query).all())
+        return {state: counts.get(state, 0) for state in JobState}
 
     def cancel(self, job_id: str) -> Job:
         """Cancel a queued job at once, or ask the dispatcher of a running one to stop.
 
         Raises
         ------
-        Conflict
-            When the job has already succeeded or failed. A cancelled one stays as it is.
+        RowConflict
+            If the job has already succeeded or failed. A cancelled job stays unchanged.
         """
         job = self._lock_job(job_id)
         if job.state is JobState.CANCELLED:
@@ -140,18 +140,18 @@ class JobRepository:
         return job
 
     def resume(self, job_id: str) -> Job:
-        """Queue a failed or cancelled job again; runs that succeeded keep their results.
+        """Queue a failed or cancelled job again; successful runs keep their results.
 
-        The one way out of a terminal state, and only a user's wish takes it.
+        Only this request of a user leaves a terminal state.
         """
         job = self._lock_job(job_id)
         if job.state not in (JobState.FAILED, JobState.CANCELLED):
             raise RowConflict(
                 f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
             )
-        again = update(Run).where(Run.job_id == job_id, Run.state != JobState.SUCCEEDED)
+        unsuccessful = update(Run).where(Run.job_id == job_id, Run.state != JobState.SUCCEEDED)
         self._session.execute(
-            again.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
+            unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
         )
         job.state, job.cancel_requested = JobState.QUEUED, False
@@ -168,7 +168,7 @@ class JobRepository:
         return job
 
     def delete(self, job_id: str) -> None:
-        """Hide a finished job; what only it refers to becomes garbage."""
+        """Hide a finished job; objects of this job alone become garbage."""
         job = self._lock_job(job_id)
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
@@ -219,7 +219,7 @@ class JobRepository:
 
 
 def end_open_runs(session: Session, job_id: str, state: JobState, error: str | None) -> None:
-    """Move a job's unfinished runs to a terminal state."""
+    """Move the unfinished runs of a job to a terminal state."""
     unfinished = update(Run).where(Run.job_id == job_id, Run.state.in_(OPEN_STATES))
     session.execute(
         unfinished.values(state=state, error=error, finished_at=utc_now()),
@@ -228,6 +228,6 @@ def end_open_runs(session: Session, job_id: str, state: JobState, error: str | N
 
 
 def notify_queue(session: Session) -> None:
-    """Wake the dispatchers when this transaction commits. SQLite has none to wake: they poll."""
+    """Wake the dispatchers when this transaction commits. With SQLite they poll."""
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text("SELECT pg_notify(:channel, '')"), {"channel": QUEUE_CHANNEL})

@@ -1,6 +1,6 @@
-"""What was made from what: edges between datasets, jobs and runs, and walks along them.
+"""Lineage: edges between datasets, jobs and runs, and walks along them.
 
-Small questions that the use cases ask: datasets by name, names of a run, how far runs are.
+It also has small queries of the use cases: datasets by name, names of a run, progress of runs.
 """
 
 from collections.abc import Collection, Iterable
@@ -32,7 +32,7 @@ class LineageLink:
 
 
 class LineageRepository:
-    """One project's lineage in one session."""
+    """The lineage of one project in one session."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
@@ -46,34 +46,34 @@ class LineageRepository:
         insert_missing(self._session, LineageEdge, edges)
 
     def list_ancestors(self, identity: str) -> list[LineageLink]:
-        """Every edge on the ways from the raw files to this object."""
+        """List every edge on the paths from the raw files to this object."""
         return self._walk_edges(identity, upward=True)
 
     def list_descendants(self, identity: str) -> list[LineageLink]:
-        """Every edge on the ways from this object to what was made from it."""
+        """List every edge on the paths from this object to its descendants."""
         return self._walk_edges(identity, upward=False)
 
     def _walk_edges(self, identity: str, *, upward: bool) -> list[LineageLink]:
         near, far = LineageEdge.child, LineageEdge.parent
         if not upward:
             near, far = far, near
-        # UNION (not ALL) ends the walk even if a circle should ever be recorded.
-        mine = LineageEdge.project_id == self._project_id
-        reached = select(far.label("id")).where(near == identity, mine).cte(recursive=True)
+        # UNION (not ALL) ends the walk even if a cycle is ever recorded.
+        of_project = LineageEdge.project_id == self._project_id
+        reached = select(far.label("id")).where(near == identity, of_project).cte(recursive=True)
         edge = aliased(LineageEdge)
         next_near, next_far = (edge.child, edge.parent) if upward else (edge.parent, edge.child)
         reached = reached.union(
             select(next_far).where(next_near == reached.c.id, edge.project_id == self._project_id)
         )
         query = select(LineageEdge).where(
-            mine, or_(near == identity, near.in_(select(reached.c.id)))
+            of_project, or_(near == identity, near.in_(select(reached.c.id)))
         )
-        found = self._session.scalars(query)
-        return sorted(LineageLink(one.child, one.parent, one.relation) for one in found)
+        edges = self._session.scalars(query)
+        return sorted(LineageLink(row.child, row.parent, row.relation) for row in edges)
 
 
 class WrittenProgress(NamedTuple):
-    """How far an open run is known to be, from the improvements written so far."""
+    """Progress of an open run, from the improvements written so far."""
 
     generation: int
     evaluations: int
@@ -83,7 +83,7 @@ class WrittenProgress(NamedTuple):
 def find_datasets_by_name(
     session: Session, name: str, project_id: str = DEFAULT_PROJECT
 ) -> list[Dataset]:
-    """Datasets of that very name, latest first."""
+    """List the datasets with exactly this name, latest first."""
     query = select(Dataset).where(
         Dataset.project_id == project_id, Dataset.deleted_at.is_(None), Dataset.name == name
     )
@@ -91,7 +91,7 @@ def find_datasets_by_name(
 
 
 def list_dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[str]:
-    """Names of the latest datasets, to suggest one."""
+    """List the names of the latest datasets, for suggestions."""
     query = select(Dataset.name).where(
         Dataset.project_id == project_id, Dataset.deleted_at.is_(None)
     )
@@ -101,7 +101,7 @@ def list_dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> l
 def list_reference_names(
     session: Session, run_id: str, project_id: str = DEFAULT_PROJECT
 ) -> list[str]:
-    """Names under which a run was accepted as a reference, now or before."""
+    """List the names for which a run is or was an accepted reference."""
     query = select(AcceptedReference.name).where(
         AcceptedReference.project_id == project_id, AcceptedReference.run_id == run_id
     )
@@ -109,7 +109,7 @@ def list_reference_names(
 
 
 def read_written_progress(session: Session, run_ids: Collection[str]) -> dict[str, WrittenProgress]:
-    """The furthest generation and the least RMS in the history of each run."""
+    """Read the largest generation and the smallest RMS in the history of each run."""
     columns = (
         RunHistory.run_id,
         func.max(RunHistory.generation),

@@ -1,4 +1,4 @@
-"""Users' own models: immutable, numbered versions of a document."""
+"""Models of users: immutable, numbered versions of a document."""
 
 import hashlib
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ class AddedModel:
 
 
 class ModelRepository:
-    """One project's models in one session. Whoever opened the session commits."""
+    """The models of one project in one session. The opener of the session commits."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
 
     def add(self, name: str, document: Document) -> AddedModel:
-        """Store a document as the next version of `name`; the latest again if it is the same."""
+        """Store a document as the next version of `name`, unless it equals the latest version."""
         digest = hashlib.sha256(to_json(document).encode()).hexdigest()
         for _ in range(_MAX_TRIES):
             latest = self._find_latest(name)
@@ -46,14 +46,14 @@ class ModelRepository:
         raise RowNotFound("free version of model", name)
 
     def get(self, reference: str) -> ModelVersion:
-        """A model by ``name`` (the latest version), ``name@version`` or identifier."""
+        """Return a model by ``name`` (the latest version), ``name@version`` or identifier."""
         model = self._find_model(reference)
         if model is None:
             raise RowNotFound("model", reference)
         return model
 
     def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[ModelVersion]:
-        """Every version of every model, latest first."""
+        """List every version of every model, latest first."""
         query = (
             select(ModelVersion)
             .where(*self._filter_project())
@@ -62,11 +62,11 @@ class ModelRepository:
         )
         if cursor is not None:
             query = query.where(ModelVersion.id < cursor)
-        found = self._session.scalars(query).all()
-        return make_page(found, limit, (model.id for model in found))
+        rows = self._session.scalars(query).all()
+        return make_page(rows, limit, (model.id for model in rows))
 
     def delete(self, reference: str) -> None:
-        """Hide one version of a model; jobs that used it keep its document."""
+        """Hide one version of a model; jobs with this version keep its document."""
         self.get(reference).deleted_at = utc_now()
         self._session.flush()
 
@@ -74,8 +74,8 @@ class ModelRepository:
         return ModelVersion.project_id == self._project_id, ModelVersion.deleted_at.is_(None)
 
     def _find_model(self, reference: str) -> ModelVersion | None:
-        name, at, version = reference.partition("@")
-        if not at:
+        name, separator, version = reference.partition("@")
+        if not separator:
             by_id = select(ModelVersion).where(
                 *self._filter_project(), ModelVersion.id == reference
             )
@@ -90,7 +90,7 @@ class ModelRepository:
         return self._session.scalar(query.order_by(ModelVersion.version.desc()).limit(1))
 
     def _insert_version(self, name: str, document: Document, digest: str) -> ModelVersion:
-        # A deleted version keeps its number, so that name@version never means two documents.
+        # A deleted version keeps its number, so that name@version stays unique.
         used = select(func.max(ModelVersion.version)).where(
             ModelVersion.project_id == self._project_id, ModelVersion.name == name
         )

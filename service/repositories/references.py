@@ -1,4 +1,4 @@
-"""Accepted references: which run stands for a name now, and which ones did before."""
+"""Accepted references: the run that is the reference of a name, and the previous ones."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from service.storage.statements import RowPage, make_page
 from service.storage.tables import DEFAULT_PROJECT, AcceptedReference, Run
 
 MAX_HISTORY = 1000
-"""Acceptances of one name that are told."""
+"""Longest reported history of one name."""
 
 _MAX_TRIES = 20
 _MAX_NAMES = 10_000
 
 
 class CurrentReference(NamedTuple):
-    """The reference in use of a name, with what is told of its run."""
+    """The reference in use of a name, with details of its run."""
 
     accepted: AcceptedReference
     job_id: str
@@ -29,7 +29,7 @@ class CurrentReference(NamedTuple):
 
 
 class ReferenceRepository:
-    """One project's references in one session. Whoever opened the session commits."""
+    """The references of one project in one session. The opener of the session commits."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
@@ -39,7 +39,7 @@ class ReferenceRepository:
     ) -> AcceptedReference:
         """Make a run the reference of a name.
 
-        The one in use again changes nothing, unless by whom or why is given and is another.
+        To accept the current reference again changes nothing, unless the person or the note is new.
         """
         for _ in range(_MAX_TRIES):
             latest = self._find_latest(name)
@@ -64,32 +64,32 @@ class ReferenceRepository:
         raise RowConflict(f"reference {name!r} is being accepted by others; try again")
 
     def get_latest(self, name: str) -> AcceptedReference:
-        """What is in use under a name; `RowNotFound` if nothing is."""
-        found = self._find_latest(name)
-        if found is None:
+        """Return the reference in use of a name; `RowNotFound` if there is none."""
+        latest = self._find_latest(name)
+        if latest is None:
             raise RowNotFound("reference", name)
-        return found
+        return latest
 
     def list_history(self, name: str) -> Sequence[AcceptedReference]:
-        """What was accepted under a name, the one in use first, at most `MAX_HISTORY` of them.
+        """List the acceptances of a name, the current one first, at most `MAX_HISTORY`.
 
         Raises
         ------
-        NotFound
-            If nothing was.
+        RowNotFound
+            If nothing was accepted.
         """
         query = select(AcceptedReference).where(*self._filter_name(name)).limit(MAX_HISTORY)
-        found = self._session.scalars(query.order_by(AcceptedReference.number.desc())).all()
-        if not found:
+        acceptances = self._session.scalars(query.order_by(AcceptedReference.number.desc())).all()
+        if not acceptances:
             raise RowNotFound("reference", name)
-        return found
+        return acceptances
 
     def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[CurrentReference]:
-        """The reference in use of every name, by name."""
-        mine = AcceptedReference.project_id == self._project_id
+        """List the reference in use of every name, by name."""
+        of_project = AcceptedReference.project_id == self._project_id
         last = (
             select(AcceptedReference.name, func.max(AcceptedReference.number).label("number"))
-            .where(mine)
+            .where(of_project)
             .group_by(AcceptedReference.name)
             .order_by(AcceptedReference.name)
             .limit(limit + 1)
@@ -105,14 +105,14 @@ class ReferenceRepository:
                 & (AcceptedReference.number == chosen.c.number),
             )
             .join(Run, Run.id == AcceptedReference.run_id)
-            .where(mine)
+            .where(of_project)
             .order_by(AcceptedReference.name)
         )
-        found = [CurrentReference(*row) for row in self._session.execute(query)]
-        return make_page(found, limit, (one.accepted.name for one in found))
+        references = [CurrentReference(*row) for row in self._session.execute(query)]
+        return make_page(references, limit, (reference.accepted.name for reference in references))
 
     def list_names(self) -> Sequence[str]:
-        """Names in use."""
+        """List the names of references in use."""
         query = (
             select(AcceptedReference.name)
             .distinct()
@@ -128,12 +128,12 @@ class ReferenceRepository:
         ).first()
 
     def _filter_name(self, name: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
-        mine = AcceptedReference.project_id == self._project_id
-        return mine, AcceptedReference.name == name
+        of_project = AcceptedReference.project_id == self._project_id
+        return of_project, AcceptedReference.name == name
 
 
 def _is_same_acceptance(
     latest: AcceptedReference, run_id: str, by: str | None, note: str | None
 ) -> bool:
-    is_new_word = by not in (None, latest.accepted_by) or note not in (None, latest.note)
-    return latest.run_id == run_id and not is_new_word
+    has_new_details = by not in (None, latest.accepted_by) or note not in (None, latest.note)
+    return latest.run_id == run_id and not has_new_details

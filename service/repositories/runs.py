@@ -1,4 +1,4 @@
-"""Runs as users see them: read, list, count, and the columns that summaries need."""
+"""Runs as users see them: read, list, count, and the columns of summaries."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ _ORDER_COLUMNS: dict[RunOrder, InstrumentedAttribute[Any]] = {
 
 
 class RunRow(NamedTuple):
-    """The columns of a run that summaries and plots need; `estimates` as in the table."""
+    """The columns of a run for summaries and plots; `estimates` as in the table."""
 
     id: str
     number: int
@@ -62,13 +62,13 @@ class RunRow(NamedTuple):
 
 
 class RunRepository:
-    """One project's runs in one session."""
+    """The runs of one project in one session."""
 
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
 
     def get(self, run_id: str) -> Run:
-        """A run of this project; `RowNotFound` otherwise."""
+        """Return a run of this project; else raise `RowNotFound`."""
         run = self._session.get(Run, run_id, populate_existing=True)
         if run is None or run.project_id != self._project_id:
             raise RowNotFound("run", run_id)
@@ -86,63 +86,65 @@ class RunRepository:
         order: RunOrder = "number",
         descending: bool = False,
     ) -> RowPage[Run]:
-        """Runs of a job, by a column; runs without a value in it come last.
+        """List the runs of a job, sorted by a column; runs without a value in it come last.
 
-        `cell` keeps the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``.
-        The pages stay put while runs finish, as far as their values in the column do.
+        `cell` selects the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``. The
+        pages do not shift while runs finish, unless their values in the column change.
         """
         query = select(Run).where(*self._filter_job(job_id)).limit(limit + 1)
         if states:
             query = query.where(Run.state.in_(states))
-        for column, wanted in ((Run.cell, cell), (Run.labels, labels)):
-            for key, value in (wanted or {}).items():
+        for column, entries in ((Run.cell, cell), (Run.labels, labels)):
+            for key, value in (entries or {}).items():
                 query = query.where(entry_equals(self._session, column, key, value))
-        found = self._session.scalars(
+        rows = self._session.scalars(
             _apply_order(query, _ORDER_COLUMNS[order], descending, cursor)
         ).all()
-        cursors = (json.dumps([getattr(run, order), run.number]) for run in found)
-        return make_page(found, limit, cursors)
+        cursors = (json.dumps([getattr(run, order), run.number]) for run in rows)
+        return make_page(rows, limit, cursors)
 
     def count_created(self, job_id: str) -> int:
-        """How many runs of a job have been made: always its first ones."""
+        """Count the created runs of a job; they are always its first ones."""
         last = self._session.scalar(select(func.max(Run.number)).where(*self._filter_job(job_id)))
         return 0 if last is None else int(last) + 1
 
     def count_states(self, job_id: str) -> dict[JobState, int]:
-        """How many runs of a job are in each state."""
+        """Count the runs of a job in each state."""
         query = select(Run.state, func.count()).where(*self._filter_job(job_id)).group_by(Run.state)
-        found = dict(self._session.execute(query).all())
-        return {state: found.get(state, 0) for state in JobState}
+        counts = dict(self._session.execute(query).all())
+        return {state: counts.get(state, 0) for state in JobState}
 
     def read_table(self, job_id: str) -> list[RunRow]:
-        """The columns of all runs of a job that summaries need, in the order of the sweep."""
+        """Read the summary columns of all runs of a job, in the order of the sweep."""
         columns = [getattr(Run, name) for name in RunRow._fields]
         query = select(*columns).where(*self._filter_job(job_id)).order_by(Run.number)
         return [RunRow(*row) for row in self._session.execute(query)]
 
     def list_parameters(self, job_id: str) -> list[tuple[str, str]]:
-        """Names and units of all parameters in the results of a job's runs, the earliest first."""
+        """List names and units of all parameters in the results of a job, the earliest first."""
         if self._session.get_bind().dialect.name == "postgresql":
-            told = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
-            each, entry = told.render_derived(), func.jsonb_extract_path_text
+            elements = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
+            each, entry = elements.render_derived(), func.jsonb_extract_path_text
             name, unit = (entry(each.c.value, key) for key in ("name", "unit"))
         else:
             each = func.json_each(Run.result, "$.parameters").table_valued("value")
             name, unit = (func.json_extract(each.c.value, f"$.{key}") for key in ("name", "unit"))
-        found = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
-        query = found.where(*self._filter_job(job_id), Run.result.is_not(None)).group_by(name, unit)
+        query_columns = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
+        query = query_columns.where(*self._filter_job(job_id), Run.result.is_not(None)).group_by(
+            name, unit
+        )
         rows = sorted(self._session.execute(query), key=lambda row: row[2])
         return [(row[0], row[1]) for row in rows]
 
     def read_history(self, run_id: str) -> list[HistoryPoint]:
-        """Better champions of a run, island by island, in the order they were found."""
+        """Read the improved champions of a run by island, in their order."""
         parts = select(RunHistory.points, RunHistory.n_parameters).where(
             RunHistory.run_id == self.get(run_id).id
         )
         return unpack_history(run_id, ((row[0], row[1]) for row in self._session.execute(parts)))
 
     def read_migrations(self, run_id: str) -> list[MigrantPoint]:
-        """Migrants of a run, in order."""
+        """Read the migrants of a run, in order."""
         parts = select(MigrationLog.migrants).where(MigrationLog.run_id == self.get(run_id).id)
         return unpack_migrants(run_id, self._session.scalars(parts))
 
@@ -153,7 +155,7 @@ class RunRepository:
 def entry_equals(
     session: Session, column: InstrumentedAttribute[Document], key: str, value: object
 ) -> ColumnElement[bool]:
-    """Whether a document has this value under a key."""
+    """Return the condition that a document has this value under a key."""
     if session.get_bind().dialect.name == "postgresql":
         return type_coerce(column, JSONB)[key] == cast(literal(to_json(value)), JSONB)
     return _sqlite_entry_equals(column, key, value)
@@ -163,7 +165,7 @@ def _sqlite_entry_equals(
     column: InstrumentedAttribute[Document], key: str, value: object
 ) -> ColumnElement[bool]:
     each = func.json_each(column).table_valued("key", "value", "type")
-    # SQLite's own numbers for true and false are 1 and 0: only the type tells them apart.
+    # SQLite stores true and false as 1 and 0: only the type distinguishes them.
     if value is None or isinstance(value, bool):
         return exists(select(1).where(each.c.key == key, each.c.type == to_json(value)))
     types = ("integer", "real") if isinstance(value, int | float) else ("text",)
@@ -182,7 +184,7 @@ def _apply_order(
     cursor: str | None,
 ) -> Select[Run]:
     by = column.desc() if descending else column.asc()
-    if column is Run.number:  # never NULL and no two alike: plain, so that its index serves
+    if column is Run.number:  # never NULL and unique: a plain order can use its index
         query = query.order_by(by)
     else:
         query = query.order_by(column.is_(None), by, Run.number)
@@ -194,8 +196,8 @@ def _apply_order(
     beyond = column < value if descending else column > value
     if column is Run.number:
         return query.where(beyond)
-    beside = (column == value) & (Run.number > number)
-    return query.where(or_(beyond, beside, column.is_(None)))
+    tied = (column == value) & (Run.number > number)
+    return query.where(or_(beyond, tied, column.is_(None)))
 
 
 def _parse_cursor(cursor: str) -> tuple[float | None, int]:

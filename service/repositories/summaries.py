@@ -1,4 +1,4 @@
-"""Aggregates over the runs of a job, computed by the database: no run is loaded to be counted."""
+"""Aggregates over the runs of a job. The database computes them, so that no run is loaded."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,27 +25,27 @@ from service.storage.columns import to_json
 from service.storage.tables import DEFAULT_PROJECT, Job, Run
 
 QUANTILES_PER_MILLE = (50, 250, 500, 750, 950)
-"""In thousandths: the database counts places with whole numbers."""
+"""Quantiles in thousandths, because the database computes ranks with integers."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """What runs are grouped by: an axis of the sweep, or a label."""
+    """Key by which runs are grouped: an axis of the sweep, or a label."""
 
     kind: Literal["axis", "label"]
     name: str
 
     @property
     def column(self) -> ColumnElement[Any]:
-        """The value in a run's row."""
+        """Value in the row of a run."""
         column = Run.cell if self.kind == "axis" else Run.labels
-        found: ColumnElement[Any] = column.expression[self.name]
-        return found
+        entry: ColumnElement[Any] = column.expression[self.name]
+        return entry
 
 
 @dataclass(frozen=True, slots=True)
 class SummaryQuantity:
-    """A number of each run that quantiles are wanted of."""
+    """A number of each run of which quantiles are computed."""
 
     kind: Literal[
         "rms",
@@ -60,7 +60,7 @@ class SummaryQuantity:
 
     @property
     def column(self) -> ColumnElement[Any]:
-        """The value in a run's row; NULL where it has none."""
+        """Value in the row of a run; NULL if it has none."""
         match self.kind:
             case "rms":
                 return Run.best_rms.expression
@@ -69,13 +69,13 @@ class SummaryQuantity:
                 number: ColumnElement[Any] = Run.estimates[(self.parameter, entry)].as_float()
                 return number
             case _:
-                found: ColumnElement[Any] = getattr(Run, self.kind)
-                return found
+                column: ColumnElement[Any] = getattr(Run, self.kind)
+                return column
 
 
 @dataclass(slots=True)
 class RunGroup:
-    """The runs that share the values of the grouping keys; `sigma` is the range of their noise."""
+    """Runs with equal values of the grouping keys; `sigma` is the range of their noise."""
 
     key: tuple[Any, ...]
     first_number: int
@@ -95,14 +95,14 @@ def read_groups(
     limit: int,
     project_id: str = DEFAULT_PROJECT,
 ) -> list[RunGroup]:
-    """Groups of a job's runs in the order of the sweep, at most `limit` + 1 of them.
+    """Read the groups of a job's runs in the order of the sweep, at most `limit` + 1 of them.
 
-    Quantiles are those of runs that succeeded, linearly interpolated between neighbours.
+    Quantiles are those of successful runs, interpolated linearly between neighbours.
     """
     columns = [key.column.label(f"key{i}") for i, key in enumerate(keys)]
-    # Once asked for the project too, SQLite searches all its runs for those of the job.
+    # With a condition on the project too, SQLite would search all runs of the project.
     of_project = select(Job.id).where(Job.id == job_id, Job.project_id == project_id)
-    mine = (Run.job_id == of_project.scalar_subquery(),)
+    of_job = (Run.job_id == of_project.scalar_subquery(),)
     counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in JobState]
     query = (
         select(
@@ -115,29 +115,29 @@ def read_groups(
             *counts,
             *columns,
         )
-        .where(*mine)
+        .where(*of_job)
         .group_by(*columns)
         .order_by(func.min(Run.number))
         .limit(limit + 1)
     )
-    found: dict[str, RunGroup] = {}
+    groups: dict[str, RunGroup] = {}
     for first, valid, evaluations, seconds, low, high, *rest in session.execute(query):
         key = tuple(rest[len(counts) :])
         states = {state: int(n) for state, n in zip(JobState, rest, strict=False)}
         mean = None if evaluations is None else float(evaluations)
         sigma = None if low is None else (float(low), float(high))
-        found[to_json(key)] = RunGroup(key, int(first), states, int(valid), sigma, mean, seconds)
-    by_first = {group.first_number: group for group in found.values()}
-    for first, quantity, values in _read_quantiles(session, mine, columns, quantities):
+        groups[to_json(key)] = RunGroup(key, int(first), states, int(valid), sigma, mean, seconds)
+    by_first = {group.first_number: group for group in groups.values()}
+    for first, quantity, values in _read_quantiles(session, of_job, columns, quantities):
         if first in by_first:  # not beyond the limit
             by_first[first].quantiles[quantity] = values
-    return list(found.values())
+    return list(groups.values())
 
 
 def find_quietest_run(
     session: Session, job_id: str, cell: Mapping[str, Any], project_id: str = DEFAULT_PROJECT
 ) -> Run | None:
-    """The best valid run of a cell among those with the least noise; None if none succeeded."""
+    """Find the best valid run of a cell among those with the least noise; None without success."""
     query = select(Run).where(
         Run.job_id == job_id,
         Run.project_id == project_id,
@@ -155,29 +155,30 @@ def _restrict_to_succeeded(column: Any) -> ColumnElement[Any]:
 
 def _read_quantiles(
     session: Session,
-    mine: Sequence[ColumnElement[bool]],
+    of_job: Sequence[ColumnElement[bool]],
     keys: Sequence[Any],
     quantities: Sequence[SummaryQuantity],
 ) -> Iterator[tuple[int, SummaryQuantity, tuple[float, ...]]]:
-    """The first number of each group, a quantity, its quantiles: only values beside them are read.
+    """Yield the first number of each group, a quantity, and its quantiles.
 
-    One statement takes what it needs out of each row's documents once, and then ranks numbers.
+    Only the values next to the quantiles are read. One statement extracts the numbers from the
+    documents of each row once, and then ranks them.
     """
     if not quantities:
         return
     names = [f"q{i}" for i in range(len(quantities))]
     group: ColumnElement[int] = func.dense_rank().over(order_by=list(keys)) if keys else literal(1)
-    # Also of runs that did not succeed, so that a group's first run is the same everywhere.
+    # Includes runs that did not succeed, so that the first run of a group is always the same.
     wide = (
         select(
             group.label("grp"),
             Run.number.label("number"),
             *(
-                _restrict_to_succeeded(one.column).label(name)
-                for one, name in zip(quantities, names, strict=True)
+                _restrict_to_succeeded(quantity.column).label(name)
+                for quantity, name in zip(quantities, names, strict=True)
             ),
         )
-        .where(*mine)
+        .where(*of_job)
         .cte("wide")
     )
     nothing = literal(0)
@@ -188,22 +189,22 @@ def _read_quantiles(
     )
     first: dict[int, int] = {}
     values: dict[tuple[int, int], tuple[int, dict[int, float]]] = {}
-    for which, grp, number, at, count in session.execute(statement):
+    for which, grp, number, rank, count in session.execute(statement):
         if which < 0:
             first[int(grp)] = int(number)
             continue
         entry = values.setdefault((int(grp), int(which)), (int(count), {}))
-        entry[1][int(at)] = float(number)
-    for (grp, which), (count, places) in values.items():
-        found = tuple(_interpolate_quantile(places, count, q) for q in QUANTILES_PER_MILLE)
-        yield first[grp], quantities[which], found
+        entry[1][int(rank)] = float(number)
+    for (grp, which), (count, ranked) in values.items():
+        quantiles = tuple(_interpolate_quantile(ranked, count, q) for q in QUANTILES_PER_MILLE)
+        yield first[grp], quantities[which], quantiles
 
 
 def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
-    """The values on both sides of each quantile of one column, group by group."""
+    """Select the values on both sides of each quantile of one column, by group."""
     value = wide.c[name]
     place = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
-    # The count is a window's too: SQLite joins a table of counts by trying every pair.
+    # The count is a window function too: SQLite would join a table of counts pair by pair.
     count = func.count().over(partition_by=wide.c.grp).label("n")
     ranked = (
         select(wide.c.grp, value.label("value"), place, count).where(value.is_not(None)).subquery()
@@ -211,11 +212,11 @@ def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
     n = cast(ranked.c.n, Integer)
     lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES_PER_MILLE]
     return select(literal(which), ranked).where(
-        or_(*(ranked.c.place.in_((at, at + 1)) for at in lower))
+        or_(*(ranked.c.place.in_((rank, rank + 1)) for rank in lower))
     )
 
 
-def _interpolate_quantile(places: dict[int, float], count: int, thousandths: int) -> float:
+def _interpolate_quantile(ranked: dict[int, float], count: int, thousandths: int) -> float:
     whole, rest = divmod(thousandths * (count - 1), 1000)
-    low = places[1 + whole]
-    return low if rest == 0 else low + (places[2 + whole] - low) * rest / 1000
+    low = ranked[1 + whole]
+    return low if rest == 0 else low + (ranked[2 + whole] - low) * rest / 1000

@@ -1,4 +1,4 @@
-"""What a trend reads of a job's runs: the parts of their results that it needs, no more."""
+"""Read the parts of run results that a trend needs."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ RESULT_PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlat
 
 
 class TrendRow(NamedTuple):
-    """One run that succeeded."""
+    """One successful run."""
 
     id: str
     number: int
@@ -31,7 +31,7 @@ class TrendRow(NamedTuple):
 def read_trend_rows(
     session: Session, job_id: str, limit: int, project_id: str = DEFAULT_PROJECT
 ) -> list[TrendRow]:
-    """The runs of a job that succeeded, in the order of the sweep, at most `limit` of them."""
+    """Read the successful runs of a job in the order of the sweep, at most `limit` of them."""
     names = TrendRow._fields
     columns = [
         Run.result.expression[name] if name in RESULT_PARTS else getattr(Run, name)
@@ -47,7 +47,7 @@ def read_trend_rows(
 
 
 def count_succeeded(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> int:
-    """How many runs of a job succeeded."""
+    """Count the successful runs of a job."""
     query = select(func.count()).where(
         Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED
     )
