@@ -1,8 +1,7 @@
 """Identification of nonlinear systems with unknown time lags: the numerical core.
 
-The public names are found in their modules when they are first asked for: `import
-sysid.core.errors` brings neither the compiler nor SciPy, so web process, command line and upload
-reader start fast.
+The public names are imported from their modules on first use. `import sysid.core.errors` loads
+neither the compiler nor SciPy, so web process, command line and upload reader start fast.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Where one run stands on the driver's side, and which items of work come next."""
+"""State of one run on the driver's side, and its next items of work."""
 
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +17,7 @@ from workers.protocol import (
 )
 
 MAX_KILLS = 2
-"""A run over which workers died so often, and which did not go on between, is given up."""
+"""A run on which this many workers died, without progress in between, fails."""
 
 
 @dataclass(slots=True, eq=False)
@@ -26,25 +26,25 @@ class ActiveRun:
 
     Attributes
     ----------
-    is_begun : bool
-        Whether a worker was given it, by this driver.
+    has_begun : bool
+        Whether this driver sent it to a worker.
     slices : int
         Time slices done; 0 before the first.
     kills : int
-        How often a worker died over it and no other run, since it last went on.
+        How often a worker died on this run alone, since its last progress.
     is_suspect : bool
-        Whether a worker died over it and others: it goes alone from then on.
+        Whether a worker died on it and others. From then on it is sent alone.
     seconds : float
         Compute time so far, over all workers.
     generation_seconds : float
         Measured cost of one generation of one island; 0 while unknown.
     islands : dict
-        While the run is spread: its islands, by number, as they stand.
-    awaited : set
+        While the run is spread: the present state of its islands, by number.
+    awaited_islands : set
         Numbers of the islands that are with the workers.
-    packs : set
-        Handles of the packs that it waits for. One that is not among them is of an epoch that
-        began anew since, and tells nothing.
+    pack_handles : set
+        Handles of the packs that it waits for. Any other pack belongs to an epoch that was
+        restarted, and is ignored.
     """
 
     run: str
@@ -62,12 +62,12 @@ class ActiveRun:
 
     @classmethod
     def from_queue(cls, queued: QueuedRun) -> "ActiveRun":
-        """The run as it waits in the queue."""
+        """Create the run from its entry in the queue."""
         return cls(queued.run, queued.spec, queued.state, kills=queued.kills)
 
     @property
     def needs_own_pack(self) -> bool:
-        """Whether it shares no pack: it is long, or may be what kills workers."""
+        """Whether it shares no pack, because it is long or may kill workers."""
         return self.slices > 0 or self.kills > 0 or self.is_suspect
 
     def should_spread(self, idle: int) -> bool:
@@ -79,11 +79,11 @@ class ActiveRun:
         return is_worth_spreading(epoch, algorithm.n_islands, idle)
 
     def make_slice(self, cost: MeanCost | None = None) -> WorkItem:
-        """The next time slice of the whole run; `cost` is that of a run of its job."""
+        """Make the next time slice of the whole run; `cost` is that of a run of its job."""
         return AdvanceRun(self.run, self.spec, self.state, choose_slice_seconds(self.slices, cost))
 
     def split_islands(self) -> list[EvolveIsland]:
-        """The islands that have not got to the next border, one item each; at least one."""
+        """Make one item for each island that is not at the next border; at least one."""
         assert self.state is not None
         target = find_next_border(self.spec.algorithm, self.state)
         self.islands = dict(enumerate(self.state.islands))
@@ -92,7 +92,7 @@ class ActiveRun:
         return [EvolveIsland(self.run, self.spec, self.islands[i], target) for i in behind]
 
     def absorb_slice(self, state: RunState, seconds: float) -> None:
-        """Take in a time slice of the whole run."""
+        """Record a time slice of the whole run."""
         before = 0 if self.state is None else _count_generations(self.state)
         done = _count_generations(state) - before
         if done > 0:
@@ -101,10 +101,10 @@ class ActiveRun:
         self.slices += 1
 
     def absorb_island(self, evolved: IslandProgress, seconds: float) -> bool:
-        """Take in an island; whether it was the last, so that the run stands at its border."""
+        """Record an island; return whether it was the last, so that the run is at its border."""
         assert self.state is not None
         index = evolved.island.index
-        spent = self.state.seconds + seconds / len(self.islands)  # as if all were beside another
+        spent = self.state.seconds + seconds / len(self.islands)  # as if all ran in parallel
         self.state = replace(self.state, seconds=spent)
         self.islands[index] = evolved.island
         self.awaited_islands.discard(index)
@@ -116,7 +116,7 @@ class ActiveRun:
         return True
 
     def restart_epoch(self) -> None:
-        """Forget the islands that are with the workers: the epoch begins anew."""
+        """Discard the islands that are with the workers, and restart the epoch."""
         self.islands, self.awaited_islands, self.pack_handles = {}, set(), set()
 
 

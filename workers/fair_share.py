@@ -1,15 +1,15 @@
-"""Who has the next place at the workers: jobs of several projects share them.
+"""Fair share: which job of several projects gets the next slot at the workers.
 
 The rules, in this order (`docs/decisions/0017-who-goes-next.md`):
 
 1. A higher priority goes first.
-2. A job's first `HEADSTART_SECONDS` of compute go before the work of those that had theirs, so a
-   single identification does not wait for a sweep. A project that had so much more than another
-   one loses this privilege until that one has caught up.
-3. Projects share equally, and the jobs of a project share its part equally. What a project had
-   more than the others stays known while it has no jobs, until these have caught up.
-4. Every sixteenth pack goes to the job that has waited longest, whatever the rules above say:
-   nobody starves.
+2. A job's first `HEADSTART_SECONDS` of compute go before jobs that have had theirs. So a single
+   identification does not wait for a sweep. A project that is ahead of another by this amount
+   loses the privilege until the other has caught up.
+3. Projects share equally, and the jobs of a project share its part equally. The lead of a project
+   is remembered while it has no jobs, until the others have caught up.
+4. Every sixteenth pack goes to the job that has waited longest, regardless of the rules above, so
+   no job starves.
 """
 
 from collections.abc import Hashable, Iterable, Mapping
@@ -19,16 +19,16 @@ from typing import Generic, TypeAlias, TypeVar
 from workers.packing import PACK_SECONDS
 
 HEADSTART_SECONDS = 30.0
-"""Compute time that a new job gets before those that had as much."""
+"""Compute time that a new job gets before jobs that have had as much."""
 
 MAX_SAVED_SECONDS = 2 * HEADSTART_SECONDS
-"""Nobody falls further behind than this: unused time is not saved for later."""
+"""Largest lag behind the others: unused time beyond it is not saved for later."""
 
 MAX_ABSENT_PROJECTS = 256
-"""Projects without jobs whose accounts are kept: those that are furthest ahead."""
+"""Largest number of stored accounts of projects without jobs: those furthest ahead."""
 
 LONGEST_WAIT_INTERVAL = 16
-"""Each so many packs, one goes to who has waited longest."""
+"""Of this many packs, one goes to the job that has waited longest."""
 
 Key = TypeVar("Key", bound=Hashable)
 Rank: TypeAlias = tuple[int, bool]
@@ -37,9 +37,9 @@ Rank: TypeAlias = tuple[int, bool]
 
 @dataclass(slots=True, eq=False)
 class _Account:
-    """What a job or project has had, in seconds of compute: shares are equal where levels are.
+    """Compute time that a job or project has had, in s; equal levels mean equal shares.
 
-    It is raised where one came later, or did not ask for its part.
+    The level is raised for one that came later, or did not use its part.
     """
 
     level: float = 0.0
@@ -47,7 +47,7 @@ class _Account:
 
 @dataclass(slots=True, eq=False)
 class _JobAccount(_Account):
-    """A job's account; `served` is the number of the last pack it was given."""
+    """Account of a job; `last_pack` is the number of its last pack."""
 
     received_seconds: float = 0.0
     priority: int = 0
@@ -57,17 +57,17 @@ class _JobAccount(_Account):
 
 @dataclass(slots=True)
 class FairShare(Generic[Key]):
-    """The accounts of the jobs that a crew works on."""
+    """Accounts of the jobs of a scheduler."""
 
     _jobs: dict[Key, _JobAccount] = field(default_factory=dict)
     _projects: dict[str, _Account] = field(default_factory=dict)
     _n_packs: int = 0
 
     def open_account(self, job: Key, *, priority: int = 0, project: str = "") -> None:
-        """Open an account: nobody begins ahead of those who are here, or behind them.
+        """Open an account that starts neither ahead of the present jobs nor behind them.
 
-        A project that comes back goes on with its own: else one job after another, each within
-        its head start, would always begin anew.
+        A project that comes back continues with its account. Otherwise one job after another, each
+        within its head start, would always start again.
         """
         floor = self._find_lowest_level()
         account = self._projects.setdefault(project, _Account(floor))
@@ -77,7 +77,7 @@ class FairShare(Generic[Key]):
     def close_account(self, job: Key) -> None:
         """Close the account of a job that has ended.
 
-        That of its project stays while it is ahead of a project with jobs.
+        The account of its project stays while it is ahead of a project with jobs.
         """
         del self._jobs[job]
         active, floor = self._list_active_projects(), self._find_lowest_level()
@@ -91,16 +91,16 @@ class FairShare(Generic[Key]):
         }
 
     def get_project(self, job: Key) -> str:
-        """The project that a job belongs to."""
+        """Return the project of a job."""
         return self._jobs[job].project
 
     def record_pack(self, job: Key) -> None:
-        """A pack of this job was sent."""
+        """Record that a pack of this job was sent."""
         self._n_packs += 1
         self._jobs[job].last_pack = self._n_packs
 
     def charge_seconds(self, job: Key, seconds: float) -> None:
-        """A pack of this job has taken `seconds` of compute time."""
+        """Charge a job for `seconds` of compute time of a pack."""
         account = self._jobs[job]
         was_fresh = account.received_seconds < HEADSTART_SECONDS
         account.received_seconds += seconds
@@ -116,11 +116,11 @@ class FairShare(Generic[Key]):
         _raise_levels(project, self._projects.values())
 
     def compute_rank(self, job: Key) -> Rank:
-        """Which jobs it goes before, whatever each has had."""
+        """Compute the rank of a job, which goes before any used compute time."""
         return self._rank_account(self._jobs[job], self._find_lowest_level())
 
     def order_jobs(self, in_flight: Mapping[Key, int]) -> list[Key]:
-        """The jobs of `in_flight`, the one that should have the next place first.
+        """Order the jobs of `in_flight`; the first one should get the next slot.
 
         Parameters
         ----------
@@ -152,11 +152,11 @@ class FairShare(Generic[Key]):
         return ordered
 
     def _list_active_projects(self) -> set[str]:
-        """Projects with jobs."""
+        """List the projects with jobs."""
         return {account.project for account in self._jobs.values()}
 
     def _find_lowest_level(self) -> float:
-        """The least that a project with jobs has had."""
+        """Find the lowest level of a project with jobs."""
         return min(
             (self._projects[name].level for name in self._list_active_projects()), default=0.0
         )
@@ -166,7 +166,7 @@ class FairShare(Generic[Key]):
         return -account.priority, not (privileged and account.received_seconds < HEADSTART_SECONDS)
 
     def _list_past_headstart(self, project: str) -> list[Key]:
-        """Jobs of a project that have had their head start."""
+        """List the jobs of a project that have had their head start."""
         return [
             job
             for job, account in self._jobs.items()

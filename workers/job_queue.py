@@ -1,4 +1,4 @@
-"""The runs of one job on the driver's side: which items come next, what became of them."""
+"""Runs of one job on the driver's side: the next items of work, and their results."""
 
 import time
 from collections import deque
@@ -27,15 +27,15 @@ from workers.protocol import (
 )
 
 MAX_SHARED_RECORDS = 16
-"""Sets of records that a job keeps with the crew."""
+"""Largest number of record sets that a job shares with the executor."""
 
 
 class JobQueue:
-    """One job's runs: waiting, with the workers, or done.
+    """Runs of one job: waiting, with the workers, or done.
 
     Attributes
     ----------
-    flying : dict
+    in_flight : dict
         Items of each pack in flight.
     """
 
@@ -50,21 +50,21 @@ class JobQueue:
         self._unreported: deque[tuple[str, RunConclusion, float]] = deque()
         self._cost = MeanCost()
         self._exhausted = False
-        self._has_no_more = False  # at present: what follows waits for runs that are not over
+        self._has_no_more = False  # at present: the next run waits for unfinished ones
 
     @property
     def is_done(self) -> bool:
-        """Whether all runs were read and told of; nothing waits or is with the workers."""
+        """Whether all runs were read and reported; none waits or is with the workers."""
         return self._exhausted and not (self.in_flight or self._ready or self._unreported)
 
     @property
     def has_unreported(self) -> bool:
-        """Whether there are results that the observer has not been told of."""
+        """Whether there are results that were not reported to the observer."""
         return bool(self._unreported)
 
     @property
     def unreported_seconds(self) -> float:
-        """Compute time of the results that the observer has not been told of."""
+        """Compute time of the results that were not reported to the observer."""
         return sum(seconds for _, _, seconds in self._unreported)
 
     @property
@@ -73,9 +73,9 @@ class JobQueue:
         return bool(self._ready)
 
     def read_ahead(self, wanted: int, deadline: float) -> bool:
-        """Ask the source until `wanted` runs wait or the time is up; whether a run waits now.
+        """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
-        One is asked for in any case.
+        At least one is read.
         """
         while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._entries, None)
@@ -110,14 +110,14 @@ class JobQueue:
             self._submit_items([run.make_slice(self._cost) for run in self._take_unstarted(size)])
 
     def absorb_pack(self, handle: PackHandle, results: tuple[ItemResult, ...]) -> None:
-        """Take in what a pack gave; islands whose turn did not come are sent again."""
+        """Record the results of a pack; islands that were not processed are sent again."""
         items = self.in_flight.pop(handle)
         waiting = self._release_runs(handle, items)
         again: list[WorkItem] = []
         for item, result in zip(items, results, strict=True):
             run = self._active.get(result.run)
             if run is None:
-                continue  # it failed while another of its islands was still out
+                continue  # it failed while another of its islands was in flight
             run.seconds += result.seconds
             if run not in waiting:
                 continue
@@ -132,17 +132,17 @@ class JobQueue:
             self._submit_items(again)
 
     def report_next(self) -> bool:
-        """Tell the observer of the next result, which takes it a while; whether there was one."""
+        """Report the next result to the observer (slow); return whether there was one."""
         if self._unreported:
             self.observer.record_result(*self._unreported.popleft())
             return True
         return False
 
     def requeue_lost_pack(self, handle: PackHandle, reason: str) -> None:
-        """A worker died: its runs go on from where they were, each alone.
+        """Queue the runs of a dead worker again from their last state, each alone.
 
-        Only a run that was alone is blamed, and not for what came of it elsewhere: two packs of
-        its islands that are lost at once are one death.
+        Only a run that was alone in the pack is blamed. Two packs of its islands that are lost at
+        once count as one death.
         """
         items = self.in_flight.pop(handle)
         are_several = len({item.run for item in items}) > 1
@@ -153,17 +153,17 @@ class JobQueue:
                 self._ready.append(run)
 
     def fail_pack(self, handle: PackHandle, reason: str) -> None:
-        """A programming error: the runs of the pack fail with it."""
+        """Fail the runs of a pack after a programming error."""
         for run in self._release_runs(handle, self.in_flight.pop(handle)):
             self._fail_run(run.run, RunFailure(reason, "InternalError"))
 
     def stop_sending(self) -> None:
-        """Begin nothing more."""
+        """Send nothing more."""
         self._ready.clear()
         self._exhausted = True
 
     def _take_unstarted(self, size: int) -> list[ActiveRun]:
-        """The next `size` runs that have not been begun and see the same records."""
+        """Take the next `size` runs that have not started and use the same records."""
         chosen = [self._ready.popleft()]
         while self._ready and len(chosen) < size:
             following = self._ready[0]
@@ -197,7 +197,7 @@ class JobQueue:
             self._active[item.run].pack_handles.add(handle)
 
     def _release_runs(self, handle: PackHandle, items: Sequence[WorkItem]) -> list[ActiveRun]:
-        """The runs that wait for this pack, which is back; not those that go on without it."""
+        """Release the runs that wait for this pack; others continued without it."""
         names = dict.fromkeys(item.run for item in items)
         runs = [self._active[name] for name in names if name in self._active]
         runs = [run for run in runs if handle in run.pack_handles]
@@ -234,7 +234,7 @@ class JobQueue:
                     self._continue_run(run)
 
     def _retry_or_fail(self, run: ActiveRun, reason: str) -> bool:
-        """Whether a run over which its worker died is tried once more; else it fails."""
+        """Retry a run on which its worker died, or fail it; return whether it is retried."""
         run.kills += 1
         self.observer.record_worker_death(run.run, run.kills)
         if run.kills >= MAX_KILLS:
@@ -248,7 +248,7 @@ class JobQueue:
             run.kills = 0
             self.observer.record_worker_death(run.run, 0)
         self.observer.record_progress(run.run, run.state, run.seconds)
-        self._ready.appendleft(run)  # what was begun is ended first: few runs are under way
+        self._ready.appendleft(run)  # finish started runs first, so that few are in progress
 
     def _fail_run(self, name: str, failure: RunFailure) -> None:
         if self._active.pop(name, None) is not None:

@@ -1,8 +1,8 @@
-"""Start or join Ray, and give it packs of work; nothing else of the program imports Ray.
+"""Start or join Ray, and send it packs of work; only `workers` imports Ray.
 
-What Ray 2.60 does unasked, and what is done about it, stands in
-``docs/decisions/0007-driving-ray.md``: it joins any cluster it finds, retries killed tasks, hangs
-when its raylet is gone, and listens on every interface (therefore the token).
+By default Ray 2.60 joins any cluster that it finds, and retries killed tasks. It hangs if its
+raylet is gone, and it listens on every interface (therefore the token). The measures against this
+are described in ``docs/decisions/0007-driving-ray.md``.
 """
 
 import logging
@@ -37,24 +37,24 @@ _log = logging.getLogger(__name__)
 START_SECONDS = 180.0
 FETCH_SECONDS = 20.0
 SILENCE_SECONDS = 5.0
-"""After so long without a finished task a no-op task asks whether Ray is alive."""
+"""After this time without a finished task, a no-op task tests whether Ray is alive."""
 ANSWER_SECONDS = 15.0
 LATE_WORKER_SECONDS = 30.0
-"""Workers that have not come up so long after the first are left to come up later."""
+"""Workers that start later than this after the first are not waited for."""
 SLOT_COUNT_SECONDS = 2.0
-"""How often the cores of a joined cluster are counted."""
+"""Interval at which the cores of a joined cluster are counted."""
 LIVENESS_SECONDS = 0.1
-"""Between two looks at the processes of a local Ray."""
+"""Interval between two checks of the processes of a local Ray."""
 VITAL_PROGRAMS = ("gcs_server", "raylet")
 """Programs without which a local Ray is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClusterSettings:
-    """Which Ray: `address` None starts one here with `cpus` cores (None: all of them).
+    """Settings of Ray: `address` None starts it on this machine with `cpus` cores (None: all).
 
-    Of a cluster that is joined, `cpus` are the cores that are used at most. `memory_bytes` is what
-    a worker may use for its runs; None: on a local Ray, its share of the machine's.
+    For a cluster that is joined, `cpus` is the largest number of cores used. `memory_bytes` is the
+    memory limit of a worker for its runs. None: on a local Ray, its share of the machine's memory.
     """
 
     address: str | None = None
@@ -68,7 +68,7 @@ class RayExecutor:
     Parameters
     ----------
     local : LocalRay, optional
-        One that was started before; else one is, unless the settings name a cluster.
+        A Ray that was started before. Otherwise one is started, unless the settings name a cluster.
 
     Raises
     ------
@@ -104,14 +104,14 @@ class RayExecutor:
             threading.Thread(target=self._watch_slot_count, name="slots", daemon=True).start()
 
     def warm_up_workers(self) -> None:
-        """Load the compiled loops in every worker, so that the first run need not.
+        """Load the compiled loops in every worker before the first run.
 
-        Cores of a joined cluster that others are using are not waited for, once one has come up.
+        Once one worker is up, busy cores of a joined cluster are not waited for.
 
         Raises
         ------
         ClusterUnavailable
-            If the workers do not come up, or have another version of this program.
+            If the workers do not start, or run another version of this program.
         """
         task = self._ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(
             warm_up_worker
@@ -136,7 +136,7 @@ class RayExecutor:
         self._last_answer = time.monotonic()
 
     def share_records(self, records: Records) -> Any:
-        """Put records into the object store; the reference travels instead of them."""
+        """Put records into the object store; afterwards only the reference is sent."""
         return self._ray.put(records)
 
     def submit_pack(
@@ -148,26 +148,26 @@ class RayExecutor:
         return handle
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
-        """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
+        """Return handles of packs that ended; wait at most `timeout` seconds for the first."""
         if not self._in_flight:
             time.sleep(timeout)
             return ()
         flying = list(self._in_flight)
         ready, _ = self._ray.wait(flying, num_returns=1, timeout=timeout, fetch_local=False)
-        if ready:  # whatever else has ended by now comes along
+        if ready:  # all others that have ended by now
             ready, _ = self._ray.wait(flying, num_returns=len(flying), timeout=0, fetch_local=False)
             self._last_answer = time.monotonic()
         return tuple(ready)
 
     def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
-        """What a finished pack gave.
+        """Return the results of a finished pack.
 
         Raises
         ------
         PackLost
             If it was cancelled, its worker died, or it met a programming error.
         ClusterLost
-            If Ray does not hand it out.
+            If Ray does not deliver the results.
         """
         errors = self._ray.exceptions
         self._in_flight.discard(handle)
@@ -181,7 +181,7 @@ class RayExecutor:
         except errors.RayTaskError as error:
             raise PackFailed(str(error)) from error
         except errors.RayError as error:  # crashed, out of memory, node or object lost
-            self._check_processes_alive(at_once=True)  # where the raylet died, no run is to blame
+            self._check_processes_alive(at_once=True)  # if the raylet died, no run is the cause
             raise WorkerDied(str(error).splitlines()[0]) from error
         return done
 
@@ -190,7 +190,7 @@ class RayExecutor:
         self._ray.cancel(handle, force=force, recursive=False)
 
     def check_cluster_alive(self) -> None:
-        """Ask Ray for a sign of life when none was seen for a while; never waits.
+        """Test whether Ray still responds, after a while without a result; never waits.
 
         Raises
         ------
@@ -210,23 +210,23 @@ class RayExecutor:
             raise ClusterLost(f"Ray has not answered for {silence:.0f} s")
 
     def is_alive(self) -> bool:
-        """Whether the processes of a local Ray are there; of a joined one nothing is known."""
+        """Whether the processes of a local Ray are running; True for a joined one."""
         return all(map(_is_running, self._vital_pids))
 
     def close(self) -> None:
-        """Leave the cluster; a local one ends with it."""
+        """Leave the cluster; a local one is shut down."""
         self._closing.set()
         self._ray.shutdown()
         self._remove_folder()
 
     def abandon_cluster(self) -> None:
-        """Let go of a cluster that is lost, without asking it anything."""
+        """Abandon a lost cluster, without any call to it."""
         if self._local is not None:
             kill_processes(find_folder_processes(os.getpid()))
             self._remove_folder()
 
     def _check_processes_alive(self, *, at_once: bool = False) -> None:
-        """Look at the processes of a local Ray: without them calls hang, or end this process."""
+        """Check the processes of a local Ray: without them calls hang, or end this process."""
         now = time.monotonic()
         if at_once or now - self._last_process_check > LIVENESS_SECONDS:
             self._last_process_check = now
@@ -238,7 +238,7 @@ class RayExecutor:
         return available if self._most_slots is None else min(available, self._most_slots)
 
     def _watch_slot_count(self) -> None:
-        """In a thread, as the call may hang; the feeder sees the new number at its next step."""
+        """Count cores in a thread, as the call may hang; the scheduler reads `slots` each step."""
         while not self._closing.wait(SLOT_COUNT_SECONDS):
             try:
                 slots = self._count_slots()

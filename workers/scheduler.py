@@ -1,4 +1,4 @@
-"""Keep the crew busy with the runs of several jobs, fairly, and hand on what comes back."""
+"""Schedule the runs of several jobs fairly on the workers, and report their results."""
 
 import logging
 import time
@@ -14,33 +14,33 @@ from workers.protocol import Executor, JobSource, PackHandle, RunObserver
 _log = logging.getLogger(__name__)
 
 GRACE_SECONDS = 1.0
-"""A cancelled pack that has not ended by then loses its worker."""
+"""After this time, the worker of a cancelled pack is killed."""
 
 PREFETCH_RUNS_PER_CORE = 64
-"""Runs read ahead of the workers, for each core; the jobs share them."""
+"""Runs read ahead for each core; the jobs share them."""
 
 MIN_PREFETCH_RUNS = 128
-"""Runs that each job reads ahead: enough for a pack of short ones."""
+"""Least runs that each job reads ahead: enough for a pack of short ones."""
 
 READ_SECONDS = 0.05
-"""Time that a step gives to reading runs: known ones cost no worker's time, and may be many."""
+"""Time that a step spends on reading runs: reused ones need no worker, and may be many."""
 
 MIN_REPORT_SECONDS = 0.02
 MAX_REPORT_SECONDS = 0.25
-"""Time that a step gives to telling of results, at which signals are stored: as long as all else
-took since the last time, but within these bounds. So half of a busy driver's time goes to it."""
+"""Limits of the time that a step spends on reporting results, in which signals are stored. Within
+them it equals the time since the last report, so a busy driver spends half of its time on it."""
 
 MAX_UNREPORTED_SECONDS = PACK_SECONDS
-"""Compute time for each core of the results that a job may leave untold; then it gets no pack."""
+"""Compute time of unreported results, for each core, above which a job gets no further pack."""
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 class Scheduler(Generic[Key]):
-    """The driver of a crew. `add` jobs, then call `step` until they have ended.
+    """Driver of an executor: add jobs, then call `run_step` until they have ended.
 
-    A job goes by a key of the caller's, which must not be in use. Whose turn it is stands in
-    `workers.fair_share`; `project_cores` is the most packs of one project that compute at a time.
+    The caller chooses the key of a job, which must not be in use. `workers.fair_share` decides
+    which job is next. `project_cores` is the largest number of packs of one project in flight.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Scheduler(Generic[Key]):
         self._shares: FairShare[Key] = FairShare()
         self._reported_at = time.monotonic()
         self._jobs: dict[Key, JobQueue] = {}
-        self._stopped: dict[Key, float] = {}  # when the job was told to stop; inf once forced
+        self._stopped: dict[Key, float] = {}  # time of the stop request; inf once forced
 
     @property
     def is_saturated(self) -> bool:
@@ -71,18 +71,18 @@ class Scheduler(Generic[Key]):
         priority: int = 0,
         project: str = "",
     ) -> None:
-        """Take on a job."""
+        """Add a job."""
         assert job not in self._jobs
         self._jobs[job] = JobQueue(source, observer, self._executor)
         self._shares.open_account(job, priority=priority, project=project)
 
     def run_step(self, timeout: float) -> tuple[Key, ...]:
-        """Feed, wait at most `timeout` seconds, collect; returns the jobs that ended.
+        """Send packs, wait at most `timeout` seconds, collect; return the jobs that ended.
 
         Raises
         ------
         ClusterLost
-            If the crew shows no sign of life.
+            If the cluster does not respond.
         """
         self._stop_cancelled_jobs()
         self._send_packs()
@@ -125,10 +125,10 @@ class Scheduler(Generic[Key]):
             self._jobs[chosen].send_next_pack(self._count_idle_cores(chosen))
 
     def _choose_job(self, deadline: float) -> Key | None:
-        """The job that the next place belongs to, if it has work for it.
+        """Choose the job that gets the next slot, if it has work.
 
-        A place beside a pack that computes (`is_busy`) is not given away over the head of a job
-        that is with the workers and will come back: its next slice would wait behind that pack.
+        If all cores are busy (`is_saturated`), a job with packs in flight keeps its turn. Otherwise
+        its next slice would wait behind a pack of another job.
         """
         going = {job: work for job, work in self._jobs.items() if job not in self._stopped}
         wanted = max(
@@ -146,10 +146,10 @@ class Scheduler(Generic[Key]):
         return None
 
     def _report_results(self, deadline: float) -> None:
-        """Tell of results, one of each job in turn, until the time is up.
+        """Report results, one of each job in turn, until the time is up.
 
-        Before the next ones the workers are asked and fed: a slice of a single run that comes
-        back does not wait until all that a sweep's pack gave is stored.
+        Then the workers are served before further results are reported. So a slice of a single run
+        does not wait until all results of a sweep's pack are stored.
         """
         while sum(work.report_next() for work in self._jobs.values()):
             if time.monotonic() > deadline:
@@ -171,7 +171,7 @@ class Scheduler(Generic[Key]):
         return work.unreported_seconds > MAX_UNREPORTED_SECONDS * self._executor.slots
 
     def _count_idle_cores(self, chosen: Key) -> int:
-        """Cores that one run of this job may take besides its own: nobody else's turn suffers."""
+        """Count cores that one run of this job may take in addition, without delaying others."""
         rank = self._shares.compute_rank(chosen)
         taken = 0
         for job, work in self._jobs.items():
@@ -189,7 +189,7 @@ class Scheduler(Generic[Key]):
             if owner is not None:
                 self._record_lost_task(owner, self._jobs[owner], handle, error)
             return
-        if owner is None:  # the crew does not know it any more, that is all
+        if owner is None:  # its job has ended
             _log.warning("a pack of no job came back")
             return
         self._shares.charge_seconds(owner, sum(result.seconds for result in results))

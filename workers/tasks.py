@@ -1,4 +1,4 @@
-"""The one kind of task: advance a pack of work. Stateless but for a cache of built problems."""
+"""The only kind of task: advance a pack of work. Stateless except for a cache of problems."""
 
 import json
 import logging
@@ -40,7 +40,7 @@ from workers.protocol import (
 _log = logging.getLogger(__name__)
 
 PACK_LIMIT_SECONDS = 1.0
-"""No further item is begun after that; what is left goes back unchanged."""
+"""No further item is started after this time; the rest is returned unchanged."""
 
 MAX_CACHED_PROBLEMS, MAX_CACHED_MODELS = 8, 32
 
@@ -50,18 +50,18 @@ _problem_cache: OrderedDict[str, tuple[str, ProblemPair]] = OrderedDict()
 def process_pack(
     pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
 ) -> tuple[ItemResult, ...]:
-    """Work on every item of the pack in turn.
+    """Process every item of the pack in turn.
 
-    What is wrong with a run comes back as its `RunFailure`, programming errors too: the other runs
-    of the pack have no part in them.
+    An error of a run is returned as its `RunFailure`, also a programming error. It does not affect
+    the other runs of the pack.
 
     Parameters
     ----------
-    pack : sequence of Item
+    pack : sequence of WorkItem
     keys : sequence of str
-        Names of the shared records, in order.
+        Keys of the shared records, in order.
     shared : Records
-        They travel as arguments of their own, so that Ray hands out one copy per machine.
+        Separate arguments, so that Ray makes one copy per machine.
     """
     records = dict(zip(keys, shared, strict=True))
     begun = time.perf_counter()
@@ -115,7 +115,7 @@ def _advance_item(
 
 
 def _evolve_item(item: EvolveIsland, problem: Problem) -> Island:
-    """The island at its border, in calls of about `CALL_SECONDS`: a cancel is heard between."""
+    """Evolve an island to its border, in calls of `CALL_SECONDS` that a cancel can interrupt."""
     island, cost = item.island, CALL_SECONDS
     while island.generation < item.target:
         count = max(1, min(item.target - island.generation, int(CALL_SECONDS / cost)))
@@ -129,14 +129,14 @@ def _evolve_item(item: EvolveIsland, problem: Problem) -> Island:
 
 
 def _load_noise_free_records(spec: ProblemSpec, records: Mapping[str, Records]) -> Records | None:
-    """The records of the estimate before noise was added; None if none was."""
+    """Load the estimation data without added noise; None if none was added."""
     if spec.noise.sigma == 0:
         return None
     return prepare_run_records(replace(spec, noise=Noise()), records).estimation
 
 
 def _get_problem(spec: ProblemSpec, records: Mapping[str, Records]) -> ProblemPair:
-    """The problem and its validation; the last few are kept, since slices of a run follow."""
+    """Get the problem and its validation; the last few are cached for further slices."""
     if spec.cache_key in _problem_cache:
         _problem_cache.move_to_end(spec.cache_key)
         return _problem_cache[spec.cache_key][1]
@@ -152,19 +152,20 @@ def _get_problem(spec: ProblemSpec, records: Mapping[str, Records]) -> ProblemPa
 
 @lru_cache(maxsize=MAX_CACHED_MODELS)
 def _parse_cached_model(document: str) -> Model:
-    """The model of a document as JSON: the runs of a sweep share it, whatever else they vary."""
+    """Parse a model document (JSON); the runs of a sweep share the model."""
     return parse_model(json.loads(document))
 
 
 def build_pack_problems(
     spec: ProblemSpec, records: Mapping[str, Records], alike: ProblemPair | None = None
 ) -> ProblemPair:
-    """The problem and that of its validation data, if there are any.
+    """Build the problem and that of its validation data, if there are any.
 
     Parameters
     ----------
     alike : pair of problems or None
-        Of a specification that differs in its noise only: they save time, and change nothing.
+        Problems of a specification that differs in its noise only. They save time and change no
+        result.
 
     Raises
     ------
@@ -180,6 +181,6 @@ def build_pack_problems(
 
 
 def prepare_run_records(spec: ProblemSpec, records: Mapping[str, Records]) -> FitRecords:
-    """Records as a run sees them: noise added to those for the estimate, validation split off."""
+    """Prepare the records of a run: split off validation data, add noise to the others."""
     validation = None if spec.validation is None else records[spec.validation]
     return prepare_records(records[spec.records], validation, spec.validation_fraction, spec.noise)

@@ -40,77 +40,73 @@ _LINE_WIDTH = 92
 
 @dataclass(slots=True)
 class CLanguage(TargetLanguage):
-    """C99 with the functions of math.h; `called` gathers what math.h does not have."""
+    """C99 with math.h; `called_functions` collects the functions that are called."""
 
     called_functions: set[str] = field(default_factory=set)
     logical_operators: Mapping[str, str] = field(default_factory=lambda: {"and": "&&", "or": "||"})
 
     def write_negation(self, condition: str) -> str:
-        """``not (…)``, to stand anywhere."""
+        """Write ``not (…)``, valid anywhere."""
         return f"!({condition})"
 
     def write_function_call(self, name: str, arguments: list[str]) -> str:
-        """A call of a function of the model language."""
+        """Write a call of a function of the model language."""
         function = FUNCTIONS[name].c
         self.called_functions.add(function)
         return f"{function}({', '.join(arguments)})"
 
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
-        """A power and its level."""
+        """Write a power and its level."""
         return f"pow({base}, {exponent})", Level.ATOM
 
     def write_choice(self, condition: str, first: str, second: str) -> str:
-        """``where``, to stand anywhere."""
+        """Write ``where``, valid anywhere."""
         return f"({condition} ? {first} : {second})"
 
     def write_constant_dividend(self, above: str) -> str:
-        """A dividend of numbers only: it needs nothing here."""
+        """Write a dividend of numbers only: C needs nothing special."""
         return above
 
     def write_element(self, array: str, index: str, divisor: int) -> str:
-        """Array at the whole part of index / divisor."""
+        """Write the array element at the whole part of index / divisor."""
         if divisor == 1:
             return f"{array}[{index}]"
         return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """A call of ``between``, ``held`` or ``averaged``."""
+        """Write a call of ``between``, ``held`` or ``averaged``."""
         return f"{helper}({signal}, n, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
-        """A number held between two others."""
+        """Write a number limited to a range."""
         return f"fmin(fmax({value}, {least}.0), {most}.0)"
 
     def write_float(self, index: str) -> str:
-        """A whole number as floating-point number."""
+        """Write a whole number as floating-point number."""
         return f"(double){index}"
 
     def lag(self, text: str, *, is_whole: bool) -> str:
-        """A lag that is not negative."""
+        """Write a time lag that is not negative."""
         least = f"fmax({text}, 0.0)"
         return f"floor({least} + 0.5)" if is_whole else least
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
-        """First line of a loop over the steps."""
+        """Write the first line of a loop over the steps."""
         return (
             f"for (long {index} = {first}; {index} {'<=' if to_last else '<'} steps; ++{index}) {{"
         )
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
-        """An assignment."""
+        """Write an assignment."""
         return _wrap_statement(f"const double {name} = " if is_new else f"{name} = ", text)
 
     def close_loop(self) -> list[str]:
-        """The brace that ends a loop."""
+        """Write the brace that ends a loop."""
         return ["}"]
 
 
 def write_c_source(identified: IdentifiedModel) -> str:
-    """A C99 file: ``NAME_parameters``, ``NAME_identified`` and ``NAME_simulate``.
-
-    Parameters
-    ----------
-    identified : Identified
+    """Write a C99 file: ``NAME_parameters``, ``NAME_identified`` and ``NAME_simulate``.
 
     Raises
     ------
@@ -174,7 +170,7 @@ def _write_struct(program: GeneratedProgram, stem: str) -> str:
 
 
 def _write_array_size(program: GeneratedProgram, name: str) -> str:
-    """Several first samples are to be given where they are measured."""
+    """Write the size of a start that needs several measured samples."""
     model = program.identified.model
     for state, initial in zip(model.states, model.initial, strict=True):
         if program.start_names[state.name] == name and isinstance(initial, MeasuredInitial):
@@ -297,7 +293,7 @@ def _write_state_arrays(program: GeneratedProgram) -> list[str]:
 
 # ---- the time loop --------------------------------------------------------------------------
 def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
-    """The four stages as a loop: each begins where the slope of the one before it leads."""
+    """Write the four stages as a loop; each starts from the slope of the one before."""
     states = program.identified.model.states
     lines = [
         "for (long step = 0; step < steps; ++step) {",
@@ -341,7 +337,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
 
 
 def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
-    """The samples lie between the points of the simulation's own grid."""
+    """Write outputs whose samples lie between the points of the simulation's own grid."""
     program.helper_names.add("between")
     model, grid_step = program.identified.model, write_number(program.grid_step or 1.0)
     lines = []
@@ -370,7 +366,7 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
 
 # ---- layout ---------------------------------------------------------------------------------
 def _wrap_statement(before: str, text: str) -> list[str]:
-    """A statement on as many lines as it needs."""
+    """Wrap a statement on as many lines as needed."""
     if len(before) + len(text) <= _LINE_WIDTH - 12:
         return [f"{before}{text};"]
     lines = wrap_source(text, _LINE_WIDTH - 16)

@@ -1,6 +1,7 @@
-"""What every exported text says of its model: facts, values with standard errors, origin.
+"""Description of a model in every exported text, and export as JSON.
 
-Export as JSON: the model's document with its values, and where they come from.
+A description has facts, values with standard errors, and origin. The JSON document has the model's
+document, its values and their provenance.
 """
 
 import json
@@ -18,19 +19,19 @@ _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
 def wrap_source(source: str, width: int) -> list[str]:
-    """Source text on lines that end before an operator or behind a comma."""
+    """Wrap source text on lines that end before an operator or behind a comma."""
     tied = re.sub(r"(?<=[-+<>=*/]) ", _NO_BREAK_SPACE, source)
     lines = textwrap.wrap(tied, width, break_long_words=False, break_on_hyphens=False)
     return [line.replace(_NO_BREAK_SPACE, " ") for line in lines]
 
 
 def describe_unit(unit: str) -> str:
-    """A unit as told in a sentence."""
+    """Describe a unit in a sentence."""
     return "without unit" if unit == "1" else unit
 
 
 def describe_model(identified: IdentifiedModel) -> list[str]:
-    """Title, source, sampling, hold and provenance, one line each."""
+    """Describe title, source, sampling, hold and provenance, one line each."""
     model = identified.model
     lines = [model.title or model.name, f"Model {model.name!r}, {model.form} form."]
     about = {key: model.document.get(key) for key in ("source", "description")}
@@ -63,7 +64,7 @@ def _describe_hold(identified: IdentifiedModel, name: str) -> str:
 def describe_values(
     identified: IdentifiedModel, parameters: Mapping[str, str], starts: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
-    """Identifier and description of every parameter and start."""
+    """Yield identifier and description of every parameter and initial state."""
     model = identified.model
     texts = model.document.get("parameters") or {}
     for parameter in model.parameters:
@@ -98,14 +99,10 @@ JSON_FORMAT = "lagid-model/1"
 
 
 def write_json_source(identified: IdentifiedModel) -> str:
-    """A JSON document from which the model can be built and simulated again.
+    """Write a JSON document from which the model can be built and simulated again.
 
-    ``model`` is the document that `sysid.load_model` and the service read; each entry of
-    ``values`` has the unit in which value and standard error are.
-
-    Parameters
-    ----------
-    identified : Identified
+    ``model`` is the document that `sysid.load_model` and the service read. Each entry of
+    ``values`` has the unit of value and standard error.
     """
     return (
         json.dumps(_to_document(identified), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -144,5 +141,5 @@ def _to_value_document(value: IdentifiedValue) -> dict[str, Any]:
 
 
 def _to_finite(value: float | None) -> float | None:
-    """JSON has no number that is not finite."""
+    """Replace a number that is not finite by None, because JSON has none."""
     return None if value is None or not isfinite(value) else float(value)

@@ -1,4 +1,4 @@
-"""`sysid.export`: an identified model in a format for other programs."""
+"""Export an identified model in a format for other programs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -41,23 +41,24 @@ def export_model(
     provenance: Mapping[str, Any] | None = None,
     pade_order: int = 3,
 ) -> str:
-    """An identified model as text.
+    """Write an identified model as text.
 
     Parameters
     ----------
     model : Model
-        As it was identified; terms that were selected on the way are taken from the result.
+        The model that was identified. Selected terms are taken from the result.
     found : Identification or mapping of str to float
-        A result, or every parameter's value; with initial values such as ``x(0)`` where the
-        model estimates them. One that is tied to others may be left out.
+        A result, or every parameter's value, with initial values such as ``x(0)`` if the model
+        estimates them. Tied parameters may be left out.
     format : {"json", "python", "c", "control"}
     sample_time : float, optional
-        Sampling period of the data in s; a transfer function in z needs it. A result knows its.
+        Sampling period of the data in s; a transfer function in z needs it. Default: the one of
+        the result.
     hold : mapping of str to {"zero", "first", "band-limited"}, optional
-        How inputs are held between their samples; where nothing is said as in the data of the
-        result, ``first`` without one.
+        Behaviour of inputs between their samples. Default: as in the data of the result, or
+        ``first``.
     version, provenance : optional
-        Told in the text: version of the program, run, data sets.
+        Written into the text: version of the program, run, data sets.
     pade_order : int
         Order of the approximation of dead times in format ``control``, 1 to 20.
 
@@ -84,7 +85,7 @@ def export_model(
 
 
 def write_export(identified: IdentifiedModel, format: str, pade_order: int = 3) -> str:
-    """An identified model in one of `EXPORT_FORMATS`.
+    """Write an identified model in one of `EXPORT_FORMATS`.
 
     Raises
     ------
@@ -126,7 +127,7 @@ def _collect_values(
 
 
 def _add_tied_values(model: Model, found: Mapping[str, float]) -> dict[str, float]:
-    """The values, and those of tied parameters that are not among them."""
+    """Add the values of tied parameters that are missing."""
     free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
     for parameter in free:
         if parameter.tied is None and parameter.name not in found:

@@ -16,75 +16,75 @@ from sysid.language.tree import (
 )
 
 HELPER_ARGUMENTS = {"between": "", "held": ", ramp", "averaged": ", half"}
-"""What the functions that read inputs are told besides the place."""
+"""Further arguments of the functions that read inputs, after the position."""
 
 
 class TargetLanguage(Protocol):
-    """What two programming languages write differently."""
+    """Syntax in which programming languages differ."""
 
     logical_operators: Mapping[str, str]
     """``and`` and ``or``."""
 
     def write_negation(self, condition: str) -> str:
-        """``not (…)``, to stand anywhere."""
+        """Write ``not (…)``, valid anywhere."""
 
     def write_function_call(self, name: str, arguments: list[str]) -> str:
-        """A call of a function of the model language."""
+        """Write a call of a function of the model language."""
 
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
-        """A power and its level; `base` may be followed by ``**``, `whole` is a small exponent."""
+        """Write a power and its level; ``**`` may follow `base`, `whole` is a small exponent."""
 
     def write_choice(self, condition: str, first: str, second: str) -> str:
-        """``where``, to stand anywhere."""
+        """Write ``where``, valid anywhere."""
 
     def write_constant_dividend(self, above: str) -> str:
-        """A dividend of numbers only, so that division by zero gives ``inf``."""
+        """Write a dividend of numbers only, so that division by zero gives ``inf``."""
 
     def write_element(self, array: str, index: str, divisor: int) -> str:
-        """Array at the whole part of index / divisor."""
+        """Write the array element at the whole part of index / divisor."""
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """A call of ``between`` or ``held``."""
+        """Write a call of ``between`` or ``held``."""
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
-        """A number held between two others."""
+        """Write a number limited to a range."""
 
     def write_float(self, index: str) -> str:
-        """A whole number as floating-point number."""
+        """Write a whole number as floating-point number."""
 
     def lag(self, text: str, *, is_whole: bool) -> str:
-        """A lag that is not negative; `is_whole`: of the nearest whole number of steps."""
+        """Write a time lag that is not negative; `is_whole`: rounded to whole steps."""
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
-        """First line of a loop over the steps from `first` on, the last one too if asked for."""
+        """Write the first line of a loop over steps from `first`; `to_last` includes the last."""
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
-        """An assignment, on as many lines as it needs; `is_new`: of a name that it declares."""
+        """Write an assignment on as many lines as needed; `is_new`: it declares the name."""
 
     def close_loop(self) -> list[str]:
-        """What ends a loop."""
+        """Write the end of a loop."""
 
 
 class ExportScope(Protocol):
-    """What names stand for at one place of the program; the texts are to stand anywhere."""
+    """Meaning of names at one position of the program; the texts can stand anywhere."""
 
     def write_symbol(self, symbol: Symbol) -> str:
-        """A parameter or a reserved name."""
+        """Write a parameter or a reserved name."""
 
     def write_past_value(self, past: PastValue) -> str:
-        """A state or an input, now or in the past."""
+        """Write a state or an input, now or in the past."""
 
 
 def write_expression(
     expression: Expression, language: TargetLanguage, scope: ExportScope, floor: int = 0
 ) -> str:
-    """Text of an expression; in parentheses if it binds less than `floor`."""
+    """Write an expression; in parentheses if it binds less than `floor`."""
     written, level = _write_with_level(expression, language, scope)
     return written if level >= floor else f"({written})"
 
 
 def write_number(value: float) -> str:
-    """Shortest text that gives the number back, and is one of floating point."""
+    """Write a floating-point number by the shortest text that reproduces it."""
     return repr(float(value))
 
 
@@ -140,7 +140,7 @@ def _write_binary(tree: Binary, language: TargetLanguage, scope: ExportScope) ->
 
 
 def is_constant(expression: Expression) -> bool:
-    """Whether an expression has no names in it."""
+    """Whether an expression contains no names."""
     return not any(isinstance(node, Symbol | PastValue) for node in walk(expression))
 
 

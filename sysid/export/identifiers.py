@@ -34,13 +34,13 @@ _GREEK = {
 
 
 class Identifiers:
-    """Gives every name an identifier of its own: ASCII letters, digits and ``_``."""
+    """Makes a unique identifier for every name: ASCII letters, digits and ``_``."""
 
     def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
 
     def make_identifier(self, name: str) -> str:
-        """An identifier like the name, that no one else has."""
+        """Make an unused identifier similar to the name."""
         stem = _to_ascii(name)
         identifier, number = stem, 1
         while identifier in self._taken:
@@ -61,16 +61,16 @@ def _to_ascii(name: str) -> str:
 
 
 def to_one_line(text: str) -> str:
-    """The text on one line, without characters that cannot be seen or that turn the direction."""
+    """Put a text on one line, without invisible characters or changes of writing direction."""
     visible = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(visible.split())
 
 
 def escape_docstring(text: str) -> str:
-    """A line of a docstring: backslashes and quotes cannot end it."""
+    """Escape a line of a docstring, so that backslashes and quotes cannot end it."""
     return to_one_line(text).replace("\\", "\\\\").replace('"', '\\"')
 
 
 def escape_c_comment(text: str) -> str:
-    """A line inside ``/* … */``: it opens and closes none, and holds no trigraph."""
+    """Escape a line inside ``/* … */``: it opens or closes no comment and has no trigraph."""
     return to_one_line(text).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")

@@ -1,8 +1,8 @@
-"""The names of a generated program, and how it reads signals at each place of its time loop.
+"""Names of a generated program, and its reads of signals in the time loop.
 
 A program is a plain loop over integration steps (of a recursion, `k`). Each state has an array of
-all its steps, so that the past is there to be read; what lies between two steps is interpolated
-by a few small functions, which are written out only where they are called.
+all its steps, so past values can be read. Values between two steps are interpolated by a few small
+functions, which are written only if they are called.
 """
 
 import textwrap
@@ -26,7 +26,7 @@ EvaluationStage = Literal["slope", "update", "recursion", "output"]
 
 @dataclass(slots=True)
 class GeneratedProgram:
-    """Identifiers for everything a program names; `lags` and `helpers` grow as it is written."""
+    """Identifiers of a program; `delay_names` and `helper_names` grow as it is written."""
 
     identified: IdentifiedModel
     language: TargetLanguage
@@ -87,16 +87,16 @@ class GeneratedProgram:
 
     @property
     def grid_step(self) -> float | None:
-        """Step of the simulation's own grid in s; None: that of the samples."""
+        """Step of the simulation's own grid in s; None: the grid of the samples."""
         return None if self.is_recursion else self.identified.model.solver.step
 
     @property
     def n_start_samples(self) -> int:
-        """Samples that are given, not computed."""
+        """Number of first samples that are inputs of the program, not computed."""
         return max(self.identified.model.memory, 1) if self.is_recursion else 1
 
     def find_initial_value(self, state: int) -> float | None:
-        """Where a state starts; None if it must be measured.
+        """Find the start of a state; None if it must be measured.
 
         Raises
         ------
@@ -115,17 +115,17 @@ class GeneratedProgram:
         raise InvalidSettings(f"/values/{name}", "a value is missing")
 
     def write_history(self, state: str) -> str:
-        """What a state was before the start."""
+        """Write the value of a state before the start."""
         zero = self.identified.model.solver.history == "zero"
         return "0.0" if zero else f"{self.array_names[state]}[0]"
 
     def write_helper_call(self, helper: str, *arguments: str) -> str:
-        """A call of a helper, which is then written out."""
+        """Write a call of a helper, and include its text in the program."""
         self.helper_names.add(helper)
         return f"{helper}({', '.join(arguments)})"
 
     def name_delay(self, expression: Expression) -> str:
-        """The variable of a lag in integration steps."""
+        """Name the variable of a time lag in integration steps."""
         if expression not in self.delay_names:
             self.delay_names[expression] = self.identifiers.make_identifier(
                 f"lag_{len(self.delay_names) + 1}"
@@ -133,7 +133,7 @@ class GeneratedProgram:
         return self.delay_names[expression]
 
     def write_ramp_width(self) -> str:
-        """Half the width of a held input's jump, in samples, as `FineInput` has it."""
+        """Write half the width of a held input's jump, in samples, as in `FineInput`."""
         if self.grid_step is not None:
             points = f"2*ceil({POINTS_PER_SAMPLE // 2}*ratio - 1e-3)"
             return f"ratio/{self.language.write_clamp(points, 4, MAX_POINTS_PER_STEP)}"
@@ -143,21 +143,21 @@ class GeneratedProgram:
         return write_number(1.0 / (n_points * self.substeps))
 
     def write_half_step(self) -> str:
-        """Half an integration step, in samples: a held input with a lag is a mean over a step."""
+        """Write half an integration step in samples: a delayed held input is a mean over a step."""
         return "0.5*ratio" if self.grid_step is not None else write_number(0.5 / self.substeps)
 
     @property
     def averaged_input_names(self) -> frozenset[str]:
-        """Inputs that are read as means over a step where they are held."""
+        """Inputs that are read as means over a step if they are held."""
         return find_averaged_inputs(self.identified.model)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopScope(ExportScope):
-    """Where in the loop an expression is evaluated.
+    """Position in the loop where an expression is evaluated.
 
-    ``slope``: `part` of a step after it began; ``update``: as it begins; ``recursion``: at sample
-    k; ``output``: at a finished step. `equation` is the one that asks.
+    ``slope``: `part` of a step after its start; ``update``: at its start; ``recursion``: at sample
+    k; ``output``: at a finished step. `equation` is the number of the equation.
     """
 
     program: GeneratedProgram
@@ -165,7 +165,7 @@ class LoopScope(ExportScope):
     equation: int = -1
 
     def write_symbol(self, symbol: Symbol) -> str:
-        """A parameter or a reserved name."""
+        """Write a parameter or a reserved name."""
         program = self.program
         if symbol.kind == "parameter":
             return program.prefix + program.parameter_names[symbol.name]
@@ -176,7 +176,7 @@ class LoopScope(ExportScope):
         return f"({self._write_index()}*{program.step_variable})"
 
     def write_past_value(self, past: PastValue) -> str:
-        """A state or an input, now or in the past."""
+        """Write a state or an input, now or in the past."""
         return self._write_input(past) if past.kind == "input" else self._write_state(past)
 
     def _write_index(self) -> str:
@@ -223,7 +223,7 @@ class LoopScope(ExportScope):
         return f"({place})/{write_number(program.substeps)}"
 
     def _write_jump_offset(self, past: PastValue) -> str:
-        """A recursion reads just behind a jump; a solver from behind one to before the next."""
+        """Offset at a jump: a recursion reads after it, a solver from one jump to the next."""
         if self.program.is_recursion:
             return " + ramp"
         if past.delay is not None:
@@ -276,7 +276,7 @@ class LoopScope(ExportScope):
         return f"{every}[{program.loop_variable}]"
 
     def _is_updated(self, name: str) -> bool:
-        """Whether the state's next value is known when the equation asks."""
+        """Whether the state's next value is computed before the equation."""
         model = self.program.identified.model
         index = [state.name for state in model.states].index(name)
         if self.program.is_recursion:
@@ -286,34 +286,35 @@ class LoopScope(ExportScope):
 
 @dataclass(frozen=True, slots=True)
 class DelayScope(ExportScope):
-    """The scope of a lag: parameters and the sampling period."""
+    """Scope of a time lag: parameters and the sampling period."""
 
     program: GeneratedProgram
 
     def write_symbol(self, symbol: Symbol) -> str:
-        """A parameter, or the sampling period."""
+        """Write a parameter or the sampling period."""
         return LoopScope(self.program, "output").write_symbol(symbol)
 
     def write_past_value(self, past: PastValue) -> str:
-        """Never asked: the language allows no signals in a lag."""
-        raise AssertionError(f"a lag holds no signal such as {past.name}")
+        """Never called: the language allows no signals in a time lag."""
+        raise AssertionError(f"a time lag contains no signal such as {past.name}")
 
 
 def write_delay_steps(program: GeneratedProgram, lag: Expression) -> str:
-    """Text of a lag in integration steps."""
+    """Write a time lag in integration steps."""
     if program.is_recursion:
         text = write_expression(lag, program.language, DelayScope(program))
     else:
-        text = f"{write_expression(lag, program.language, DelayScope(program), Level.SIGN)}/{program.step_variable}"
+        seconds = write_expression(lag, program.language, DelayScope(program), Level.SIGN)
+        text = f"{seconds}/{program.step_variable}"
     is_whole = program.identified.model.solver.interpolation == "nearest"
     return program.language.lag(text, is_whole=is_whole)
 
 
-# ---- what both languages write alike --------------------------------------------------------
+# ---- common to both languages ---------------------------------------------------------------
 def time_loop(
     program: GeneratedProgram, runge_kutta: Callable[[GeneratedProgram], list[str]]
 ) -> list[str]:
-    """The loop that computes the states; of a Runge-Kutta method each language has its own."""
+    """Write the loop that computes the states; the Runge-Kutta loop differs by language."""
     if program.is_recursion:
         return _write_recursion(program)
     if program.identified.model.solver.method == "rk4":
@@ -348,20 +349,20 @@ def _write_euler(program: GeneratedProgram) -> list[str]:
 
 
 def equation(program: GeneratedProgram, kind: EvaluationStage, index: int, floor: int = 0) -> str:
-    """Text of an equation's right-hand side; in parentheses if it binds less than `floor`."""
+    """Write an equation's right-hand side; in parentheses if it binds less than `floor`."""
     tree = program.identified.model.equations[index]
     return write_expression(tree, program.language, LoopScope(program, kind, index), floor)
 
 
 def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
-    """Lines (or several joined) moved to the right."""
+    """Indent lines (or several joined)."""
     return [textwrap.indent(line, "    " * levels) for line in lines]
 
 
 def needed_helpers(
     helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
 ) -> list[str]:
-    """Texts of the helpers that are used or that those call, each before who calls it."""
+    """List the texts of used helpers and those they call, each before its caller."""
     wanted = set(used)
     if "lately" in wanted:
         wanted.add("past")
@@ -372,7 +373,7 @@ def needed_helpers(
 
 
 def _variants_of(identified: IdentifiedModel) -> Mapping[str, str]:
-    """Which helpers of a program are written in another way, by the solver of its model."""
+    """Find the helpers with a variant for the solver of the model."""
     solver = identified.model.solver
     variants = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
     if identified.model.form == "differential" and solver.step is not None:

@@ -40,70 +40,66 @@ class PythonLanguage(TargetLanguage):
     logical_operators: Mapping[str, str] = {}
 
     def write_negation(self, condition: str) -> str:
-        """``not (…)``, to stand anywhere."""
+        """Write ``not (…)``, valid anywhere."""
         return f"(not ({condition}))"
 
     def write_function_call(self, name: str, arguments: list[str]) -> str:
-        """A call of a function of the model language."""
+        """Write a call of a function of the model language."""
         return f"np.{FUNCTIONS[name].numpy}({', '.join(arguments)})"
 
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
-        """A power and its level."""
+        """Write a power and its level."""
         if whole is not None:
             return f"{base}**{whole}", Level.ATOM - 1
         return f"np.power({base}, {exponent})", Level.ATOM
 
     def write_choice(self, condition: str, first: str, second: str) -> str:
-        """``where``, to stand anywhere."""
+        """Write ``where``, valid anywhere."""
         return f"({first} if {condition} else {second})"
 
     def write_constant_dividend(self, above: str) -> str:
-        """A dividend of numbers only."""
+        """Write a dividend of numbers only."""
         return f"np.float64({above})"
 
     def write_element(self, array: str, index: str, divisor: int) -> str:
-        """Array at the whole part of index / divisor."""
+        """Write the array element at the whole part of index / divisor."""
         if divisor == 1:
             return f"{array}[{index}]"
         return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """A call of ``between``, ``held`` or ``averaged``."""
+        """Write a call of ``between``, ``held`` or ``averaged``."""
         return f"{helper}({signal}, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
-        """A number held between two others."""
+        """Write a number limited to a range."""
         return f"min(max({value.replace('ceil', 'np.ceil')}, {least}), {most})"
 
     def write_float(self, index: str) -> str:
-        """A whole number as floating-point number."""
+        """Write a whole number as floating-point number."""
         return f"np.float64({index})"
 
     def lag(self, text: str, *, is_whole: bool) -> str:
-        """A lag that is not negative."""
+        """Write a time lag that is not negative."""
         least = f"max({text}, 0.0)"
         return f"np.floor({least} + 0.5)" if is_whole else least
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
-        """First line of a loop over the steps."""
+        """Write the first line of a loop over the steps."""
         ends = f"{first}, " if first else ""
         return f"for {index} in range({ends}steps{' + 1' if to_last else ''}):"
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
-        """An assignment; a new name is not declared."""
+        """Write an assignment; a new name is not declared."""
         return _wrap_statement(f"{name} = ", text)
 
     def close_loop(self) -> list[str]:
-        """Nothing: what is no longer indented is behind the loop."""
+        """Return nothing: the loop ends with its indentation."""
         return []
 
 
 def write_python_source(identified: IdentifiedModel) -> str:
-    """A module with one function ``simulate(t, u, …) -> y``.
-
-    Parameters
-    ----------
-    identified : Identified
+    """Write a module with one function ``simulate(t, u, …) -> y``.
 
     Raises
     ------
@@ -306,7 +302,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
 
 # ---- layout ---------------------------------------------------------------------------------
 def _wrap_statement(before: str, text: str, after: str = "") -> list[str]:
-    """A statement on as many lines as it needs, in parentheses if on several."""
+    """Wrap a statement on as many lines as needed, in parentheses if on several."""
     if len(before) + len(text) + len(after) <= _LINE_WIDTH - 12:
         return [f"{before}{text}{after}"]
     return [f"{before}(", _wrap_lines(text, "    "), f"){after}"]

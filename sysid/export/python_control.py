@@ -69,13 +69,13 @@ systems = {names: control.tf(*pair, period) for names, pair in pairs.items()}
 
 
 def write_control_source(identified: IdentifiedModel, pade_order: int) -> str:
-    """A script that makes ``systems``: for (input, output) a transfer function of python-control.
+    """Write a script that makes ``systems``: transfer functions by (input, output).
 
     Parameters
     ----------
-    identified : Identified
+    identified : IdentifiedModel
     pade_order : int
-        Order of the approximation of dead times in ``systems``; ``response`` has none.
+        Order of the Padé approximation of dead times in ``systems``; ``response`` is exact.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _write_pair(pair: TransferFunction, numerator: str, denominator: str) -> str
 
 
 def _write_delayed_terms(polynomial: QuasiPolynomial) -> str:
-    """Terms of a quasi-polynomial; that without dead time first, even if it is zero."""
+    """Write the terms of a quasi-polynomial, the term without dead time first."""
     terms = group_by_delay(polynomial)
     parts = [f"({write_number(delay)}, {_write_list(powers)})" for delay, powers in terms]
     return f"[{', '.join(parts)}]"
@@ -127,7 +127,7 @@ def _write_list(values: list[float]) -> str:
 
 
 def _describe_constants(identified: IdentifiedModel, functions: TransferFunctions) -> list[str]:
-    """What the transfer functions leave out."""
+    """Describe the constants that the transfer functions leave out."""
     model = identified.model
     constants = [
         f"the output {one.name} has the constant {form.constant:.10g}"
