@@ -1,14 +1,14 @@
-"""Closing the loop: a model whose input is what a controller makes of one of its outputs.
+"""Closed loop: a model whose input is computed by a controller from one of its outputs.
 
-The result is a model like any other, whose input is the reference; `ClosedLoop.simulate` runs it.
-Gain, times, limits and transport are parameters of that model, fixed at their values: its kernel
-is compiled once, whatever their numbers. The plant's input is that of `sysid.control.controllers`,
-proportional at its simplest,
+The result is a model like any other, with the reference as input; `ClosedLoop.simulate` runs it.
+Gain, times, limits and transport are parameters of that model, fixed at their values. So its kernel
+is compiled once for all values. `sysid.control.controllers` defines the plant's input. The simplest
+controller is proportional,
 
-    u = ± limit at most of gain · (reference - output),
+    u = gain · (reference - output), limited to ± limit.
 
-and may pass a transport element G e^(-Ls)/(Ts + 1), such as the long tube of section 5.2, before
-it enters the plant (Asakura and Guo, Figure 21).
+Before it enters the plant, the signal may pass a transport element G e^(-Ls)/(Ts + 1). An example
+is the long tube of section 5.2 (Asakura and Guo, Figure 21).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from sysid.control.controllers import PidControl
 from sysid.control.loop_document import LoopDocumentBuilder, choose_free_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.language.evaluation import evaluate_expression as value_of
+from sysid.language.evaluation import evaluate_expression
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Number, PastValue, Symbol
 from sysid.models.model import FixedInitial, Model, name_initial_state
@@ -39,18 +39,17 @@ class ClosedLoop:
     model : Model
         Its outputs are those of the plant, then `input` and `command`.
     reference : str
-        The model's input that stands for the reference, in the unit of the controlled output.
+        The model's input for the reference, in the unit of the controlled output.
     input : str
-        The output that tells what enters the plant.
+        The output for the signal that enters the plant.
     command : str
-        The output that tells what the controller gives, before the transport.
-    steps_late : int
-        In the difference form, steps by which the controller acts late where without them its
-        present value would depend on itself: as a sampled controller does. Else 0.
-    renamed : mapping of str to str
-        Coefficients of a polynomial, which are no names of the language, and what they are called.
-    filter : Filter or None
-        That of the derivative.
+        The output for the controller's signal, before the transport.
+    controller_delay_steps : int
+        In the difference form, steps by which the controller is late, as a sampled controller is.
+        Without them its present value would depend on itself. Otherwise 0.
+    new_names : mapping of str to str
+        New names of polynomial coefficients, whose names are not valid in the language.
+    derivative_filter : DerivativeFilter or None
     """
 
     model: Model
@@ -62,22 +61,24 @@ class ClosedLoop:
     derivative_filter: DerivativeFilter | None = None
 
     def rename_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Values of the plant's parameters as those of the closed loop."""
+        """Rename values of the plant's parameters to those of the closed loop."""
         return {self.new_names.get(name, name): value for name, value in values.items()}
 
     def simulate(
         self, inputs: Sequence[Channel], values: Mapping[str, float], *, times: FloatArray
     ) -> Recording:
-        """Outputs of the loop at given times, as `sysid.simulation.simulate.simulate` of its model.
+        """Simulate the outputs of the loop, by `sysid.simulation.simulate.simulate`.
 
         The integral starts at 0, the derivative's filter at rest.
 
         Parameters
         ----------
         inputs : sequence of Channel
-            The reference, of the name `reference`, and the plant's other inputs.
+            The reference, named `reference`, and the plant's other inputs.
         values : mapping of str to float
-            The plant's parameters and starts, by the plant's names.
+            The plant's parameters and initial values, by the plant's names.
+        times : FloatArray, shape (N,)
+            Times of the outputs in s.
         """
         loop_values = self.rename_values(values)
         return simulate(
@@ -90,7 +91,7 @@ class ClosedLoop:
     def _compute_filter_start(
         self, inputs: Sequence[Channel], values: Mapping[str, float], times: FloatArray
     ) -> dict[str, float]:
-        """Where the derivative's filter is at rest: a reference that steps first comes after."""
+        """Compute the rest position of the derivative's filter, before the first step."""
         if self.derivative_filter is None:
             return {}
         name, followed, lag = self.derivative_filter
@@ -98,7 +99,7 @@ class ClosedLoop:
         begins = [times[0]] if is_sampled else [times[0], *(channel.times[0] for channel in inputs)]
         start = float(min(begins))
         before = self._evaluate_start(followed, inputs, values, start, "left")
-        if is_sampled:  # its first value is that of a first step, not of the time before
+        if is_sampled:  # its first value is that after the first step
             period = float(times[1] - times[0]) / self.model.solver.substeps
             now = self._evaluate_start(followed, inputs, values, start, "right")
             before += period / (lag + period) * (now - before)
@@ -112,7 +113,7 @@ class ClosedLoop:
         time: float,
         side: str,
     ) -> float:
-        """Value of an expression where the loop starts, just before or just after."""
+        """Evaluate an expression just before or just after the start of the loop."""
         input_values = {
             channel.name: _interpolate_channel(channel, time, side) for channel in inputs
         }
@@ -133,29 +134,29 @@ class ClosedLoop:
                     return None
 
         fixed = {p.name: p.fixed for p in self.model.parameters if p.fixed is not None}
-        return value_of(substitute(tree, substitute_values), {**fixed, **values})
+        return evaluate_expression(substitute(tree, substitute_values), {**fixed, **values})
 
 
 def close_loop(model: Model, control: PidControl, period: float | None = None) -> ClosedLoop:
-    """The model under a controller.
+    """Close the loop of a model and a controller.
 
-    Behind a transport with a time constant the plant's input becomes a state. It starts at 0, or
-    at the value that is given for ``u(0)`` if the input is called u.
+    After a transport with a time constant the plant's input becomes a state. It starts at 0, or at
+    the value of ``u(0)`` if the input is called u.
 
     Parameters
     ----------
     period : float or None
-        Step (s) at which the model will be simulated. If it is known, a transport's delay of a
-        step or more is one for a model in the difference form: the controller need not act late;
-        and in the differential form the steps are divided until two of them are in each time
-        constant of the controller. The loop then holds for that step only.
+        Step (s) at which the model will be simulated. If it is set, the loop is valid for that
+        step only. In the difference form, a transport delay of a step or more then replaces the
+        delay of the controller. In the differential form, the steps are divided until each time
+        constant of the controller has two of them.
 
     Raises
     ------
     InvalidSettings
-        If the model has no such input or output, if the output contains the input itself with
-        nothing between them that takes time (an algebraic loop), or if a time constant of the
-        controller is too short for the step.
+        If the model has no such input or output. If the output contains the input itself without
+        a delay or state between them (an algebraic loop). If a time constant of the controller is
+        too short for the step.
     InvalidModel
         If the closed loop is too long to be a model.
     """
@@ -177,7 +178,7 @@ def close_loop(model: Model, control: PidControl, period: float | None = None) -
 
 
 def _choose_parameter_names(model: Model) -> dict[str, str]:
-    """Names for parameters whose own are none in the language, such as ``a[y(k-1)]``."""
+    """Choose names for parameters whose names are not valid in the language: ``a[y(k-1)]``."""
     taken = {q.name for group in (model.inputs, model.states, model.outputs) for q in group}
     taken |= {p.name for p in model.parameters}
     odd = [p.name for p in model.parameters if not p.name.isidentifier()]
@@ -185,7 +186,7 @@ def _choose_parameter_names(model: Model) -> dict[str, str]:
 
 
 def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
-    """The model with parameters of other names."""
+    """Rename parameters of a model."""
 
     def rename_symbol(node: Expression) -> Expression | None:
         match node:
@@ -202,7 +203,7 @@ def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
 
 
 def _interpolate_channel(channel: Channel, time: float, side: str) -> float:
-    """Value of a signal just before ("left") or just after ("right") a time."""
+    """Interpolate a signal just before ("left") or just after ("right") a time."""
     times, values = channel.history_and_samples.times, channel.history_and_samples.values
     if channel.hold != "zero":
         return float(np.interp(time, times, values))

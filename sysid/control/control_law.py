@@ -1,13 +1,13 @@
-"""A controller as expressions: its signal, and the equations of its integral and its filter.
+"""Control law as expressions: signal, and equations of the integral and the derivative filter.
 
-In the differential form the controller is continuous. In the difference form it acts once a step:
-the integral by forward, the derivative by backward differences (Åström and Hägglund, Advanced PID
-Control, ISA 2006, section 13.3),
+In the differential form the controller is continuous. In the difference form it acts once a step.
+The integral uses forward, the derivative backward differences (Åström and Hägglund, Advanced PID
+Control, ISA 2006, section 13.3):
 
     I(k) = I(k-1) + K h/T_i e(k-1) + min(1, h/T_t) (u(k-1) - v(k-1))
-    D(k) = T_d/(T_d + N h) D(k-1) + K T_d N/(T_d + N h) (d(k) - d(k-1)),  d = c r - y,
+    D(k) = T_d/(T_d + N h) D(k-1) + K T_d N/(T_d + N h) (d(k) - d(k-1)),  d = c r - y.
 
-where D = K N (d - z) and z is d behind a lag of T_d/N.
+Here D = K N (d - z), and z is d filtered by a time constant T_d/N.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _PERIOD_SYMBOL = Symbol("h", "period")
 
 @dataclass(frozen=True, slots=True)
 class ControllerState:
-    """A state of the controller: its name, whether its unit is the input's, and its equation."""
+    """State of a controller; `has_input_unit`: its unit is that of the plant's input."""
 
     name: str
     has_input_unit: bool
@@ -31,7 +31,7 @@ class ControllerState:
 
 
 class DerivativeFilter(NamedTuple):
-    """The derivative's filter: its state, what it follows, and its time constant in s."""
+    """Filter of the derivative: its state, its input signal, and its time constant in s."""
 
     state: str
     followed_signal: Expression
@@ -40,14 +40,14 @@ class DerivativeFilter(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ControlLaw:
-    """A controller whose reference and output are signals of a model.
+    """Control law whose reference and output are signals of a model.
 
     Attributes
     ----------
     command : Expression
-        What it gives now.
-    states : tuple of LawState
-    filter : Filter or None
+        Present signal of the controller.
+    states : tuple of ControllerState
+    filter : DerivativeFilter or None
     """
 
     command: Expression
@@ -56,7 +56,7 @@ class ControlLaw:
 
 
 ParameterFactory = Callable[..., Symbol]
-"""Gives the parameter of a name, a value and, if it has one, a unit."""
+"""Makes a parameter from name, value and optional unit."""
 
 
 def build_control_law(
@@ -68,12 +68,12 @@ def build_control_law(
     fixed: ParameterFactory,
     state: Callable[[str], str],
 ) -> ControlLaw:
-    """The law of a controller.
+    """Build the law of a controller.
 
     Parameters
     ----------
     reference : str
-        Input that stands for the reference.
+        Input for the reference.
     output : Expression
         The controlled output.
     is_sampled : bool
@@ -81,7 +81,7 @@ def build_control_law(
     fixed : callable
         Makes a parameter of the loop from name, value and unit.
     state : callable
-        Makes the name of a state that nothing else has.
+        Makes an unused name of a state.
     """
     return _ControlLawBuilder(control, reference, output, is_sampled, fixed, state).build()
 
@@ -130,7 +130,7 @@ class _ControlLawBuilder:
         return Binary("*", self.gain, Binary("-", weighted, self.output))
 
     def _build_derivative(self) -> tuple[Expression, ControllerState, DerivativeFilter]:
-        """K N (d - z), the equation of z, and its filter."""
+        """Build K N (d - z), the equation of z, and its filter."""
         control = self.control
         divisor = self.add_parameter("derivative_filter", control.derivative_filter)
         time = self.add_parameter("derivative_time", control.derivative_time, "s")

@@ -1,7 +1,7 @@
-"""Controllers by their numbers, and what lies between a controller and the plant.
+"""Parameters of PID controllers, and of the transport between controller and plant.
 
 The standard (ISA) form with two weights of the reference r (Åström and Hägglund, Advanced PID
-Control, ISA 2006, sections 3.3 to 3.5), y the controlled output:
+Control, ISA 2006, sections 3.3 to 3.5). The controlled output is y:
 
     v = K [ (b r - y) + 1/T_i ∫(r - y) dt + T_d s/(1 + s T_d/N) (c r - y) ]
     u = min(upper, max(lower, v))
@@ -14,7 +14,7 @@ from typing import Literal
 from sysid.core.errors import InvalidSettings
 
 LARGEST_NUMBER = 1e300
-"""What is as large is no number of a model; a time is infinite."""
+"""Larger numbers are not allowed in a model; a larger time counts as infinite."""
 
 DerivativeOn = Literal["measurement", "error"]
 AntiWindup = Literal["back-calculation", "none"]
@@ -22,13 +22,13 @@ AntiWindup = Literal["back-calculation", "none"]
 
 @dataclass(frozen=True, slots=True)
 class Transport:
-    """What lies between controller and plant: gain · e^(-delay s) / (time_constant s + 1).
+    """Transport between controller and plant: gain · e^(-delay s) / (time_constant s + 1).
 
     Attributes
     ----------
     gain : float
     time_constant, delay : float
-        In s, 0 or more. Without time constant it is a pure delay.
+        In s, 0 or more. Without a time constant it is a pure dead time.
     """
 
     gain: float = 1.0
@@ -55,23 +55,23 @@ class PidControl:
     gain : float
         K, unit of the input per unit of the output.
     limit : float or None
-        Largest absolute value that the controller gives, in the unit of the input.
+        Largest absolute value of the controller's signal, in the unit of the input.
     transport : Transport or None
-        What its signal passes before it enters the plant.
+        Transport between controller and plant.
     integral_time : float or None
         T_i in s; None or infinite: no integral action.
     derivative_time : float
         T_d in s; 0: no derivative action.
     derivative_filter : float
-        N: the derivative is filtered by a lag of T_d/N, so its gain is N K at most.
+        N: the derivative is filtered by a time constant T_d/N, so its gain is N K at most.
     derivative_on : {"measurement", "error"}
         c = 0 or c = 1: whether steps of the reference are differentiated.
     setpoint_weight : float
-        b, the part of the reference in the proportional action.
+        b, the weight of the reference in the proportional action.
     lower, upper : float or None
-        Least and largest value that the controller gives; instead of `limit`.
+        Limits of the controller's signal, instead of `limit`.
     anti_windup : {"back-calculation", "none"}
-        At a limit the integral is led back by (u - v)/T_t, or not at all.
+        At a limit the integral is corrected by (u - v)/T_t, or not at all.
     tracking_time : float or None
         T_t in s; None: √(T_i T_d), without derivative action T_i.
     """
@@ -141,14 +141,14 @@ class PidControl:
 
     @property
     def output_limits(self) -> tuple[float | None, float | None]:
-        """Least and largest value that the controller gives; None where there is no limit."""
+        """Lower and upper limit of the controller's signal; None if there is no limit."""
         if self.limit is not None:
             return -self.limit, self.limit
         return self.lower, self.upper
 
     @property
     def active_tracking_time(self) -> float | None:
-        """T_t in s; None where nothing winds up, or nothing is done about it."""
+        """T_t in s; None without windup or without anti-windup."""
         is_limited = any(limit is not None for limit in self.output_limits)
         if not (self.has_integral_action and is_limited and self.anti_windup == "back-calculation"):
             return None

@@ -1,6 +1,6 @@
-"""Whether a model is linear with constant coefficients, found from its trees, and its matrices.
+"""Identified model with its values, and its linear form with constant coefficients.
 
-What is exported: a model, the values found for it, and where they come from.
+The linear form is derived from the expression trees of the equations.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Hold
 from sysid.kernels.reads import is_difference
-from sysid.language.evaluation import evaluate_expression as number_of
+from sysid.language.evaluation import evaluate_expression
 from sysid.language.printer import format_expression
 from sysid.language.transform import substitute
 from sysid.language.tree import (
@@ -29,7 +29,7 @@ from sysid.models.model import Model
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedValue:
-    """One parameter, or initial state of an experiment, as found; `stderr` in `unit`."""
+    """Value of one parameter or initial state; `stderr` in `unit`."""
 
     name: str
     value: float
@@ -53,17 +53,17 @@ class IdentifiedModel:
     Attributes
     ----------
     model : Model
-    values : tuple of Value
+    values : tuple of IdentifiedValue
         Every parameter in the model's order, then initial states named as in `Problem`.
     covariance : Covariance or None
     sample_time : float or None
-        Sampling period of the data in s; None where it is not known or not regular.
+        Sampling period of the data in s; None if unknown or irregular.
     holds : mapping of str to {"zero", "first", "band-limited"}
-        How the inputs were held between their samples; ``first`` where nothing is said.
+        Behaviour of the inputs between their samples; default ``first``.
     version : str
         Version of the program that writes the text.
     provenance : mapping
-        Run, data sets with their hashes, dates: JSON values, told as they are.
+        Run, data sets with their hashes, dates: JSON values, written unchanged.
     """
 
     model: Model
@@ -76,20 +76,20 @@ class IdentifiedModel:
 
     @property
     def value_by_name(self) -> dict[str, float]:
-        """Value of each name."""
+        """Values by name."""
         return {value.name: value.value for value in self.values}
 
     def find_value(self, name: str) -> IdentifiedValue | None:
-        """The value of that name, if there is one."""
+        """Find the value of a name, if there is one."""
         return next((value for value in self.values if value.name == name), None)
 
     def get_hold(self, signal: str) -> Hold:
-        """How an input was held between its samples."""
+        """Get the behaviour of an input between its samples."""
         return self.holds.get(signal, "first")
 
 
 class NotLinear(SysidError, ValueError):
-    """A model has no transfer function; the message says which term is in the way."""
+    """A model has no transfer function; the message names the term that prevents it."""
 
 
 class DelayedSignal(NamedTuple):
@@ -108,7 +108,7 @@ class AffineForm:
     constant: float = 0.0
 
     def add_scaled(self, other: "AffineForm", factor: float = 1.0) -> "AffineForm":
-        """Sum with a multiple of another."""
+        """Add a multiple of another form."""
         terms = dict(self.terms)
         for signal, coefficient in other.terms.items():
             terms[signal] = terms.get(signal, 0.0) + factor * coefficient
@@ -116,7 +116,7 @@ class AffineForm:
         return AffineForm(nonzero, self.constant + factor * other.constant)
 
     def scale_by(self, factor: float) -> "AffineForm":
-        """Product with a number."""
+        """Multiply by a number."""
         return AffineForm({}).add_scaled(self, factor)
 
 
@@ -129,13 +129,13 @@ class LinearForm:
 
 
 def to_linear_form(identified: IdentifiedModel, period: float | None) -> LinearForm:
-    """The model as a linear one.
+    """Convert a model to its linear form.
 
     Parameters
     ----------
-    identified : Identified
+    identified : IdentifiedModel
     period : float or None
-        Integration step of a difference equation in s, which its coefficients may hold.
+        Integration step of a difference equation in s, which its coefficients may contain.
 
     Raises
     ------
@@ -175,7 +175,7 @@ class _AffineReader:
     substitute_known: Callable[[Expression], Expression | None]
 
     def to_affine(self, tree: Expression) -> AffineForm:
-        """The tree as an affine form; what it says of parameters is computed."""
+        """Convert a tree to an affine form; terms of parameters are evaluated."""
         if not self._has_signals(tree):
             return AffineForm({}, self._evaluate_constant(tree))
         match tree:
@@ -195,7 +195,7 @@ class _AffineReader:
         return self._read_other(tree)
 
     def _read_other(self, tree: Expression) -> AffineForm:
-        """A first power, or a choice that numbers decide; nothing else is linear."""
+        """Read a first power, or a choice with a constant condition; others are not linear."""
         match tree:
             case Binary("**", base, Number(1.0)):
                 return self.to_affine(base)
@@ -206,10 +206,10 @@ class _AffineReader:
         raise self._make_refusal(tree)
 
     def _evaluate_constant(self, tree: Expression) -> float:
-        return number_of(substitute(tree, self.substitute_known), {})
+        return evaluate_expression(substitute(tree, self.substitute_known), {})
 
     def _read_product(self, tree: Expression, left: Expression, right: Expression) -> AffineForm:
-        """A factor that is 0 takes its term away, whatever that is."""
+        """Read a product with a constant factor; a factor 0 removes any other."""
         for factor_tree, other in ((left, right), (right, left)):
             if not self._has_signals(factor_tree):
                 factor = self._evaluate_constant(factor_tree)
@@ -236,7 +236,8 @@ class _AffineReader:
         return False
 
     def _make_refusal(self, tree: Expression) -> NotLinear:
+        text = format_expression(tree, self.clock)
         return NotLinear(
-            f"{self.description} is not linear in states and inputs: {format_expression(tree, self.clock)}; "
+            f"{self.description} is not linear in states and inputs: {text}; "
             "only a linear model has a transfer function"
         )

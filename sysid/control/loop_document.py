@@ -1,7 +1,7 @@
-"""The document of a closed loop: a model with its input replaced by what a controller makes.
+"""Document of a closed loop: a model with its input replaced by the controller's signal.
 
-The plant's equations read the controller's signal, some time ago where a transport lies between,
-or a state that follows it. What is written here is read by the model's own parser again.
+The plant's equations read the controller's signal, delayed by the transport, or a state that
+follows it. The model's own parser reads this document again.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,15 +21,15 @@ from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 
 _PERIOD_SYMBOL = Symbol("h", "period")
-_STEP_ROUNDING = 1e-9  # of a step: a delay of so much less than a whole step is one
+_STEP_ROUNDING = 1e-9  # of a step: a delay shorter than a whole step by this counts as one
 _MIN_STEPS_PER_TIME_CONSTANT = (
-    2.0  # integration steps, at least, in each time constant of the controller
+    2.0  # least number of integration steps in each time constant of the controller
 )
 _MAX_SUBSTEPS = 1000
 
 
 class LoopDocumentBuilder:
-    """A model and its controller, on the way to the document of the closed loop."""
+    """Builds the document of a closed loop from a model and its controller."""
 
     def __init__(self, model: Model, control: PidControl, period: float | None) -> None:
         self.model, self.control, self.period = model, control, period
@@ -60,7 +60,7 @@ class LoopDocumentBuilder:
         self.steps = self.controller_delay_steps = 0
 
     def _add_parameter(self, name: str, value: float, unit: str = "1") -> Symbol:
-        """A number of the controller or the transport as a parameter of the closed loop."""
+        """Add a number of the controller or transport as a parameter of the closed loop."""
         name = choose_free_name(name, self.taken)
         self.taken.add(name)
         self.new_parameters[name] = {
@@ -72,13 +72,13 @@ class LoopDocumentBuilder:
         return Symbol(name, "parameter")
 
     def _reserve_state_name(self, name: str) -> str:
-        """A name for a state of the controller."""
+        """Reserve a name for a state of the controller."""
         name = choose_free_name(name, self.taken)
         self.taken.add(name)
         return name
 
     def build_differential(self) -> dict[str, Any]:
-        """Document of a closed loop in the differential form."""
+        """Build the document of a closed loop in the differential form."""
         if self.transport.time_constant > 0:
             delayed = self._build_plant_input(0, self.delay)
             entered = f"{format_expression(delayed, self.clock)} - {self.input.name}"
@@ -95,7 +95,7 @@ class LoopDocumentBuilder:
         return self._build_document(None, self._replace_plant_input)
 
     def build_difference(self) -> dict[str, Any]:
-        """Document of a closed loop in the difference form (a polynomial becomes one)."""
+        """Build the document of a closed loop in the difference form, also of a polynomial."""
         if self.transport.time_constant > 0:
             decay = f"exp(-h/{self._add_time_constant()})"
             drive = format_expression(self._build_plant_input(1, self.delay))
@@ -112,16 +112,16 @@ class LoopDocumentBuilder:
         ).name
 
     def _add_delay(self) -> Expression | None:
-        """The transport's delay as a lag: in seconds, or in steps in the difference form."""
+        """Add the transport's delay: in seconds, or in steps in the difference form."""
         if self.transport.delay == 0:
             return None
         delay = self._add_parameter("transport_delay", self.transport.delay, "s")
         return Binary("/", delay, _PERIOD_SYMBOL) if self.clock == "k" else delay
 
     def _split_whole_steps(self) -> tuple[int, Expression | None]:
-        """The transport's delay as a whole step and a rest in steps, if a step or more is in it.
+        """Split the transport's delay into a whole step and a rest, if it is a step or more.
 
-        Such a delay cuts the circle: the plant's input is one of an earlier sample.
+        Such a delay breaks the algebraic loop: the plant's input is that of an earlier sample.
         """
         if self.period is None:
             return 0, self.delay
@@ -132,17 +132,17 @@ class LoopDocumentBuilder:
         return 1, self._add_parameter("transport_steps", whole - 1 + max(steps - whole, 0.0))
 
     def _build_plant_input(self, steps: int, lag: Expression | None) -> Expression:
-        """What leaves the transport but for its time constant, some steps and a lag ago."""
+        """Build the delayed signal after the transport's gain, without its time constant."""
         command = self._build_command(steps, lag)
         gain = self.transport_gain
         return command if gain is None else Binary("*", gain, command)
 
     def _build_command(self, steps: int, lag: Expression | None) -> Expression:
-        """What the controller gives, some steps and a lag ago."""
+        """Build the controller's signal, delayed by some steps and a time lag."""
         return shift_expression(self.law.command, steps, lag, counts=self.clock == "k")
 
     def _replace_plant_input(self, node: Expression) -> Expression | None:
-        """The controller's signal where the plant reads its input."""
+        """Replace a read of the plant's input by the controller's signal."""
         match node:
             case PastValue(self.input.name, "input", offset, own):
                 lag = add_delays(self.delay, own)
@@ -172,7 +172,7 @@ class LoopDocumentBuilder:
     def _build_document(
         self, equation: str | None, change: Callable[[Expression], Expression | None] | None
     ) -> dict[str, Any]:
-        """The closed loop, with an equation of the plant's input or with its reads replaced."""
+        """Build the document, with an equation of the plant's input or with its reads replaced."""
         model, name = self.model, self.input.name
 
         def write_tree(tree: Expression) -> str:
@@ -218,9 +218,9 @@ class LoopDocumentBuilder:
         }
 
     def _choose_substeps(self) -> dict[str, int]:
-        """Substeps by which the controller's own time constants are resolved, if that takes more.
+        """Choose more substeps if the controller's time constants need them.
 
-        By a power of two more than the model's: every number of them has a kernel of its own.
+        The model's number is multiplied by a power of two, because every number needs its kernel.
         """
         control, substeps = self.control, self.model.solver.substeps
         if self.clock == "k" or self.period is None:
@@ -262,7 +262,7 @@ def _find_signal(signals: Any, name: str, role: str) -> Any:
 
 
 def choose_free_name(name: str, taken: set[str]) -> str:
-    """The name, or with underscores behind it until nothing else has it."""
+    """Append underscores to a name until it is unused."""
     while name in taken:
         name += "_"
     return name
@@ -277,7 +277,7 @@ def _to_declaration(parameter: Parameter) -> dict[str, Any]:
 
 
 def _to_initial_value(initial: InitialState) -> Mapping[str, float] | float:
-    """A start that needs no measurement: what is estimated or measured is given as a value."""
+    """Convert to a start without measurement; an estimated or measured one becomes a range."""
     if isinstance(initial, FixedInitial):
         return initial.value
     if isinstance(initial, EstimatedInitial):

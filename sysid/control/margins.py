@@ -1,4 +1,4 @@
-"""Stability and margins of a loop around a linear model, with its dead times as they are."""
+"""Stability and margins of a loop around a linear model, with exact dead times."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from sysid.core.types import BoolArray, ComplexArray, FloatArray
 from sysid.kernels.reads import is_difference
 
 _OUTER_DECADES = 3  # below the slowest and above the fastest part of the loop
-_MAX_FREQUENCY_RATIO = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
+_MAX_FREQUENCY_RATIO = 1e8  # of a corner frequency to the middle one; others are limited to it
 _POINTS_PER_DECADE = 400  # frequencies
 _MAX_TURN = 0.05  # rad that dead times turn from one frequency to the next
-_LOUD_GAIN = 0.1  # loop gain below which they may turn farther: only gain margins are left there
+_LOUD_GAIN = 0.1  # loop gain below which they may turn farther: there are only gain margins there
 _MAX_FREQUENCIES = 200_000
-_NEGLIGIBLE_GAIN = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
-_SECANT_STEPS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
+_NEGLIGIBLE_GAIN = 1e-3  # loop gain below which the search ends: a gain margin of a thousand
+_SECANT_STEPS = 12  # enough for steps of a hundredth, also at sharp resonances
 _PHASE_ROUNDING = 1e-6  # rad
-_UNRESOLVED_TURN = 0.5  # rad: what turns farther from one frequency to the next may be missed
-_MAX_REFINEMENTS, _REFINEMENT_PARTS = 8, 10  # in which such a step is divided
+_UNRESOLVED_TURN = 0.5  # rad: a larger turn from one frequency to the next may be missed
+_MAX_REFINEMENTS, _REFINEMENT_PARTS = 8, 10  # parts into which such a step is divided
 _MAX_UNRESOLVED_STEPS = (
-    1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
+    1000  # more such steps are caused by a dead time at irrelevant frequencies, not by a root
 )
 
 
@@ -37,24 +37,24 @@ _MAX_UNRESOLVED_STEPS = (
 class Margins:
     """How far a loop is from instability (Åström and Hägglund, Advanced PID Control, section 4.6).
 
-    Of several crossings each margin is that of the one nearest to instability.
+    If there are several crossings, each margin is that of the one nearest to instability.
 
     Attributes
     ----------
     is_stable : bool
-        Whether no root of the characteristic equation has a real part above 0. The margins of a
-        loop that is unstable are those of its crossings and do not tell how to mend it.
+        Whether no root of the characteristic equation has a real part above 0. The margins of an
+        unstable loop are those of its crossings; they do not show how to stabilise it.
     gain_margin : float
-        Factor of the gain at which the loop swings, or drifts; below 1 of a loop that needs its
-        gain, ``inf`` if there is none.
+        Factor of the gain at which the loop oscillates or drifts. Below 1 for a loop that needs
+        its gain; ``inf`` if there is none.
     phase_margin : float
-        Degrees of further phase lag that the loop bears; ``inf`` if its gain is 1 nowhere.
+        Additional phase lag in degrees that the loop tolerates; ``inf`` if its gain is never 1.
     delay_margin : float
-        Further dead time in s that the loop bears; ``inf`` as before, 0 if it is unstable.
+        Additional dead time in s that the loop tolerates; ``inf`` likewise, 0 if it is unstable.
     crossover_frequency : float
-        Where the loop gain is 1, in rad/s, at the phase margin; ``nan`` if nowhere.
+        Frequency in rad/s of loop gain 1, at the phase margin; ``nan`` if there is none.
     sensitivity_peak : float
-        M_s, the largest |1/(1 + L)|; 1.2 to 2 is usual. Of an unstable loop it says nothing.
+        M_s, the largest |1/(1 + L)|; 1.2 to 2 is usual. It has no meaning for an unstable loop.
     """
 
     is_stable: bool
@@ -66,7 +66,7 @@ class Margins:
 
 
 def compute_margins(identified: IdentifiedModel, control: PidControl) -> Margins:
-    """Margins of the loop that a controller closes around a model, its limits left out.
+    """Compute the margins of a loop of controller and model, without the controller's limits.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def compute_margins(identified: IdentifiedModel, control: PidControl) -> Margins
 
 
 class _LoopGain:
-    """L(s) on the imaginary axis; weights of the reference are outside the loop."""
+    """Loop gain L(s) on the imaginary axis; weights of the reference are outside the loop."""
 
     def __init__(self, pair: TransferFunction, control: PidControl) -> None:
         self._pair, self._control = pair, control
@@ -94,18 +94,18 @@ class _LoopGain:
         self.order += self._transport.time_constant > 0
 
     def evaluate_gain(self, omega: FloatArray) -> ComplexArray:
-        """L(iω): controller, transport and plant in a row."""
+        """Evaluate L(iω): controller, transport and plant in series."""
         above, below = self.evaluate_fraction(omega)
         return above / below
 
     def evaluate_static_gain(self) -> FloatArray:
-        """L(0), (1,), a real number; (0,) where something integrates."""
+        """Evaluate L(0), a real number, (1,); empty if the loop integrates."""
         above, below = self.evaluate_fraction(np.zeros(1))
         gains: FloatArray = (above[below != 0] / below[below != 0]).real
         return gains[np.isfinite(gains)]
 
     def evaluate_fraction(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Numerator and denominator of L(iω), without the poles that they have."""
+        """Evaluate numerator and denominator of L(iω), both without poles."""
         control, transport = self._control, self._transport
         s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
         late: ComplexArray = np.exp(-s * transport.delay)
@@ -128,10 +128,11 @@ def _evaluate_quasi_polynomial(quasi: QuasiPolynomial, s: ComplexArray) -> Compl
 
 
 def _is_stable(loop: _LoopGain, omega: FloatArray) -> bool:
-    """By Mikhailov's criterion: the sum of both parts turns by a quarter for each of its roots.
+    """Whether the loop is stable, by Mikhailov's criterion.
 
-    Divided by as many stable roots it does not turn at all if all roots are stable, and by half a
-    turn back for each that is not.
+    The sum of numerator and denominator turns by a quarter for each stable root. It is divided by
+    a polynomial with as many stable roots. Then it does not turn if all its roots are stable, and
+    turns back by half a turn for each unstable root.
     """
     above, below = loop.evaluate_fraction(omega)
     middle = float(np.sqrt(omega[0] * omega[-1]))
@@ -142,7 +143,7 @@ def _is_stable(loop: _LoopGain, omega: FloatArray) -> bool:
 def _choose_frequencies(
     loop: _LoopGain, pair: TransferFunction, control: PidControl
 ) -> tuple[FloatArray, float]:
-    """Angular frequencies around all that the loop has, and beyond which its gain is gone."""
+    """Choose angular frequencies for the loop, and the one above which its gain is negligible."""
     scales = sorted(_find_corner_frequencies(pair, control)) or [1.0]
     middle = scales[len(scales) // 2]
     scales = [
@@ -173,7 +174,7 @@ def _choose_frequencies(
 
 
 def _find_last_frequency(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
-    """The frequency behind the last one where something holds."""
+    """Find the frequency after the last one where a condition holds."""
     matches = np.flatnonzero(where)
     return float(omega[min(int(matches[-1]) + 2, omega.size - 1)]) if matches.size else otherwise
 
@@ -184,10 +185,10 @@ def _space_frequencies(start: float, stop: float, step: float) -> FloatArray:
 
 
 def _refine_frequencies(loop: _LoopGain, omega: FloatArray) -> FloatArray:
-    """With more frequencies where a root near the axis turns the loop, or its border, at once.
+    """Add frequencies where a root near the axis turns the loop, or its border, abruptly.
 
-    A root on the axis is never resolved, and one right of it by less than the last step is taken
-    for one left of it as often as not.
+    A root on the axis is never resolved. A root right of it by less than the last step may be
+    taken for one left of it.
     """
     for _ in range(_MAX_REFINEMENTS):
         above, below = loop.evaluate_fraction(omega)
@@ -202,7 +203,7 @@ def _refine_frequencies(loop: _LoopGain, omega: FloatArray) -> FloatArray:
 
 
 def _find_corner_frequencies(pair: TransferFunction, control: PidControl) -> Iterable[float]:
-    """Frequencies in rad/s at which something changes."""
+    """Find the corner frequencies in rad/s."""
     for quasi in (pair.numerator, pair.denominator):
         for delay, powers in group_by_delay(quasi):
             yield from (abs(root) for root in np.roots(powers) if root != 0)
@@ -221,7 +222,7 @@ def _measure_margins(loop: _LoopGain, omega: FloatArray, *, is_stable: bool) -> 
         lambda w: np.abs(loop.evaluate_gain(w)) - 1.0, omega, np.abs(gains) - 1.0
     )
     lefts = np.angle(-loop.evaluate_gain(crossings))
-    if is_stable:  # past half a turn it is stable since the next border is a turn away
+    if is_stable:  # beyond half a turn it is stable, because the next border is a turn away
         lefts = np.where(lefts < -_PHASE_ROUNDING, lefts + 2 * pi, lefts)
     nearest = int(np.argmin(np.abs(lefts))) if lefts.size else None
     turned = _find_sign_changes(lambda w: loop.evaluate_gain(w).imag, omega, gains.imag)
@@ -241,7 +242,7 @@ def _measure_margins(loop: _LoopGain, omega: FloatArray, *, is_stable: bool) -> 
 def _find_sign_changes(
     function: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
 ) -> FloatArray:
-    """Where a function changes its sign, by secants of the steps in which it does."""
+    """Find where a function changes its sign, by secants of the steps in which it does."""
     before = np.flatnonzero(values[:-1] * values[1:] < 0)
     low, high, below, above = omega[before], omega[before + 1], values[before], values[before + 1]
     for _ in range(_SECANT_STEPS):

@@ -1,4 +1,4 @@
-"""What a step response is judged by: rise time, overshoot, settling, and integrals of the error."""
+"""Measures of a step response: rise time, overshoot, settling, and integrals of the error."""
 
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -11,31 +11,31 @@ from sysid.core.types import FloatArray
 _RISE_LEVELS = (0.1, 0.9)
 _SETTLING_BAND = 0.02
 _TAIL_SHARE = 0.1
-_N_WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
-_PEAK_GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
-_SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
+_N_WINDOWS = 3  # the last quarters of the record: the first one contains the step itself
+_PEAK_GROWTH = 1.03  # a limit cycle's peaks differ by less, because of the sampling
+_SWING_GROWTH = 1.01  # the same for swings between interpolated turning points
 _LASTING_SHARE = 0.9  # of the swing two quarters before: one that decays faster will settle
-_STEADY_GROWTH = 0.99  # of the last increment: from there on, growth does not slow down
-_RESPONSE_ROUNDING = 1e-9  # of the step: an output that moves less has not answered
-_DIVERGENCE_LIMIT = 1e100  # steps away from the reference: not to be squared
+_STEADY_GROWTH = 0.99  # of the last increment: above it, growth does not slow down
+_RESPONSE_ROUNDING = 1e-9  # of the step: an output that moves less has not responded
+_DIVERGENCE_LIMIT = 1e100  # steps away from the reference: larger values cannot be squared
 
 
 @dataclass(frozen=True, slots=True)
 class StepMetrics:
-    """Measures of a step response; times in s after the step, ``nan`` where there is none.
+    """Measures of a step response; times in s after the step, ``nan`` if undefined.
 
     Attributes
     ----------
     rise_time : float
-        From 10 % to 90 % of the way from where the output stood to the final value.
+        From 10 % to 90 % of the change from the initial to the final value.
     overshoot_percent : float
-        Farthest way beyond the reference, in per cent of the step; 0 if it is not passed.
+        Largest excess over the reference, in per cent of the step; 0 if it is not passed.
     overshoot_of_final_percent : float
-        Farthest way beyond the final value, in per cent of the way to it from where the output
-        stood: what is left of the overshoot where a steady error keeps it from the reference.
+        Largest excess over the final value, in per cent of the change from the initial value. It
+        is useful if a steady error keeps the output from the reference.
     settling_time : float
-        From when on the output stays within `band` of its mean over the last tenth of the record;
-        ``nan`` if it leaves it in that tenth still.
+        Time from which the output stays within `band` of its mean over the last tenth of the
+        record. ``nan`` if it leaves the band within that tenth.
     band : float
         2 % of the step, in the unit of the output.
     steady_error : float
@@ -43,19 +43,19 @@ class StepMetrics:
     final_value : float
         That mean.
     runs_away : bool
-        The output is not finite, or its deviation from the reference, or its swing, grows from
-        each quarter of the record to the next without slowing down: the loop is unstable, and
-        there is no overshoot, settling time or final value; they are ``nan``.
+        Whether the output is not finite, or its deviation or swing grows from each quarter of the
+        record to the next without slowing down. The loop is unstable then. Overshoot, settling
+        time and final value are ``nan``.
     is_settled : bool
-        There is a settling time. A response that neither runs away nor has settled still moves at
-        the end of the record: its final value and overshoot are those of the record.
+        Whether there is a settling time. A response that neither runs away nor has settled still
+        moves at the end of the record. Its final value and overshoot are those of the record.
     iae, itae : float
         ∫|e| dt and ∫t |e| dt of the error e = reference - output, from the step to the end of the
-        record; in the unit of the output times s and s². A steady error makes both grow with it.
+        record. In the unit of the output times s and s². A steady error makes both grow with it.
     swing, swing_period : float
-        Of an output that keeps swinging with the same size, as in a limit cycle: from peak to
-        peak, in its unit, and the period in s. ``nan`` where it settles or runs away, or where
-        the record is too short to tell.
+        Amplitude from peak to peak, in the unit of the output, and period in s of a sustained
+        oscillation, as in a limit cycle. ``nan`` if the output settles or runs away, or if the
+        record is too short.
     """
 
     rise_time: float
@@ -76,7 +76,7 @@ class StepMetrics:
 def measure_step_response(
     times: FloatArray, values: FloatArray, *, at: float, before: float, after: float
 ) -> StepMetrics:
-    """Judge the response to a reference that steps once.
+    """Measure the response to a reference that steps once.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def measure_step_response(
     at : float
         Time of the step in s.
     before, after : float
-        The reference on either side of it, in the unit of the output.
+        The reference before and after it, in the unit of the output.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def measure_step_response(
         return StepMetrics(nan, nan, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
     tail = t >= t[-1] - _TAIL_SHARE * (t[-1] - t[0])
     final = float(np.mean(y[tail]))
-    # A steady error keeps the output from the reference before the step as after it.
+    # A steady error keeps the output from the reference both before and after the step.
     start = float(values[~later][-1]) if not later.all() else float(y[0])
     if abs(final - start) <= _RESPONSE_ROUNDING * abs(height):
         start = final
@@ -137,16 +137,16 @@ def _measure_rise_time(t: FloatArray, y: FloatArray, before: float, final: float
 
 
 def _measure_overshoot(y: FloatArray, before: float, end: float) -> float:
-    """Farthest way beyond `end` in per cent of the way there; ``nan`` if there is no way."""
+    """Largest excess over `end` in per cent of the change; ``nan`` if there is no change."""
     if end == before:
         return nan
     return 100.0 * max(float(np.max((y - before) / (end - before))) - 1.0, 0.0)
 
 
 def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
-    """Whether the output is not finite, or goes or swings farther and farther from the reference.
+    """Whether the output is not finite, or its deviation or swing keeps growing.
 
-    A response that is only late, slow, or far off in the end slows down or turns towards its end.
+    A response that is only late, slow, or off in the end slows down or turns towards its end.
     """
     with np.errstate(over="ignore"):
         away = np.abs(deviation)
@@ -162,7 +162,7 @@ def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
 
 
 def _measure_limit_cycle(t: FloatArray, deviation: FloatArray, band: float) -> tuple[float, float]:
-    """Size and period of a swing that neither grows nor decays; ``nan`` if there is none."""
+    """Measure size and period of a swing that neither grows nor decays; ``nan`` if none."""
     ends, sizes = _measure_swings(t, deviation)
     first, *_, last = _find_window_maxima(ends, sizes, _compute_window_edges(t))
     if not last > 2.0 * band or not last > _LASTING_SHARE * first > 0.0:
@@ -172,13 +172,13 @@ def _measure_limit_cycle(t: FloatArray, deviation: FloatArray, band: float) -> t
 
 
 def _compute_window_edges(t: FloatArray) -> FloatArray:
-    """Ends of the quarters of the record, from that of the first on."""
+    """Compute the ends of the quarters of the record, beginning with the first."""
     edges: FloatArray = t[0] + (t[-1] - t[0]) * np.arange(1, _N_WINDOWS + 2) / (_N_WINDOWS + 1)
     return edges
 
 
 def _find_window_maxima(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
-    """The greatest value in each window (_WINDOWS,); 0 where there is none."""
+    """Find the largest value in each window (_N_WINDOWS,); 0 if there is none."""
     which = np.searchsorted(edges, t, side="left")  # 0: before the first window
     return np.array([np.max(values[which == i], initial=0.0) for i in range(1, _N_WINDOWS + 1)])
 
@@ -192,10 +192,10 @@ def _is_growing(sizes: FloatArray, least: float) -> bool:
 
 
 def _measure_swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """When each way from a turning point to the next ends, and how long it is.
+    """Measure the swings between turning points: the end time and size of each.
 
-    The values there are those of parabolas through three samples: of the samples alone, those of
-    a limit cycle would seem to grow.
+    Parabolas through three samples give the values at turning points. With the samples alone, the
+    swings of a limit cycle would seem to grow.
     """
     slope = np.diff(y)
     turning = np.flatnonzero(slope[:-1] * slope[1:] < 0.0) + 1
@@ -205,7 +205,7 @@ def _measure_swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _find_level_crossing(t: FloatArray, progress: FloatArray, level: float) -> float:
-    """When the way first reaches a level, on a line between samples."""
+    """Find when the progress first reaches a level, by linear interpolation."""
     reached = np.flatnonzero(progress >= level)
     if reached.size == 0:
         return nan
@@ -217,7 +217,7 @@ def _find_level_crossing(t: FloatArray, progress: FloatArray, level: float) -> f
 
 
 def _measure_settling_time(t: FloatArray, away: FloatArray, band: float, latest: float) -> float:
-    """From when on it stays inside the band; ``nan`` if that is later than `latest`."""
+    """Measure from when on it stays inside the band; ``nan`` if later than `latest`."""
     outside = np.flatnonzero(away > band)
     if outside.size == 0:
         return 0.0

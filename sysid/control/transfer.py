@@ -1,8 +1,8 @@
 """Transfer functions of a linear model, from every input to every output.
 
-How a recursion reads a signal between its samples, as weights of whole samples.
-
-Polynomials in s with dead times: sums of c s^p e^(-s d); in z⁻¹ with p = 0 and d in samples.
+They are fractions of polynomials in s with dead times, sums of c s^p e^(-s d). Those of a recursion
+are in z⁻¹, with p = 0 and d in samples. A recursion reads a signal between its samples as a
+weighted sum of samples.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ _CANCELLATION_TOLERANCE = 1e-13
 def add_polynomials(
     first: QuasiPolynomial, second: QuasiPolynomial, factor: float = 1.0
 ) -> QuasiPolynomial:
-    """Sum with a multiple of another; what is left of terms that cancel is left out."""
+    """Add a multiple of another polynomial; terms that cancel up to rounding are removed."""
     terms = dict(first)
     for key, value in second.items():
         before, change = terms.get(key, 0.0), factor * value
@@ -42,7 +42,7 @@ def add_polynomials(
 
 
 def multiply_polynomials(first: QuasiPolynomial, second: QuasiPolynomial) -> QuasiPolynomial:
-    """Product of two."""
+    """Multiply two polynomials."""
     product: QuasiPolynomial = {}
     for (power, delay), value in first.items():
         shifted = {(power + p, delay + d): value * v for (p, d), v in second.items()}
@@ -51,7 +51,7 @@ def multiply_polynomials(first: QuasiPolynomial, second: QuasiPolynomial) -> Qua
 
 
 def compute_determinant(matrix: Sequence[Sequence[QuasiPolynomial]]) -> QuasiPolynomial:
-    """Determinant of a small square matrix, by its first row."""
+    """Compute the determinant of a small square matrix, by its first row."""
     if not matrix:
         return {(0, 0.0): 1.0}
     determinant: QuasiPolynomial = {}
@@ -69,12 +69,12 @@ def compute_determinant(matrix: Sequence[Sequence[QuasiPolynomial]]) -> QuasiPol
 def replace_column(
     matrix: Sequence[Sequence[QuasiPolynomial]], j: int, column: Sequence[QuasiPolynomial]
 ) -> list[list[QuasiPolynomial]]:
-    """The matrix with another column j."""
+    """Replace column j of a matrix."""
     return [[*row[:j], entry, *row[j + 1 :]] for row, entry in zip(matrix, column, strict=True)]
 
 
 def group_by_delay(polynomial: QuasiPolynomial) -> list[tuple[float, list[float]]]:
-    """Coefficients of falling powers for each dead time, the shortest dead time first."""
+    """Group coefficients of falling powers by dead time, the shortest dead time first."""
     parts: dict[float, dict[int, float]] = {}
     for (power, delay), value in polynomial.items():
         parts.setdefault(delay, {})[power] = value
@@ -87,17 +87,17 @@ def group_by_delay(polynomial: QuasiPolynomial) -> list[tuple[float, list[float]
 def compute_taps(
     identified: IdentifiedModel, signal: DelayedSignal, *, finished: int, updated: bool
 ) -> dict[int, float]:
-    """Weights of whole samples that give a signal between them, as the simulation reads it.
+    """Compute the weights of samples that give a delayed signal, as the simulation reads it.
 
     Parameters
     ----------
-    identified : Identified
-    signal : Signal
-        Its delay in samples.
+    identified : IdentifiedModel
+    signal : DelayedSignal
+        With its delay in samples.
     finished : int
-        How many samples ago the last one was that is known: 1 in an equation, 0 in an output.
+        Samples since the last computed one: 1 in an equation, 0 in an output.
     updated : bool
-        Whether a state's present sample is known; if not, the one before stands for it.
+        Whether a state's present sample is computed; if not, the previous one replaces it.
     """
     if signal.kind == "input":
         taps = _compute_input_taps(identified, signal)
@@ -124,7 +124,7 @@ def _compute_input_taps(identified: IdentifiedModel, signal: DelayedSignal) -> d
 
 
 def _count_fine_points(identified: IdentifiedModel) -> int:
-    """Fine points in a step of the simulation; half of one is where a jump is read."""
+    """Count the fine points in a step of the simulation; a jump is read at half of one."""
     return 2 * -(-POINTS_PER_SAMPLE // (2 * identified.model.solver.substeps))
 
 
@@ -149,7 +149,7 @@ def _compute_state_taps(
 
 
 def _interpolate_polynomial(delay: float, nodes: tuple[int, ...]) -> dict[int, float]:
-    """The polynomial through the samples at these places beside the one before."""
+    """Interpolate by the polynomial through the samples at these offsets."""
     i = floor(-delay)
     part = -delay - i
     if part == 0.0:
@@ -161,7 +161,7 @@ MAX_STATES = 8
 
 
 class TransferFunction(NamedTuple):
-    """From `input` to `output`: numerator and denominator."""
+    """Numerator and denominator of the transfer function from `input` to `output`."""
 
     input: str
     output: str
@@ -170,7 +170,7 @@ class TransferFunction(NamedTuple):
 
 
 class TransferFunctions(NamedTuple):
-    """All pairs of a model; `period` (s) of a recursion, None in continuous time."""
+    """Transfer functions of all pairs; `period` (s) of a recursion, None in continuous time."""
 
     pairs: tuple[TransferFunction, ...]
     linear_form: LinearForm
@@ -178,13 +178,13 @@ class TransferFunctions(NamedTuple):
 
 
 def compute_transfer_functions(identified: IdentifiedModel) -> TransferFunctions:
-    """Transfer functions from the equations, with all lags as they are.
+    """Compute transfer functions from the equations, with exact dead times.
 
     Raises
     ------
     NotLinear
-        If the model is not linear with constant coefficients, has no input, has too many states,
-        or is a recursion whose sampling period is not known.
+        If the model is not linear with constant coefficients, has no input or too many states, or
+        is a recursion whose sampling period is unknown.
     """
     model = identified.model
     if not model.inputs:
@@ -231,7 +231,7 @@ def _find_integration_step(identified: IdentifiedModel) -> float | None:
 def _build_equations(
     identified: IdentifiedModel, linear: LinearForm
 ) -> tuple[list[list[QuasiPolynomial]], Mapping[str, list[QuasiPolynomial]]]:
-    """M X = Σ b U: the matrix M, and b of every input."""
+    """Build M X = Σ b U: the matrix M, and b of every input."""
     states = [one.name for one in identified.model.states]
     power = 0 if is_difference(identified.model) else 1
     matrix = []
@@ -267,7 +267,7 @@ def _compute_numerator(
 def _make_coefficient_reader(
     identified: IdentifiedModel, equation: int | None
 ) -> Callable[[AffineForm, str, str], QuasiPolynomial]:
-    """What one signal contributes to an affine form, in an equation or in an output (None)."""
+    """Make a function that reads the coefficient of a signal in an equation or output (None)."""
     model = identified.model
 
     def weights(signal: DelayedSignal) -> Iterable[tuple[float, float]]:

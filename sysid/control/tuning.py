@@ -1,8 +1,8 @@
 """Tuning rules for a linear model with a dead time: SIMC and AMIGO.
 
-A rule needs the plant as k e^(-θs)/((T1 s + 1)(T2 s + 1)); time constants beyond these are halved
-between the last one that is kept and the dead time (Skogestad's half rule). An integrating plant,
-k' e^(-θs)/(s (T2 s + 1)), is the limit of an infinite T1 with k/T1 = k'.
+A rule needs the plant as k e^(-θs)/((T1 s + 1)(T2 s + 1)). Half of the first neglected time
+constant is added to the last retained one, the rest to the dead time (Skogestad's half rule). An
+integrating plant, k' e^(-θs)/(s (T2 s + 1)), is the limit of an infinite T1 with k/T1 = k'.
 """
 
 from collections.abc import Mapping
@@ -35,11 +35,9 @@ REFERENCES: Mapping[TuningRule, str] = {
     "amigo": "K. J. Åström and T. Hägglund, Revisiting the Ziegler-Nichols step response method "
     "for PID control, J. Process Control 14 (2004) 635-650",
 }
-_CANCELLATION_TOLERANCE = 1e-6  # of a root: a zero so close to a pole takes it away
+_CANCELLATION_TOLERANCE = 1e-6  # of a root: a zero so close to a pole cancels it
 _INTEGRATOR_TOLERANCE = 1e-9  # of the fastest root: a pole there integrates
-_REAL_POLE_TOLERANCE = (
-    1e-3  # of a root: the parts of a fourfold pole are less far apart by rounding
-)
+_REAL_POLE_TOLERANCE = 1e-3  # of a root: rounding separates a fourfold pole by less
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,20 +63,20 @@ class ProcessModel:
 
     @property
     def initial_slope(self) -> float:
-        """k/T1, or k': what the slope of the step response begins with."""
+        """k/T1, or k': the initial slope of the step response without T2."""
         return self.gain / self.time_constant if isfinite(self.time_constant) else self.gain
 
 
 @dataclass(frozen=True, slots=True)
 class Tuning:
-    """What a rule gives for a controller in the standard form, and what it was given.
+    """Controller in the standard form by a rule, with the inputs of the rule.
 
     Attributes
     ----------
     gain, integral_time, derivative_time : float
         K in units of input per output, T_i and T_d in s.
-    process : Process
-        The model as the rule takes it.
+    process : ProcessModel
+        The model in the form of the rule.
     closed_loop_time_constant : float or None
         τ_c in s, of SIMC.
     formulas : tuple of str
@@ -109,23 +107,23 @@ def tune_controller(
     closed_loop_time_constant: float | None = None,
     transport: Transport | None = None,
 ) -> Tuning:
-    """A controller of one output by one input by a rule.
+    """Tune a controller of one output by one input with a rule.
 
     Parameters
     ----------
-    identified : Identified
+    identified : IdentifiedModel
         A linear model in the differential form.
     rule : {"simc", "amigo"}
     controller : {"PI", "PID"}
     closed_loop_time_constant : float, optional
-        τ_c of SIMC in s; the effective dead time θ if not given, which Skogestad advises.
+        τ_c of SIMC in s. Default: the effective dead time θ, as Skogestad recommends.
     transport : Transport, optional
-        What lies between controller and plant: a part of what is to be controlled.
+        Transport between controller and plant; it is a part of the controlled system.
 
     Raises
     ------
     InvalidSettings
-        If the rule has no answer for this model; the message tells why.
+        If the rule has no answer for this model; the message says why.
     """
     if closed_loop_time_constant is not None and rule != "simc":
         raise InvalidSettings(
@@ -139,7 +137,7 @@ def tune_controller(
             if rule == "amigo"
             else _tune_simc(process, controller, closed_loop_time_constant)
         )
-    except ZeroDivisionError:  # of numbers whose product is too small to be one
+    except ZeroDivisionError:  # a product of small numbers underflows
         raise _make_refusal(_describe_impossible_gain(inf, process)) from None
     if not 0.0 < abs(tuning.gain) < LARGEST_NUMBER:
         raise _make_refusal(_describe_impossible_gain(tuning.gain, process))
@@ -155,7 +153,7 @@ def _describe_impossible_gain(gain: float, process: ProcessModel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TransferFactors:
-    """gain · e^(-delay s) / Π (T s + 1), over s where it integrates."""
+    """Factors of gain · e^(-delay s) / Π (T s + 1), divided by s if it integrates."""
 
     gain: float
     delay: float
@@ -163,7 +161,7 @@ class TransferFactors:
     is_integrating: bool
 
     def reduce_order(self, order: int) -> ProcessModel:
-        """The process of first or second order by the half rule."""
+        """Reduce to first or second order by the half rule."""
         times = [inf, *self.time_constants] if self.is_integrating else list(self.time_constants)
         times += [0.0] * (order + 1 - len(times))
         leading, neglected = times[:order], times[order:]
@@ -178,7 +176,7 @@ class TransferFactors:
 def factor_transfer_function(
     identified: IdentifiedModel, input: str, output: str, transport: Transport | None
 ) -> TransferFactors:
-    """The transfer function from the controller to the output as gain, lags and dead time.
+    """Factor the transfer function from controller to output: gain, time constants, dead time.
 
     Raises
     ------
@@ -230,7 +228,7 @@ def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactor
             "constants"
         )
     times = [float(1.0 / abs(pole)) for pole in others]
-    # What is left of numerator and denominator at low frequencies, s of the integrator apart.
+    # Numerator and denominator at low frequencies, without s of the integrator.
     gain = float(above[0] / below[0] * np.prod(times)) * transport.gain
     if transport.time_constant > 0:
         times.append(transport.time_constant)
@@ -255,7 +253,7 @@ def _find_roots(powers: list[float]) -> ComplexArray:
 def _cancel_common_roots(
     zeros: ComplexArray, poles: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Roots without those that numerator and denominator share: of states that have no effect."""
+    """Remove the roots that numerator and denominator share: those of states without effect."""
     remaining_poles, remaining_zeros = list(poles), []
     for zero in zeros:
         near = [
@@ -287,7 +285,7 @@ def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float 
     series_gain = 1.0 / (process.initial_slope * (tau + theta))
     series_time = min(process.time_constant, 4.0 * (tau + theta))
     derivative = process.second_time_constant
-    # From the series form, in which the rule is written, to the standard one.
+    # The rule is in the series form; convert it to the standard form.
     factor = 1.0 + derivative / series_time
     formulas = ["K' = T1/(k (τ_c + θ))", "T_i' = min(T1, 4 (τ_c + θ))"]
     if controller == "PID":

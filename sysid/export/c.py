@@ -183,8 +183,8 @@ def _write_identified_function(program: GeneratedProgram, stem: str) -> str:
     lines = [f"{stem}_parameters {stem}_identified(void)", "{", f"    {stem}_parameters p;"]
     numbers = identified.value_by_name
     lines += [
-        f"    p.{program.parameter_names[parameter.name]} = {write_number(numbers[parameter.name])};"
-        for parameter in identified.model.parameters
+        f"    p.{program.parameter_names[item.name]} = {write_number(numbers[item.name])};"
+        for item in identified.model.parameters
     ]
     for i, state in enumerate(identified.model.states):
         start, name = program.find_initial_value(i), program.start_names[state.name]

@@ -14,7 +14,7 @@ from sysid.export.description import write_json_source
 from sysid.export.python import write_python_source
 from sysid.export.python_control import write_control_source
 from sysid.identification.result import Identification
-from sysid.language.evaluation import evaluate_expression as value_of
+from sysid.language.evaluation import evaluate_expression
 from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
 from sysid.models.ties import resolve_ties
@@ -133,7 +133,9 @@ def _add_tied_values(model: Model, found: Mapping[str, float]) -> dict[str, floa
         if parameter.tied is None and parameter.name not in found:
             raise InvalidSettings(f"/values/{parameter.name}", "a value is missing")
     return {
-        **{name: value_of(tie, found) for name, tie in resolve_ties(model, free).items()},
+        **{
+            name: evaluate_expression(tie, found) for name, tie in resolve_ties(model, free).items()
+        },
         **found,
     }
 

@@ -15,8 +15,8 @@ _LIBRARIES = ("numpy", "scipy", "numba")
 def compute_fingerprint(*packages: Path) -> str:
     """Compute a digest of all that a result depends on in addition to its specification.
 
-    It covers the sources of this package and of the folders `packages`, the versions of the
-    libraries, and the properties of the machine that kernels depend on.
+    It covers the sources of this package and of the folders `packages`. It also covers the versions
+    of the libraries and the properties of the machine that kernels depend on.
     """
     parts = [describe_machine(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     for folder in (Path(__file__).parents[1], *packages):

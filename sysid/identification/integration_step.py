@@ -74,8 +74,8 @@ def warn_integration_step(
         return []
     substeps = problem.model.solver.substeps
     return [
-        f"the integration step is too long for these estimates: with half of it {', '.join(shifts)}. "
-        f"Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
+        "the integration step is too long for these estimates: with half of it "
+        f"{', '.join(shifts)}. Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
     ]
 
 

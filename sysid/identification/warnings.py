@@ -141,9 +141,9 @@ def _warn_early_response(problem: Problem) -> list[str]:
         if unprompted := find_unprompted_output(record):
             where = f" in experiment {number}" if len(problem.records) > 1 else ""
             messages.append(
-                f"output {unprompted[0]!r} begins to move at t = {unprompted[1]:.4g} s{where}, before any "
-                "input. If the record begins with the step itself, the estimated time lag is "
-                "wrong: the input is assumed constant before the record. Put some rows of the "
+                f"output {unprompted[0]!r} begins to move at t = {unprompted[1]:.4g} s{where}, "
+                "before any input. If the record begins with the step itself, the estimated time "
+                "lag is wrong: the input is assumed constant before the record. Put some rows of the "
                 "input at rest before the record."
             )
     return messages
@@ -344,8 +344,8 @@ def _warn_coloured_residuals(
         suggestion = _NOISE_MODEL_SUGGESTION if advises else ""
         return [
             f"the residuals are not white (on the {tests.data} data): dynamics are missing from "
-            f"the model. The estimate of {', '.join(sorted(delay_names))} depends on the order of the "
-            f"model. {_STDERR_MEANINGS[colour]}{suggestion}"
+            f"the model. The estimate of {', '.join(sorted(delay_names))} depends on the order of "
+            f"the model. {_STDERR_MEANINGS[colour]}{suggestion}"
         ]
     if not advises:
         return []

@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
-from sysid.language.evaluation import evaluate_expression as worth
+from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
@@ -97,7 +97,7 @@ def _linearise_tie(
     fixed_values = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
 
     def evaluate_at(values: FloatArray) -> float:
-        return worth(
+        return evaluate_expression(
             tree, {**fixed_values, **dict(zip(problem.free_names, values.tolist(), strict=True))}
         )
 
@@ -128,7 +128,7 @@ def _explain_status(
     if lacks_stderr:
         return "the output does not change with it"
     return {
-        "unidentifiable": "the data say little about it: its standard error is as large as its range",
+        "unidentifiable": "the data say little about it; its standard error exceeds its range",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")
 

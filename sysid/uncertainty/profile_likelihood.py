@@ -8,8 +8,8 @@ the interval of the t distribution, except for a part of order 1/n. For other mo
 shows what the covariance cannot: open ends, more than one valley, a bound.
 
 With the soft-l1 loss, its sum R replaces S. The ratio is scaled by R₀ ΣK / (n Σψ²) to follow χ²
-again, with ψ and K as in `sysid.uncertainty.analysis` (the ratio test of an M-estimator, Hampel et
-al. 1986, ch. 7). The scale is 1 if no residual is an outlier.
+again (the ratio test of an M-estimator, Hampel et al. 1986, ch. 7). ψ and K are those of
+`sysid.uncertainty.analysis`. The scale is 1 if no residual is an outlier.
 
 If the residuals are coloured, the ratio is divided by the factor by which this widens the square of
 the interval (`sysid.residuals.coloured`). So profile and standard error assume the same noise.
