@@ -1,8 +1,6 @@
-"""Use cases of datasets: store an upload, derive, tell, and read the samples back.
+"""Use cases of datasets: store an upload, derive, describe, and read samples and lineage.
 
-Datasets by what requests call them: an identifier, or a name that only one has.
-
-Use case of lineage: what a dataset was made from, and what was made from it.
+Requests name a dataset by its identifier, or by a name that is unique.
 """
 
 import hashlib
@@ -48,7 +46,7 @@ from sysid.models.units import list_unknown_unit_warnings
 
 
 def read_lineage(session: Session, dataset_id: str) -> LineageOut:
-    """Every edge on the ways to and from a dataset, from raw file to job."""
+    """Read every edge on the paths to and from a dataset, from raw file to job."""
     row = DatasetRepository(session).get(dataset_id)
     repository = LineageRepository(session)
     edges = {*repository.list_ancestors(row.id), *repository.list_descendants(row.id)}
@@ -56,19 +54,19 @@ def read_lineage(session: Session, dataset_id: str) -> LineageOut:
 
 
 def resolve_dataset(session: Session, reference: str) -> Dataset | str:
-    """The dataset of that identifier or name, or why there is none."""
+    """Return the dataset of an identifier or name, or a message why there is none."""
     try:
         return DatasetRepository(session).get(reference)
     except RowNotFound:
-        named = find_datasets_by_name(session, reference)
-    if len(named) == 1:
-        return named[0]
-    if named:
-        ids = ", ".join(one.id for one in named)
-        return f"{len(named)} datasets are named {reference!r}; give one of the ids {ids}"
+        matches = find_datasets_by_name(session, reference)
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        ids = ", ".join(dataset.id for dataset in matches)
+        return f"{len(matches)} datasets are named {reference!r}; use one of the ids {ids}"
     hint = suggest_name(reference, set(list_dataset_names(session)))
     if "/" in reference or reference.endswith((".csv", ".mcap")):
-        hint = "; a path of a file is not read here, add the file first: `lagid dataset add`"
+        hint = "; file paths are not read here: add the file first with `lagid dataset add`"
     return f"there is no dataset {reference!r}{hint}"
 
 
@@ -87,12 +85,12 @@ def add_upload(
     segments: Sequence[str] = (),
     sample_time: float | None = None,
 ) -> StoredDataset:
-    """Store an uploaded file, or give the dataset that the same bytes made before.
+    """Store an uploaded file, or return the existing dataset of the same bytes.
 
     Raises
     ------
     InvalidUpload
-        If the file cannot be used, with the place.
+        If the file cannot be used, with the position of the fault.
     """
     read_as = {
         "sha256": sha256,
@@ -102,10 +100,10 @@ def add_upload(
     }
     key = hash_source(read_as)
     with database.read_session() as session:
-        known = DatasetRepository(session).find_by_source(key)
-    if known is not None:
-        return StoredDataset(known, is_new=False)
-    # Reading takes time: no transaction is open meanwhile, which on SQLite would hold up all.
+        existing = DatasetRepository(session).find_by_source(key)
+    if existing is not None:
+        return StoredDataset(existing, is_new=False)
+    # Reading takes time. An open transaction would block all others on SQLite.
     read = read_untrusted(path, form, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
@@ -122,22 +120,22 @@ def add_upload(
 def derive_dataset(
     database: Database, store: ObjectStore, parent_id: str, body: DeriveIn
 ) -> StoredDataset:
-    """Make a dataset from another by steps; the same steps again give the same dataset.
+    """Derive a dataset from another by steps; the same steps again return the same dataset.
 
     Raises
     ------
-    NoSuchDataset
-        If none has that identifier or name, or several have the name.
+    DatasetNotFound
+        If no dataset has that identifier or name, or several share the name.
     InvalidRecord, InvalidSettings
-        If a step cannot be done.
+        If a step is not possible.
     """
     with database.read_session() as session:
         parent = resolve_dataset(session, parent_id)
         if isinstance(parent, str):
             raise DatasetNotFound(parent)
-        known = DatasetRepository(session).find_by_source(_hash_derivation(parent, body))
-    if known is not None:
-        return StoredDataset(known, is_new=False)
+        existing = DatasetRepository(session).find_by_source(_hash_derivation(parent, body))
+    if existing is not None:
+        return StoredDataset(existing, is_new=False)
     from sysid.data.derivations import (
         derive_recording as derived,  # brings SciPy's signal processing
     )
@@ -168,7 +166,7 @@ def add_recording(
     parents: Sequence[str] = (),
     relation: Relation = "derived",
 ) -> StoredDataset:
-    """Store a recording: its object first, then the row that names it."""
+    """Store a recording: first its object, then the row that refers to it."""
     metadata = {"source": key, "parents": " ".join(parents), "name": name}
     content = _store_file(store, recording, metadata)
     new = describe_recording(
@@ -187,7 +185,7 @@ def describe_recording(
     details: Mapping[str, Any],
     content: StoredObject,
 ) -> NewDataset:
-    """What the row of a recording says."""
+    """Build the description of a recording for its row."""
     return NewDataset(
         name=name,
         kind=kind,
@@ -210,7 +208,7 @@ def describe_recording(
 
 
 def to_out(row: Dataset) -> DatasetOut:
-    """A dataset as it is told."""
+    """Convert a dataset to its response."""
     details = dict(row.details)
     return DatasetOut.from_source(
         row,
@@ -222,45 +220,45 @@ def to_out(row: Dataset) -> DatasetOut:
 
 
 def to_stored_out(stored: StoredDataset, name: str | None) -> DatasetOut:
-    """A dataset that was just sent; warned of if it is there already under another name."""
-    answer, row = to_out(stored.dataset), stored.dataset
+    """Convert a stored dataset to its response; warn if it exists under another name."""
+    response, row = to_out(stored.dataset), stored.dataset
     if stored.is_new:
-        return answer
+        return response
     if name in (None, row.name):
-        return answer
-    warning = f"the same data were stored before, as {row.name!r}; that name stays"
-    return answer.model_copy(update={"warnings": [*answer.warnings, warning]})
+        return response
+    warning = f"the same data are already stored as {row.name!r}; that name stays"
+    return response.model_copy(update={"warnings": [*response.warnings, warning]})
 
 
 def _measure_history(recording: Recording) -> float:
-    """For how long (s) before the start something is known."""
+    """Return the length (s) of the history before the start of the recording."""
     return recording.start - min(
-        float(one.history_and_samples.times[0]) for one in recording.channels
+        float(channel.history_and_samples.times[0]) for channel in recording.channels
     )
 
 
 def list_datasets(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
-    """Datasets, latest first."""
-    found = DatasetRepository(session).list_page(cursor=cursor, limit=limit)
-    return Page(items=[to_out(row) for row in found.items], next=found.next)
+    """List datasets, latest first."""
+    page = DatasetRepository(session).list_page(cursor=cursor, limit=limit)
+    return Page(items=[to_out(row) for row in page.items], next=page.next)
 
 
 def read_signals(
     session: Session, store: ObjectStore, dataset_id: str, max_points: int
 ) -> SignalsOut:
-    """Channels of a dataset, reduced so that extremes stay visible."""
+    """Read the channels of a dataset, reduced so that extremes stay visible."""
     row = DatasetRepository(session).get(dataset_id)
     channels = load_recording(store, row.sha256).channels
-    before = [Channel(c.name, *c.history, c.unit) for c in channels if c.history is not None]
+    histories = [Channel(c.name, *c.history, c.unit) for c in channels if c.history is not None]
     return SignalsOut(
         id=row.id,
         channels=[to_series(channel, max_points) for channel in channels],
-        history=[to_series(channel, max_points) for channel in before],
+        history=[to_series(channel, max_points) for channel in histories],
     )
 
 
 def to_series(channel: Channel, max_points: int) -> SeriesOut:
-    """A channel as one line of a plot."""
+    """Convert a channel to one line of a plot."""
     times, values = decimate(channel.times, channel.values, max_points)
     return SeriesOut(
         name=channel.name,
@@ -272,21 +270,22 @@ def to_series(channel: Channel, max_points: int) -> SeriesOut:
 
 
 def hash_source(source: Mapping[str, Any]) -> str:
-    """Hash of what a dataset is made from."""
+    """Return the hash of the source of a dataset."""
     return hashlib.sha256(json.dumps(source, sort_keys=True).encode()).hexdigest()
 
 
 def check_upload_size(size: int, settings: Settings) -> None:
-    """Refuse a body that is larger than the limit.
+    """Refuse an upload that exceeds the limit.
 
     Raises
     ------
     TooLarge
+        If the upload is larger than the limit.
     """
     if size > settings.max_upload_bytes:
         raise TooLarge(
             f"the upload has {size} bytes or more; at most {settings.max_upload_bytes} "
-            "(LAGID_MAX_UPLOAD_BYTES)"
+            "are allowed (LAGID_MAX_UPLOAD_BYTES)"
         )
 
 
@@ -320,8 +319,8 @@ def _describe_channel(channel: Channel) -> dict[str, Any]:
 
 
 def _find_common_period(recording: Recording) -> float | None:
-    periods = [channel.sampling for channel in recording.channels]
-    if not all(one.is_regular for one in periods):
+    samplings = [channel.sampling for channel in recording.channels]
+    if not all(sampling.is_regular for sampling in samplings):
         return None
-    first = periods[0].period
-    return first if all(abs(p.period - first) <= 1e-6 * first for p in periods) else None
+    first = samplings[0].period
+    return first if all(abs(p.period - first) <= 1e-6 * first for p in samplings) else None

@@ -1,4 +1,4 @@
-"""Use case: a dataset simulated from a reference plant, which is finer than any model of it."""
+"""Use case: a dataset simulated from a reference plant, which is finer than its models."""
 
 from dataclasses import fields
 from typing import Any
@@ -22,7 +22,7 @@ _INTEGER_PARAMETERS = ("pattern", "gauges", "cells", "modes")
 
 
 def simulate_plant(database: Database, store: ObjectStore, body: SimulateIn) -> StoredDataset:
-    """Make a dataset of a plant's inputs and outputs; the same body gives the same dataset.
+    """Simulate the inputs and outputs of a plant; the same body returns the same dataset.
 
     Raises
     ------
@@ -31,19 +31,21 @@ def simulate_plant(database: Database, store: ObjectStore, body: SimulateIn) -> 
     """
     key = hash_source(body.model_dump(mode="json", exclude={"name"}))
     with database.read_session() as session:
-        known = DatasetRepository(session).find_by_source(key)
-        if known is not None:
-            return StoredDataset(known, is_new=False)
+        existing = DatasetRepository(session).find_by_source(key)
+        if existing is not None:
+            return StoredDataset(existing, is_new=False)
         if body.plant == "tube":
             supply: Channel | None = None
             parents: list[str] = []
         else:
             supply, parents = _build_supply(session, store, body)
-    # The simulation takes its time: no transaction is open meanwhile.
-    recording, used = _simulate_tube(body) if supply is None else _simulate_actuator(body, supply)
+    # The simulation takes time: no transaction is open meanwhile.
+    recording, true_parameters = (
+        _simulate_tube(body) if supply is None else _simulate_actuator(body, supply)
+    )
     details = {
         "simulation": body.model_dump(mode="json", exclude={"model"}),
-        "true_parameters": used,
+        "true_parameters": true_parameters,
         "warnings": [],
     }
     return add_recording(
@@ -62,7 +64,7 @@ def simulate_plant(database: Database, store: ObjectStore, body: SimulateIn) -> 
 def _build_supply(
     session: Session, store: ObjectStore, body: SimulateIn
 ) -> tuple[Channel, list[str]]:
-    """The supply pressure of the actuator, and the datasets it was taken from."""
+    """Build the supply pressure of the actuator; also return the datasets that it comes from."""
     faults = [
         FieldError(f"/inputs/{name}", "the actuator has one input, P_a")
         for name in body.inputs
@@ -74,9 +76,7 @@ def _build_supply(
         )
     if body.samples is None or body.sample_time is None:
         missing = "samples" if body.samples is None else "sample_time"
-        faults.append(
-            FieldError(f"/{missing}", "is missing; the actuator has no record of its own")
-        )
+        faults.append(FieldError(f"/{missing}", "is missing; the actuator has no default"))
     if faults:
         raise InvalidRequest(faults)
     times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
@@ -88,10 +88,10 @@ def _build_supply(
 def _simulate_actuator(body: SimulateIn, supply: Channel) -> tuple[Recording, dict[str, float]]:
     from sysid.plants.actuator import Actuator, simulate_actuator
 
-    given = _check_parameters(Actuator, (), body.parameters)
-    if "k_a" in given and "k_b" not in given:
-        given["k_b"] = given["k_a"]  # as P settles at P_a
-    actuator = Actuator(**given)
+    parameters = _check_parameters(Actuator, (), body.parameters)
+    if "k_a" in parameters and "k_b" not in parameters:
+        parameters["k_b"] = parameters["k_a"]  # because P settles at P_a
+    actuator = Actuator(**parameters)
     try:
         recording = simulate_actuator(actuator, supply)
     except InvalidRecord as error:
@@ -107,28 +107,28 @@ def _simulate_tube(body: SimulateIn) -> tuple[Recording, dict[str, float]]:
             f"/inputs/{next(iter(body.inputs))}",
             "the tube is driven by its regulator; choose the parameter 'pattern', 1 or 2",
         )
-    given = _check_parameters(Tube, _TUBE_OPTIONS, body.parameters)
-    extra = {name: given.pop(name) for name in _TUBE_OPTIONS if name in given}
-    tube = Tube(**given)
+    parameters = _check_parameters(Tube, _TUBE_OPTIONS, body.parameters)
+    options = {name: parameters.pop(name) for name in _TUBE_OPTIONS if name in parameters}
+    tube = Tube(**parameters)
     period = body.sample_time or (0.002 if tube.length_m <= 10 else 0.01)
-    stretched = 30.0 * max(1.0, tube.length_m / 40.0)
-    samples = body.samples or round(stretched / period) + 1
-    pattern = extra.get("pattern", 1)
+    duration = 30.0 * max(1.0, tube.length_m / 40.0)
+    samples = body.samples or round(duration / period) + 1
+    pattern = options.get("pattern", 1)
     recording = simulate_tube_record(tube, pattern, samples, period)
-    if "gauges" in extra:
-        recording = add_gauge_errors(recording, extra["gauges"])
+    if "gauges" in options:
+        recording = add_gauge_errors(recording, options["gauges"])
     return recording, {**_read_parameters(tube), "pattern": pattern}
 
 
 def _check_parameters(
     kind: Any, extra: tuple[str, ...], values: dict[str, float]
 ) -> dict[str, Any]:
-    """Parameters as the plant takes them; some are whole numbers."""
-    known = [*(field.name for field in fields(kind)), *extra]
+    """Check the parameters of a plant, and convert the whole numbers."""
+    valid_names = [*(field.name for field in fields(kind)), *extra]
     faults = []
     for name, value in values.items():
-        if name not in known:
-            detail = f"the plant has no parameter {name!r}{suggest_name(name, known)}"
+        if name not in valid_names:
+            detail = f"the plant has no parameter {name!r}{suggest_name(name, valid_names)}"
             faults.append(FieldError(f"/parameters/{name}", detail))
         elif name in _INTEGER_PARAMETERS and (value != int(value) or value < 0):
             detail = f"found {value:g}; need a whole number, 0 or more"
@@ -143,7 +143,7 @@ def _read_parameters(plant: Any) -> dict[str, float]:
 
 
 def _add_noise(recording: Recording, body: SimulateIn) -> Recording:
-    """Noise on the output: the angle of the actuator, the far end of the tube."""
+    """Add noise to the output: the angle of the actuator, the far end of the tube."""
     if body.noise.sigma == 0:
         return recording
     from sysid.data.derivations import derive_recording

@@ -1,4 +1,4 @@
-"""Recordings from the object store; the last few stay in memory."""
+"""Load recordings from the object store; the latest few stay in memory."""
 
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -15,43 +15,43 @@ MAX_CACHED_SAMPLES = 2_000_000  # samples over all channels: 32 MB
 
 
 class _RecordingCache:
-    """The recordings read last, by hash: an object never changes."""
+    """The latest recordings, by hash; an object never changes."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._found: OrderedDict[str, Recording] = OrderedDict()
+        self._recordings: OrderedDict[str, Recording] = OrderedDict()
 
     def get(self, sha256: str) -> Recording | None:
         with self._lock:
-            if sha256 in self._found:
-                self._found.move_to_end(sha256)
-            return self._found.get(sha256)
+            if sha256 in self._recordings:
+                self._recordings.move_to_end(sha256)
+            return self._recordings.get(sha256)
 
     def put(self, sha256: str, recording: Recording) -> None:
         if sum(channel.total_samples for channel in recording.channels) > MAX_CACHED_SAMPLES:
             return
         with self._lock:
-            self._found[sha256] = recording
-            while len(self._found) > CACHE_SIZE:
-                self._found.popitem(last=False)
+            self._recordings[sha256] = recording
+            while len(self._recordings) > CACHE_SIZE:
+                self._recordings.popitem(last=False)
 
 
 _recording_cache = _RecordingCache()
 
 
 def load_recording(store: ObjectStore, sha256: str) -> Recording:
-    """The recording that an object holds.
+    """Load the recording of an object.
 
     Raises
     ------
     ObjectMissing
-        If the store has lost it.
+        If the object is missing from the store.
     """
-    found = _recording_cache.get(sha256)
-    if found is None:
-        found = read_recording(store.get_bytes(sha256))
-        _recording_cache.put(sha256, found)
-    return found
+    recording = _recording_cache.get(sha256)
+    if recording is None:
+        recording = read_recording(store.get_bytes(sha256))
+        _recording_cache.put(sha256, recording)
+    return recording
 
 
 def read_records(
@@ -62,9 +62,9 @@ def read_records(
     Raises
     ------
     ObjectMissing
-        If the store has lost a dataset.
+        If the object of a dataset is missing from the store.
     InvalidRecord
-        If a channel is not there, or cannot be that signal.
+        If a channel is missing, or cannot be that signal.
     """
     return tuple(
         record

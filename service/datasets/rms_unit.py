@@ -1,4 +1,4 @@
-"""The unit of a body's RMS."""
+"""The unit of the RMS of a job."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,9 +13,10 @@ JobBody = Mapping[str, Any]
 
 
 def find_rms_unit(session: Session, body: JobBody) -> str:
-    """Unit of the RMS: the output's, or standard deviations of several outputs together.
+    """Return the unit of the RMS: that of the output, or σ for several outputs together.
 
-    A model that fits any unit says "1"; then the unit is that of the recorded channel.
+    σ are standard deviations. A model that fits any unit has the unit "1"; then the unit is that of
+    the recorded channel.
     """
     model = load_stored_model(body["model"])
     if len(model.outputs) > 1:
@@ -33,4 +34,4 @@ def _find_recorded_unit(session: Session, body: JobBody, channel: str) -> str:
         channels = DatasetRepository(session).get(body["datasets"][0]).channels
     except RowNotFound:
         return "1"
-    return next((str(one["unit"]) for one in channels if one["name"] == channel), "1")
+    return next((str(entry["unit"]) for entry in channels if entry["name"] == channel), "1")

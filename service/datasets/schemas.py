@@ -1,4 +1,4 @@
-"""What is sent and told about datasets."""
+"""Wire types of datasets."""
 
 from datetime import datetime
 from typing import Annotated, Any, Literal, Self
@@ -12,7 +12,7 @@ from sysid.data.records import Hold
 MAX_SIMULATED_SAMPLES = 10_000_000
 
 SampleTime = Annotated[float, Field(ge=1e-9, le=1e9)]
-"""In s; the longest record then lasts a finite time, and no two of its samples share one."""
+"""In s; its bounds keep the longest record finite and the times of its samples distinct."""
 
 
 class WaveInput(Body):
@@ -73,16 +73,17 @@ InputIn = Annotated[
 
 
 class SimulateIn(Body):
-    """A dataset made from a model or a plant: parameters, inputs, the noise on its outputs.
+    """A dataset simulated from a model or a plant: parameters, inputs, and noise on its outputs.
 
-    A state's start may be given among the parameters as ``x(0)``; a state that the model does not
-    start itself starts at zero. A plant has values of its own for all that is not given:
+    The initial value of a state may be given among the parameters as ``x(0)``. A state without an
+    initial value in the model starts at zero. A plant has default values for everything that is not
+    given:
 
-    - ``actuator``: the vane actuator with stick-slip friction, exact between its events; input P_a
-      in Pa, parameters J, F_c, F_max, k_a, k_b, k_c, A_m, B, theta_s in SI units.
-    - ``tube``: a pneumatic tube with a regulator before and a volume behind it; parameters
-      ``pattern`` (1 or 2, the excitation), length_m, bore_m, volume_m3, temperature, and
-      ``gauges`` (a seed: the pressures as gauges with noise and 12 bit tell them).
+    - ``actuator``: the vane actuator with stick-slip friction, exact between its events. Its input
+      is P_a in Pa. Its parameters are J, F_c, F_max, k_a, k_b, k_c, A_m, B and theta_s in SI units.
+    - ``tube``: a pneumatic tube with a regulator before and a volume behind it. Its parameters are
+      ``pattern`` (1 or 2, the excitation), length_m, bore_m, volume_m3, temperature and ``gauges``
+      (a seed: pressures are read by gauges with noise and 12 bit).
     """
 
     name: str | None = Field(default=None, max_length=200)
@@ -102,16 +103,17 @@ class SimulateIn(Body):
 
 
 class DeriveIn(Body):
-    """A dataset made from another by steps, each an object with one key: the step's name."""
+    """A dataset derived from another by steps; each is an object with one key, the step name."""
 
     name: str | None = Field(default=None, max_length=200)
     steps: list[dict[str, Any]] = Field(min_length=1, max_length=32)
 
 
 class ChannelOut(Answer):
-    """One channel of a dataset. `sample_time` is None where the sampling is irregular.
+    """One channel of a dataset. `sample_time` is null if the sampling is irregular.
 
-    `history_samples` were recorded before `start`, from `history_start` (s) on: lags read them.
+    `history_samples` were recorded before `start`, from `history_start` (s) on; delayed inputs read
+    them.
     """
 
     name: str
@@ -145,7 +147,7 @@ class DatasetOut(Answer):
 
 
 class SeriesOut(Answer):
-    """One line of a plot: at most as many points as were asked for."""
+    """One line of a plot, with at most the requested number of points."""
 
     name: str
     unit: str
@@ -157,7 +159,7 @@ class SeriesOut(Answer):
 class SignalsOut(Answer):
     """Channels of a dataset, reduced so that extremes stay visible.
 
-    `history` has what is known of them from before their first samples.
+    `history` has their samples from before the start of the record.
     """
 
     id: str
@@ -174,7 +176,7 @@ class LineageEdgeOut(Answer):
 
 
 class LineageOut(Answer):
-    """Everything a dataset was made from and everything made from it."""
+    """Everything that a dataset was made from, and everything made from it."""
 
     id: str
     edges: list[LineageEdgeOut]
@@ -184,7 +186,7 @@ MAX_SERIES_SAMPLES = 1_000_000
 
 
 class SeriesInput(Body):
-    """Samples given in the request; before the first and after the last they keep their values."""
+    """Samples in the request; before the first and after the last sample the value is constant."""
 
     kind: Literal["series"]
     times: list[float] = Field(min_length=1, max_length=MAX_SERIES_SAMPLES)
@@ -197,7 +199,7 @@ class SeriesInput(Body):
         if times != values:
             raise PydanticCustomError(
                 "lengths",
-                "there are {times} times and {values} values; need as many",
+                "there are {times} times and {values} values; need the same number",
                 {"times": times, "values": values},
             )
         return self

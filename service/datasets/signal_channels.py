@@ -1,4 +1,4 @@
-"""Which channel of a recording is which signal of a model, and how its inputs are held."""
+"""Map the signals of a model to channels of a recording, and set how inputs are held."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class SignalChannels:
     inputs, outputs : tuple of (signal, channel)
         In the order of the model.
     holds : tuple of (channel, hold)
-        Channels whose hold is not that of the recording.
+        Channels whose hold differs from that of the recording.
     """
 
     inputs: tuple[tuple[str, str], ...]
@@ -29,12 +29,12 @@ class SignalChannels:
         return dict((*self.inputs, *self.outputs))
 
     def cut_records(self, recording: Recording, name: str) -> tuple[Record, ...]:
-        """Give the records of a recording, one for each segment.
+        """Return the records of a recording, one for each segment.
 
         Raises
         ------
         InvalidRecord
-            If a channel is not there, or cannot be that signal.
+            If a channel is missing, or cannot be that signal.
         """
         held = recording.replace_holds(dict(self.holds))
         return tuple(held.to_records(dict(self.inputs), dict(self.outputs), name))
@@ -43,7 +43,7 @@ class SignalChannels:
 def map_channels(
     model: Model, channels: Mapping[str, str], hold: Mapping[str, Hold] | None = None
 ) -> SignalChannels:
-    """Find the channel of every signal of a model; it has the signal's name if none is named.
+    """Map every signal of a model to a channel, by default to the channel of its name.
 
     Parameters
     ----------
@@ -51,7 +51,11 @@ def map_channels(
         ``channels`` and ``hold`` of a job body, by the names of the signals.
     """
     return SignalChannels(
-        inputs=tuple((one.name, channels.get(one.name, one.name)) for one in model.inputs),
-        outputs=tuple((one.name, channels.get(one.name, one.name)) for one in model.outputs),
+        inputs=tuple(
+            (signal.name, channels.get(signal.name, signal.name)) for signal in model.inputs
+        ),
+        outputs=tuple(
+            (signal.name, channels.get(signal.name, signal.name)) for signal in model.outputs
+        ),
         holds=tuple((channels.get(name, name), kind) for name, kind in (hold or {}).items()),
     )

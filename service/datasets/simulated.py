@@ -27,7 +27,7 @@ from sysid.models.model import FixedInitial, Model
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDataset:
-    """A recording that was simulated and is not stored, with what its dataset will say."""
+    """A simulated recording that is not stored yet, with the description of its dataset."""
 
     recording: Recording
     name: str
@@ -36,7 +36,7 @@ class SimulatedDataset:
     parents: tuple[str, ...]
 
     def to_row(self, dataset_id: str) -> Dataset:
-        """The dataset as it will be, to be looked at before it is stored."""
+        """Build the row of the dataset, to preview it before it is stored."""
         nothing = StoredObject(sha256="", size=0)
         return build_dataset_row(
             describe_recording(
@@ -51,7 +51,7 @@ class SimulatedDataset:
         )
 
     def store_dataset(self, database: Database, store: ObjectStore) -> StoredDataset:
-        """Store it as a dataset."""
+        """Store the recording as a dataset."""
         return add_recording(
             database,
             store,
@@ -67,7 +67,7 @@ class SimulatedDataset:
 
 @simulation_limit.acquire()
 def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -> StoredDataset:
-    """Make a dataset of a model's or plant's signals; the same body gives the same dataset.
+    """Simulate a model or a plant as a dataset; the same body returns the same dataset.
 
     Raises
     ------
@@ -76,14 +76,14 @@ def simulate_dataset(database: Database, store: ObjectStore, body: SimulateIn) -
     """
     if body.plant is not None:
         return simulate_plant(database, store, body)
-    found = simulate_or_find(database, store, body)
-    return found if isinstance(found, StoredDataset) else found.store_dataset(database, store)
+    dataset = simulate_or_find(database, store, body)
+    return dataset if isinstance(dataset, StoredDataset) else dataset.store_dataset(database, store)
 
 
 def simulate_or_find(
     database: Database, store: ObjectStore, body: SimulateIn
 ) -> StoredDataset | SimulatedDataset:
-    """A model's signals, or the dataset that the same body made before; nothing is stored.
+    """Simulate a model, or return the existing dataset of the same body; store nothing.
 
     Raises
     ------
@@ -94,9 +94,9 @@ def simulate_or_find(
         model, document = _resolve_model(session, body.model)
         request = body.model_dump(mode="json", exclude={"name", "plant"})
         key = hash_source({**request, "model": document})
-        known = DatasetRepository(session).find_by_source(key)
-        if known is not None:
-            return StoredDataset(known, is_new=False)
+        existing = DatasetRepository(session).find_by_source(key)
+        if existing is not None:
+            return StoredDataset(existing, is_new=False)
         faults = [
             *_find_parameter_faults(model, body.parameters),
             *_find_input_faults(model, body.inputs),
@@ -110,8 +110,10 @@ def simulate_or_find(
         times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
         signals = InputSignals(session, store, times)
         inputs = [
-            signals.sample_input(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
-            for one in model.inputs
+            signals.sample_input(
+                f"/inputs/{quantity.name}", quantity.name, quantity.unit, body.inputs[quantity.name]
+            )
+            for quantity in model.inputs
         ]
     details = {
         "simulation": {**request, "name": body.name, "model": document},
@@ -138,16 +140,16 @@ def _resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
 def _simulate_recording(
     model: Model, inputs: list[Channel], body: SimulateIn, times: FloatArray
 ) -> Recording:
-    # The compiler comes with this import, and most requests never need it.
-    from sysid.simulation.simulate import simulate as outputs_of
+    # This import loads the compiler, which most requests never need.
+    from sysid.simulation.simulate import simulate as simulate_model
 
-    rest = {
+    initial_values = {
         f"{state.name}(0)": 0.0
         for state, start in zip(model.states, model.initial, strict=True)
         if not isinstance(start, FixedInitial)
     }
-    values = {**rest, **body.parameters}
-    outputs = outputs_of(model, inputs, values, times=times).channels
+    values = {**initial_values, **body.parameters}
+    outputs = simulate_model(model, inputs, values, times=times).channels
     check_finite_outputs(outputs, times)
     recording = Recording((*inputs, *outputs))
     if body.noise.sigma == 0:
@@ -167,48 +169,52 @@ def check_finite_outputs(outputs: Sequence[Channel], times: FloatArray) -> None:
         With the output and the time.
     """
     for channel in outputs:
-        wrong = np.flatnonzero(~np.isfinite(channel.values))
-        if wrong.size:
+        invalid = np.flatnonzero(~np.isfinite(channel.values))
+        if invalid.size:
             raise InvalidRequest.from_fault(
                 "/parameters",
                 f"with these values output {channel.name!r} diverges at "
-                f"t = {times[wrong[0]]:g} s; choose others, or a smaller sample_time",
+                f"t = {times[invalid[0]]:g} s; choose other values, or a smaller sample_time",
             )
 
 
 def check_given_delays(model: Model, values: Mapping[str, float]) -> None:
-    """Refuse given values at which a lag would reach into the future.
+    """Refuse values at which a delay would be negative and read the future.
 
     Raises
     ------
     InvalidRequest
-        Naming the parameter.
+        With the name of the parameter.
     """
     for parameter in model.parameters:
         value = values.get(parameter.name)
         if value is None:
             continue
-        # Only this one leaves its bounds: inside them the model's own lags are known to be past.
+        # Only this parameter leaves its bounds. Inside them all delays of the model are valid.
         low, high = min(value, parameter.lower), max(value, parameter.upper)
         wide = replace(parameter, lower=low, upper=high, fixed=None, tied=None, scale="linear")
         others = [wide if p is parameter else p for p in model.parameters]
         try:
             check_delays(model, others)
         except InvalidSettings as error:
-            at = f"/parameters/{parameter.name}"
+            pointer = f"/parameters/{parameter.name}"
             detail = error.detail.removeprefix("inside these bounds ")
-            raise InvalidRequest.from_fault(at, f"found {value:g}; with it {detail}") from None
+            raise InvalidRequest.from_fault(pointer, f"found {value:g}; with it {detail}") from None
 
 
 def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldError]:
-    # A start that the model does not fix, or another than its own, is given as `x(0)`.
-    known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
+    # `x(0)` sets or replaces the initial value of a state.
+    valid_names = [
+        *(p.name for p in model.parameters),
+        *(f"{state.name}(0)" for state in model.states),
+    ]
     faults = [
         FieldError(
-            f"/parameters/{name}", f"the model has no parameter {name!r}{suggest_name(name, known)}"
+            f"/parameters/{name}",
+            f"the model has no parameter {name!r}{suggest_name(name, valid_names)}",
         )
         for name in values
-        if name not in known
+        if name not in valid_names
     ]
     missing = [p for p in model.parameters if p.is_free and p.name not in values]
     return faults + [
@@ -218,17 +224,19 @@ def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> list[Fi
 
 
 def _find_input_faults(model: Model, inputs: Mapping[str, InputIn]) -> list[FieldError]:
-    known = [one.name for one in model.inputs]
+    valid_names = [quantity.name for quantity in model.inputs]
     faults = [
-        FieldError(f"/inputs/{name}", f"the model has no input {name!r}{suggest_name(name, known)}")
+        FieldError(
+            f"/inputs/{name}", f"the model has no input {name!r}{suggest_name(name, valid_names)}"
+        )
         for name in inputs
-        if name not in known
+        if name not in valid_names
     ]
     return faults + [
         FieldError(
             f"/inputs/{name}",
             f'give input {name!r}, such as {{"kind": "cosine", "amplitude": 1, "frequency": 0.5}}',
         )
-        for name in known
+        for name in valid_names
         if name not in inputs
     ]

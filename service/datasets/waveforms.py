@@ -1,4 +1,4 @@
-"""Signals that a request describes: waves, steps, random binary signals, expressions, records."""
+"""Signals described in a request: waves, steps, random binary signals, expressions, records."""
 
 from dataclasses import replace
 from math import pi
@@ -30,20 +30,19 @@ from sysid.language.evaluation import evaluate_signal
 from sysid.language.scope import Scope
 
 MAX_DRAWS = 10_000_000
-"""Values of one random binary signal at most."""
+"""Maximum number of values of one random binary signal."""
 
-_BEFORE_START = (
-    1e-9  # of a sampling period: how long before the start a step shows where it comes from
-)
+_BEFORE_START = 1e-9
+"""Time before the start at which a step has its offset, in sampling periods."""
 
 
 class InputSignals:
-    """Values of inputs at given times; remembers the datasets they came from.
+    """Samples inputs at given times; records the datasets that they come from.
 
     Parameters
     ----------
     times : FloatArray, shape (N,)
-        In s.
+        Times in s.
     """
 
     def __init__(self, session: Session, store: ObjectStore, times: FloatArray) -> None:
@@ -51,7 +50,7 @@ class InputSignals:
         self._session, self._store, self._times = session, store, times
 
     def evaluate_input(self, pointer: str, signal: InputIn) -> FloatArray:
-        """Values of one input, which stands at `pointer` in the request.
+        """Evaluate one input, which is at `pointer` in the request.
 
         Raises
         ------
@@ -76,16 +75,16 @@ class InputSignals:
                 return interpolate_channel(self._load_recorded(pointer, signal), t)
 
     def build_channel(self, pointer: str, name: str, unit: str, signal: RunInputIn) -> Channel:
-        """One input with what it does between its samples; before a step it has its offset.
+        """Build one input with its behaviour between samples; a step has its offset before.
 
         Raises
         ------
         InvalidRequest, InvalidRecord
-            As `of`; if a step lies before the start, or given times decrease.
+            As `evaluate_input`. Also if a step is outside the simulation, or times decrease.
         """
         match signal:
             case SeriesInput():
-                times, values = (np.array(one) for one in (signal.times, signal.values))
+                times, values = (np.array(series) for series in (signal.times, signal.values))
                 return Channel(name, times, values, unit, signal.hold)
             case DatasetInput():
                 return self._convert_recorded(pointer, name, unit, signal)
@@ -95,17 +94,17 @@ class InputSignals:
                 return self.sample_input(pointer, name, unit, signal)
 
     def sample_input(self, pointer: str, name: str, unit: str, signal: InputIn) -> Channel:
-        """One input at the given times, with what it does between them.
+        """Sample one input at the given times, with its behaviour between them.
 
         Raises
         ------
         InvalidRequest, InvalidRecord
-            As `of`; if a recorded channel is in a unit that is not the input's.
+            As `evaluate_input`. Also if the unit of a recorded channel cannot be converted.
         """
         if isinstance(signal, DatasetInput):
-            found = self._convert_recorded(pointer, name, unit, signal)
-            values = interpolate_channel(found, self._times)
-            return replace(found, times=self._times, values=values, history=None)
+            channel = self._convert_recorded(pointer, name, unit, signal)
+            values = interpolate_channel(channel, self._times)
+            return replace(channel, times=self._times, values=values, history=None)
         return Channel(
             name, self._times, self.evaluate_input(pointer, signal), unit, choose_hold(signal)
         )
@@ -113,17 +112,19 @@ class InputSignals:
     def _convert_recorded(
         self, pointer: str, name: str, unit: str, signal: DatasetInput
     ) -> Channel:
-        """A recorded channel as an input: in its unit, where both have one."""
-        found = self._load_recorded(pointer, signal)
-        told = describe_difference(found.unit, unit)
-        times = find_conversion_factor(found.unit, unit) if told else 1.0
-        if times is None:
+        """Convert a recorded channel to the unit of the input, if both have one."""
+        channel = self._load_recorded(pointer, signal)
+        difference = describe_difference(channel.unit, unit)
+        factor = find_conversion_factor(channel.unit, unit) if difference else 1.0
+        if factor is None:
             raise InvalidRequest.from_fault(
                 f"{pointer}/channel",
-                f"channel {found.name!r} of {signal.dataset} is in {found.unit}, but "
-                f"{name!r} is in {unit}: {told}",
+                f"channel {channel.name!r} of {signal.dataset} is in {channel.unit}, but "
+                f"{name!r} is in {unit}: {difference}",
             )
-        return replace(change_values(found, lambda _, values: values * times), name=name, unit=unit)
+        return replace(
+            change_values(channel, lambda _, values: values * factor), name=name, unit=unit
+        )
 
     def _build_step(self, pointer: str, name: str, unit: str, signal: StepInput) -> Channel:
         start, stop = float(self._times[0]), float(self._times[-1])
@@ -132,7 +133,7 @@ class InputSignals:
                 f"{pointer}/time",
                 f"{signal.time:g} s is outside the simulation, from {start:g} to {stop:g} s",
             )
-        # States start where the first input does: at the start, not a sample before it.
+        # States start with the first input: at the start, not a sample before it.
         before = start - _BEFORE_START * float(self._times[1] - self._times[0])
         later = signal.offset + signal.amplitude
         times = np.array([before, signal.time, stop])
@@ -150,22 +151,25 @@ class InputSignals:
 
 
 def choose_hold(signal: RunInputIn) -> Hold:
-    """What a signal that is laid on samples does between them: one that jumps is held."""
+    """Choose the hold of a sampled signal: a signal that jumps is held."""
     return "zero" if isinstance(signal, StepInput | BinaryInput) else "first"
 
 
 def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
-    """Values of a channel at other times, in its history too; of a held one, those after jumps."""
+    """Interpolate a channel and its history at other times.
+
+    A held channel has the value after a jump at the time of the jump.
+    """
     channel = replace(channel, history=trim_missing_history(channel.history)).history_and_samples
     if channel.hold != "zero":
         return np.interp(times, channel.times, channel.values)
     last = np.searchsorted(channel.times, times, side="right") - 1
-    found: FloatArray = channel.values[np.clip(last, 0, channel.times.size - 1)]
-    return found
+    values: FloatArray = channel.values[np.clip(last, 0, channel.times.size - 1)]
+    return values
 
 
 def _get_angular_frequency(wave: WaveInput) -> float:
-    """Angular frequency in rad/s."""
+    """Return the angular frequency in rad/s."""
     if wave.frequency is not None:
         return 2 * pi * wave.frequency
     return wave.omega or 0.0
@@ -176,20 +180,20 @@ def _draw_binary(pointer: str, signal: BinaryInput, times: FloatArray) -> FloatA
     if not duration / signal.period < MAX_DRAWS:
         raise InvalidRequest.from_fault(
             f"{pointer}/period",
-            f"found {signal.period:g} s, so that {duration:g} s need more than {MAX_DRAWS} "
-            f"draws; need more than {duration / MAX_DRAWS:g} s",
+            f"found {signal.period:g} s, but then {duration:g} s need more than {MAX_DRAWS} draws. "
+            f"Use a period of more than {duration / MAX_DRAWS:g} s.",
         )
-    places = (times / signal.period).astype(np.int64)
+    draw_of_sample = (times / signal.period).astype(np.int64)
     source = np.random.Generator(np.random.Philox(signal.seed))
-    draws = source.integers(0, 2, int(places[-1]) + 1)
-    return np.where(draws[places] == 1, 1.0, -1.0)
+    draws = source.integers(0, 2, int(draw_of_sample[-1]) + 1)
+    return np.where(draws[draw_of_sample] == 1, 1.0, -1.0)
 
 
 def _evaluate_expression(pointer: str, expression: str, times: FloatArray) -> FloatArray:
-    """An expression of t, k and h, as in a difference equation, at regular times (N,)."""
+    """Evaluate an expression of t, k and h, as in a difference equation, at regular times (N,)."""
     tree, faults, _ = check_expression(expression, Scope("difference"))
     if tree is None:
         raise InvalidRequest(
-            FieldError(f"{pointer}/expression", one.detail, one.column) for one in faults
+            FieldError(f"{pointer}/expression", fault.detail, fault.column) for fault in faults
         )
     return evaluate_signal(tree, times)

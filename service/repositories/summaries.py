@@ -45,7 +45,7 @@ class GroupKey:
 
 @dataclass(frozen=True, slots=True)
 class SummaryQuantity:
-    """A number of each run of which quantiles are computed."""
+    """A number of each run, for quantiles over runs."""
 
     kind: Literal[
         "rms",
@@ -203,11 +203,11 @@ def _read_quantiles(
 def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
     """Select the values on both sides of each quantile of one column, by group."""
     value = wide.c[name]
-    place = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
+    rank = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
     # The count is a window function too: SQLite would join a table of counts pair by pair.
     count = func.count().over(partition_by=wide.c.grp).label("n")
     ranked = (
-        select(wide.c.grp, value.label("value"), place, count).where(value.is_not(None)).subquery()
+        select(wide.c.grp, value.label("value"), rank, count).where(value.is_not(None)).subquery()
     )
     n = cast(ranked.c.n, Integer)
     lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES_PER_MILLE]

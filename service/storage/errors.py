@@ -113,9 +113,9 @@ class DatabaseNotAtHead(StorageError):
 
     status = 503
 
-    def __init__(self, found: str | None, head: str | None) -> None:
+    def __init__(self, current: str | None, head: str | None) -> None:
         super().__init__(
-            f"the database is at revision {found or 'none'}, but this program needs {head}; "
+            f"the database is at revision {current or 'none'}, but this program needs {head}; "
             "run `lagid db upgrade`"
         )
-        self.found, self.head = found, head
+        self.found, self.head = current, head

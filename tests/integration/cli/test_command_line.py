@@ -330,7 +330,7 @@ def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(
     assert stored["name"] == "steps"
     assert "steps" in lagid("datasets", **environment).stdout
     again = lagid("dataset", "add", data, "--name", "other", **environment)
-    assert "stored before, as 'steps'" in again.stdout
+    assert "already stored as 'steps'" in again.stdout
     job = tmp_path / "job.yaml"
     job.write_text("model: fopdt\ndatasets: [steps]\nseed: 3\n")
     done = lagid("submit", job, "--json", **environment)

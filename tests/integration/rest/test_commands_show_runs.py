@@ -245,6 +245,6 @@ def test_bytes_that_are_stored_under_another_name_are_warned_of(served: Served) 
     assert again["id"] == served.data
     assert again["name"] == "steps"
     (warning,) = again["warnings"]
-    assert "stored before, as 'steps'" in warning
+    assert "already stored as 'steps'" in warning
     assert served.client.add_dataset(recording(), "steps")["warnings"] == []
     assert served.client.dataset(served.data)["warnings"] == []

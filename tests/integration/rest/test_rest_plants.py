@@ -105,12 +105,12 @@ def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient
         (
             {**ARM, "inputs": {"P_a": {**SUPPLY["P_a"], "period": 1e-9}}},
             "/inputs/P_a/period",
-            "need more than 1.99e-07 s",
+            "Use a period of more than 1.99e-07 s",
         ),
         (
             {**ARM, "inputs": {"P_a": {**SUPPLY["P_a"], "period": 1e-300}}},
             "/inputs/P_a/period",
-            "need more than 1.99e-07 s",
+            "Use a period of more than 1.99e-07 s",
         ),
     ],
 )
