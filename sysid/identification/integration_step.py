@@ -75,7 +75,8 @@ def warn_integration_step(
     substeps = problem.model.solver.substeps
     return [
         "the integration step is too long for these estimates: with half of it "
-        f"{', '.join(shifts)}. Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
+        f"{', '.join(shifts)}. "
+        f"Give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
     ]
 
 

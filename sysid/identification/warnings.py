@@ -143,8 +143,8 @@ def _warn_early_response(problem: Problem) -> list[str]:
             messages.append(
                 f"output {unprompted[0]!r} begins to move at t = {unprompted[1]:.4g} s{where}, "
                 "before any input. If the record begins with the step itself, the estimated time "
-                "lag is wrong: the input is assumed constant before the record. Put some rows of the "
-                "input at rest before the record."
+                "lag is wrong: the input is assumed constant before the record. Put some rows "
+                "of the input at rest before the record."
             )
     return messages
 

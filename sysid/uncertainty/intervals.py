@@ -128,7 +128,8 @@ def _explain_status(
     if lacks_stderr:
         return "the output does not change with it"
     return {
-        "unidentifiable": "the data say little about it; its standard error exceeds its range",
+        "unidentifiable": "the data say little about it: its standard error is as large as "
+        "its range",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")
 
