@@ -1,1 +1,1 @@
-"""Programs that measure lagid and print a table."""
+"""Programs that measure lagid and print tables."""

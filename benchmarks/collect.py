@@ -1,8 +1,8 @@
-"""All that the programs wrote into a folder as one table: ours beside each bar, then the rest.
+"""Collect the results of benchmark programs in one table: figures with bars first.
 
-``python -m benchmarks.collect FOLDER PROGRAM…`` reads ``PROGRAM.json`` and ``PROGRAM.md`` that the
-programs wrote with ``--json`` and writes ``bench.json`` and ``bench.md``. It exits 1 where one has
-written nothing.
+``python -m benchmarks.collect FOLDER PROGRAM…`` reads ``PROGRAM.json`` and ``PROGRAM.md``, which
+the programs write with ``--json``. It writes ``bench.json`` and ``bench.md``. It exits 1 if a
+program has written nothing.
 """
 
 import argparse

@@ -1,12 +1,13 @@
-"""How good the default method's estimates and intervals are over many draws of the noise.
+"""Measure the default method's estimates and intervals over many draws of the noise.
 
-Examples 1 and 2 of the paper, measurement noise of sd 0.01. Every draw is a whole identification
-from the catalogue's bounds, with a search seed of its own. For every parameter: its root mean
-square error over the Cramér-Rao bound, its bias in standard deviations, and how often the printed
-95 % interval holds the truth. The bound is sd²(SᵀS)⁻¹ with the sensitivities S at the truth.
+Examples 1 and 2 of the paper, with measurement noise of sd 0.01. Every draw is a whole
+identification from the catalogue's bounds with its own search seed. For every parameter the
+program prints three figures: the root mean square error over the Cramér-Rao bound, the bias in
+standard deviations, and the coverage of the 95 % interval. The bound is sd²(SᵀS)⁻¹ with the
+sensitivities S at the true values.
 
-L = 0.5 s is 25 samples exactly, a knot of the interpolated past: the slopes on its two sides
-differ by 0.7 %, and S is their mean.
+L = 0.5 s is exactly 25 samples, a knot of the interpolated past. The slopes on its two sides differ
+by 0.7 %; S is their mean.
 """
 
 import argparse

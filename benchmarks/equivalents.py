@@ -1,4 +1,4 @@
-"""Models that users write, beside C written by hand for each (`benchmarks/c/equivalents.c`)."""
+"""Users' models and their equivalents in hand-written C (`benchmarks/c/equivalents.c`)."""
 
 import ctypes
 import re

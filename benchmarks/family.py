@@ -1,4 +1,4 @@
-"""The processes that a benchmark has started: their memory and CPU time, from /proc."""
+"""Memory and CPU time of the processes that a benchmark has started, from /proc."""
 
 import os
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""Speed of the compiled kernels beside C, and of what surrounds them.
+"""Compare the speed of compiled kernels with C, and measure the cost of their calls.
 
-The reference of the paper's recursion lies in the folder ``bench`` beside the measured data
-(`LAGID_DATA`); C of other models is in ``benchmarks/c``. Both are compiled here.
+The C reference of the paper's recursion is in the folder ``bench`` next to the measured data
+(`LAGID_DATA`). C code of other models is in ``benchmarks/c``. This program compiles both.
 """
 
 import importlib.util

@@ -1,4 +1,4 @@
-"""How long a user waits: a job over REST, the whole command, a model never seen."""
+"""Measure how long a user waits: a job over REST, the whole command, a new model."""
 
 import os
 import resource

@@ -1,4 +1,4 @@
-"""Processor time of storing and loading a recording as MCAP: a million samples of two channels."""
+"""Measure the CPU time to store and load MCAP: a million samples of two channels."""
 
 import sys
 import time

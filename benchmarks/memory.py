@@ -1,4 +1,4 @@
-"""Memory of the service's processes and the time of requests, during a job of many runs."""
+"""Measure the service's memory and the time of requests during a job of many runs."""
 
 import statistics
 import time

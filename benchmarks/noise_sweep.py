@@ -1,9 +1,8 @@
-"""A noise-sensitivity sweep through the service (Figure 15): from submission to stored results.
+"""Measure a noise sweep through the service (Figure 15), from submission to stored results.
 
-On a machine that others use the wall clock says little: the CPU seconds of each kind of process
-are told too, and what the sweep would take if they were dealt over two cores evenly. The share of
-that CPU time in compiled loops (search, least squares, simulations) comes from runs of the same
-kind that this program times call by call.
+On a shared machine the wall clock says little. So the program also prints the CPU seconds of each
+kind of process, and the time on two evenly loaded cores. The share of CPU time in compiled loops
+(search, least squares, simulations) comes from runs of the same kind, timed call by call.
 """
 
 import time

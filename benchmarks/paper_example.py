@@ -1,4 +1,4 @@
-"""The paper's Example 1 as the programs on speed use it: record, problem, job body."""
+"""The paper's Example 1 for the speed benchmarks: record, problem, job body."""
 
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,8 @@
-"""Other optimisers on the same records, tracked by counters of their own.
+"""Run other optimisers on the same records and count their simulations.
 
-SciPy: differential evolution, dual annealing, least squares (MINPACK) from random starts; pygmo:
-de1220, sade and CMA-ES, as `bench/peers` runs them. On the paper's examples they get a compiled
-simulation of one individual, which is faster for them than lagid's kernel of sixteen lanes.
+SciPy: differential evolution, dual annealing, and least squares (MINPACK) from random starts.
+pygmo: de1220, sade and CMA-ES, as in `bench/peers`. On the paper's examples they use a compiled
+simulation of one individual. For them it is faster than lagid's kernel of sixteen lanes.
 """
 
 import importlib.util

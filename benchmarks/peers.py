@@ -1,20 +1,20 @@
-"""CPU time until the target is hit: `improved` beside the optimisers that are installed here.
+"""Compare the CPU time to the target: `improved` and the installed optimisers.
 
-A0 and B0 are the paper's examples without noise, the others have noise of sd 0.01; A/300/1 and
-B/300/1 are the paper's, 1500 samples or a lag of up to 5 s make them harder. Target: 1.01 times the
-RMS of the record's least-squares optimum, without noise the errors of the paper's tables. Everybody
-gets the same records, 20,000 simulations and seeds of its own; compilation is excluded for all, and
-counters of this program, not of the optimisers, say when the target is hit. A search that fails
-costs its whole time: the time per hit is that of all searches over the number of hits.
+A0 and B0 are the paper's examples without noise. The others have noise of sd 0.01. A/300/1 and
+B/300/1 are the paper's; 1500 samples or a time lag of up to 5 s make them harder. The target is
+1.01 times the RMS of the record's least-squares optimum; without noise, the errors of the paper's
+tables. All optimisers get the same records and 20,000 simulations; each has its own seeds.
+Compilation is excluded. Counters of this program decide when the target is hit. A failed search
+costs its whole time: the time per hit is the time of all searches over the number of hits.
 
-lagid's time is counted in two ways. *Prorated*, as the table of `bench/peers` does it for all: the
-time of a whole search times the share of its simulations that came before the hit. *Direct*: a
-search that ends with the generation of the hit, from nothing to the run's state. Direct is more,
-since what every search does once (plans, drawing and ranking each island's first population) falls
-on few simulations, and since the other islands run that generation to its end too.
-The peers stop at the simulation that hits, so theirs is direct.
+lagid's time is counted in two ways. *Prorated*, as in the table of `bench/peers`: the time of a
+whole search times the share of its simulations before the hit. *Direct*: a search that ends with
+the generation of the hit, from the start to the run's state. Direct is longer for two reasons.
+Costs that every search has once (plans, each island's first population) fall on few simulations.
+The other islands also finish that generation. The peers stop at the simulation that hits, so their
+time is direct.
 
-Bars: the fastest peer of this run; where a record is harder, the fastest that hits in all runs.
+Bars: the fastest peer of this run. On harder records: the fastest peer that hits in all runs.
 """
 
 import argparse
@@ -109,5 +109,5 @@ def main(options: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     made = parser(__doc__ or "")
-    made.add_argument("--searches", type=int, metavar="N", help="searches of each (20)")
+    made.add_argument("--searches", type=int, metavar="N", help="searches per optimiser (20)")
     main(made.parse_args())

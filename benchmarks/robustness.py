@@ -1,20 +1,21 @@
-"""Does the search always reach the optimum? Every system many times, beside other optimisers.
+"""Measure how often the search reaches the optimum, on every system, and compare optimisers.
 
-Each search has its own noise draw and its own seed; none of them was used to develop the search.
-The method is `improved` with its defaults and a budget of 20,000 simulations. A search succeeds
-if its result lies within 0.01 % of the RMS of the least-squares optimum of its record, which SciPy
-finds from the true values or from what the search found, whichever is lower (noise-free records:
-0.01 % of the output's RMS).
+Each search has its own noise draw and seed. None of them was used to develop the search. The method
+is `improved` with its defaults and a budget of 20,000 simulations. A search succeeds if its result
+lies within 0.01 % of the RMS of the record's least-squares optimum (noise-free records: 0.01 % of
+the output's RMS). SciPy computes the optimum from the true values and from the search's result; the
+lower one counts.
 
 The target is 1.01 times the optimum's RMS (noise-free: the errors of the paper's tables).
-*Evaluations to the target* are counted twice: as the counters of the peers do, all simulations of
-one process until an individual is there (it evolves the islands one after the other, from migration
-to migration), and side by side, those of all islands up to the first generation in which one of
-them is there. CPU time *to the target* is that of a repetition that ends with this generation. The
-prorated time is that of a whole search times the share of its
-simulations that came before the target; failures cost their whole time. What follows the search
-(refinement, standard errors, tests of the residuals) is told apart. The peers stop at the target
-and refine nothing, so their time is direct.
+*Evaluations to the target* are counted in two ways. In order, as for the peers: all simulations of
+one process until an individual reaches the target. This process evolves the islands one after the
+other, from migration to migration. Side by side: the simulations of all islands up to the first
+generation in which one of them reaches the target.
+
+CPU time *to the target* is the time of a repetition that ends with this generation. The prorated
+time is the time of a whole search times the share of its simulations before the target. Failures
+cost their whole time. The time after the search (refinement, standard errors, residual tests) is
+reported separately. The peers stop at the target and refine nothing, so their time is direct.
 """
 
 from collections.abc import Iterable
@@ -162,10 +163,10 @@ def paper_rows(first: int, count: int) -> Iterable[Row]:
 def main() -> None:
     """Print the table."""
     made = parser(__doc__ or "")
-    made.add_argument("--peers", type=int, metavar="N", help="searches of each peer (20)")
-    made.add_argument("--searches", type=int, metavar="N", help="searches of each system (50)")
+    made.add_argument("--peers", type=int, metavar="N", help="searches per peer (20)")
+    made.add_argument("--searches", type=int, metavar="N", help="searches per system (50)")
     made.add_argument(
-        "--first-seed", type=int, default=FIRST_SEED, metavar="N", help="of every system"
+        "--first-seed", type=int, default=FIRST_SEED, metavar="N", help="first seed of every system"
     )
     options = made.parse_args()
     count, peers = (4, 1) if options.quick else (50, 20)

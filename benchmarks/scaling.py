@@ -1,7 +1,7 @@
-"""Two workers against one, the cost of a task and of a run, and a single run beside a sweep.
+"""Measure two workers against one, the cost of a task and a run, and a run during a sweep.
 
-The model of `docs/scaling.md` is made of these: one dispatcher's second of CPU pays for so many
-runs and packs, hence for so many workers.
+The model of `docs/scaling.md` uses these figures: how many runs and packs a CPU second of the
+dispatcher pays for, and therefore how many workers.
 """
 
 import os

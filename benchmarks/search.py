@@ -1,7 +1,7 @@
-"""Time of whole searches on the paper's Example 1: what is added to the simulations.
+"""Measure whole searches on the paper's Example 1: the time in addition to simulations.
 
-Where the C reference is at hand (see `benchmarks/kernels.py`) figures are ratios to it, measured
-in the same run.
+If the C reference is available (see `benchmarks/kernels.py`), figures are ratios to it, measured in
+the same run.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""One search of lagid beside the least-squares optimum of its record, in numbers."""
+"""Run one search of lagid and compare it with the least-squares optimum of its record."""
 
 import time
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
-"""Silverbox (measured, 65,062 samples): the whole estimation through the service.
+"""Measure the estimation of Silverbox (measured, 65,062 samples) through the service.
 
-Six parameters from the catalogue's bounds, the default algorithm, two cores; from the submission
-to the stored result. Standard errors and validation on the three test parts are in it.
+Six parameters from the catalogue's bounds, the default algorithm, two cores. The time is from the
+submission to the stored result. It includes standard errors and validation on the three test parts.
 """
 
 import argparse

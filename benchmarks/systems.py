@@ -1,7 +1,7 @@
-"""Identification problems whose true parameters are known: the paper's, harder versions, others.
+"""Identification problems with true parameters: the paper's, harder versions, others.
 
-The harder versions have five times the samples, five times the range of the lag, or both. With
-them the paper's examples stay what they are (300 samples, lag up to 1 s).
+The harder versions have five times the samples, five times the range of the time lag, or both. The
+paper's examples are unchanged (300 samples, time lag up to 1 s).
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""What every benchmark program shares: rows measured against a bar, a table, JSON, `--check`."""
+"""Shared parts of the benchmark programs: figures with bars, a table, JSON, `--check`."""
 
 import argparse
 import json
@@ -44,7 +44,7 @@ def parser(description: str) -> argparse.ArgumentParser:
     made.add_argument(
         "--json", type=Path, metavar="FILE", help="write the figures as JSON, the table as FILE.md"
     )
-    made.add_argument("--check", action="store_true", help="exit 1 when a bar does not hold")
+    made.add_argument("--check", action="store_true", help="exit 1 if a bar is missed")
     return made
 
 

@@ -1,4 +1,4 @@
-"""Break a service at random for some minutes, and count what it lost, doubled or left behind."""
+"""Break a service at random for some minutes; count lost, doubled and left-over items."""
 
 import argparse
 import os
@@ -253,9 +253,11 @@ def main() -> None:
 
 def _options() -> argparse.Namespace:
     made = parser(__doc__ or "")
-    made.add_argument("--minutes", type=float, default=10.0, help="of faults, for each database")
+    made.add_argument(
+        "--minutes", type=float, default=10.0, help="duration of the faults per database"
+    )
     made.add_argument("--database", choices=("sqlite", "postgres", "both"), default="both")
-    made.add_argument("--seed", type=int, default=1, help="of the order of the faults")
+    made.add_argument("--seed", type=int, default=1, help="seed of the order of the faults")
     return made.parse_args()
 
 

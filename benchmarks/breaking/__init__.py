@@ -1,1 +1,1 @@
-"""A whole service to be broken: for `benchmarks/torture.py` and `tests/faults`."""
+"""A whole service and its faults, for `benchmarks/torture.py` and `tests/faults`."""

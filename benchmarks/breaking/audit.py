@@ -1,4 +1,4 @@
-"""What became of jobs: nothing lost, nothing doubled, and the numbers of an undisturbed run."""
+"""Audit jobs after faults: nothing lost or doubled, and the numbers of an undisturbed run."""
 
 import json
 from collections import Counter, defaultdict

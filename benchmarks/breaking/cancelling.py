@@ -1,6 +1,6 @@
-"""Jobs that are cancelled in every state and resumed, and runs that harm whoever computes them.
+"""Cancel and resume jobs in every state, and submit runs that harm their workers.
 
-The jobs go on while the next faults come, and end as those that nobody has disturbed.
+The jobs continue during the next faults. They must end like undisturbed jobs.
 """
 
 import time

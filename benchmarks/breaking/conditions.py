@@ -1,7 +1,7 @@
-"""Faults that last a while: no space, no Ray, a service that was stopped.
+"""Faults that last for some time: a full disk, no Ray, a stopped service.
 
-They are over when there is space, or Ray, again, and recovery counts from then; that of a restart
-from the order to stop. An upgrade is not among them: there are no earlier tables yet.
+Recovery counts from the time when space or Ray is available again. After a restart it counts from
+the order to stop. Upgrades are not tested, since there are no earlier tables yet.
 """
 
 import contextlib

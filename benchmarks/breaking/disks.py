@@ -1,4 +1,4 @@
-"""A small file system for a service's files, which can be filled and emptied again."""
+"""Small file systems for a service's files, which can be filled and emptied."""
 
 import contextlib
 import subprocess

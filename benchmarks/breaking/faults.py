@@ -1,7 +1,7 @@
-"""Faults, each as a function that breaks a standing service and tells how long it took to recover.
+"""Faults as functions: each breaks a running service and returns the recovery time.
 
-Recovered means: a result that was computed after the fault is stored, and what was broken works
-again.
+A service has recovered when the broken part works again and a result computed after the fault is
+stored.
 """
 
 import contextlib

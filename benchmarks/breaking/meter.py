@@ -1,4 +1,4 @@
-"""Whose processor time a stretch of time had: a service's, others', or nobody's."""
+"""Measure processor time over an interval: the service's, other programs', and idle time."""
 
 import threading
 from contextlib import suppress

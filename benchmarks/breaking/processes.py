@@ -1,4 +1,4 @@
-"""Which processes belong to a service: by a mark in their environment, or by their session."""
+"""Find the processes of a service by a mark in their environment or by their session."""
 
 import os
 from collections.abc import Callable

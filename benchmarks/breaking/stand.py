@@ -1,4 +1,4 @@
-"""A service in processes of its own, started anew when it ends, as an init system would."""
+"""Run a service in separate processes and restart it when it ends, like an init system."""
 
 import contextlib
 import os

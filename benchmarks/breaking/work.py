@@ -1,4 +1,4 @@
-"""Jobs that are submitted again and again, each held against an undisturbed one of its kind."""
+"""Submit jobs repeatedly and compare each with an undisturbed job of its kind."""
 
 import threading
 import time

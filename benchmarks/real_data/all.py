@@ -1,4 +1,4 @@
-"""All programs on measured records, in one service: one table, free run on the test parts."""
+"""Run all programs on measured records in one service: one table, free run on the test parts."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Hair dryer PT326 (dryer2, measured): first and second order with dead time, on the last half."""
+"""Hair dryer PT326 (dryer2, measured): first and second order, dead time, on the last half."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Pneumatic tubes of 1 to 8 m, fill (measured): repeats pooled, the lag over length."""
+"""Pneumatic tubes of 1 to 8 m, fill (measured): pooled repeats, the time lag over the length."""
 
 import csv
 from collections import defaultdict

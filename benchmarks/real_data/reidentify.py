@@ -1,4 +1,4 @@
-"""Batch re-identification of tubes through the recipe: table, trend, cold against warm starts."""
+"""Re-identify a batch of tubes by the recipe: table, trend, cold and warm starts."""
 
 import argparse
 import os

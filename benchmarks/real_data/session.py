@@ -1,4 +1,4 @@
-"""What the programs on measured records share: the folder, a service, one job over REST."""
+"""Shared parts of the programs on measured records: the folder, a service, a job over REST."""
 
 import os
 import tempfile

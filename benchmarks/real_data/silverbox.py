@@ -1,4 +1,4 @@
-"""Silverbox (measured): a Duffing oscillator with a free input lag, free run on three tests."""
+"""Silverbox (measured): a Duffing oscillator with a free input delay, free run on three tests."""
 
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,8 @@
-"""Put first on PYTHONPATH, this breaks a process from inside: its clock, its runs.
+"""Break a process from inside, its clock or its runs; must be first on PYTHONPATH.
 
-``BREAK_CLOCK`` names a file with seconds that are added to the time of day of rows;
-``BREAK_SEEDS`` lists seeds of runs that kill the worker that computes them, ``BREAK_MEMORY`` of
-runs that take all the memory they get; while the file ``BREAK_RAY`` is there, Ray does not start.
+``BREAK_CLOCK`` names a file with seconds that are added to the times of rows. ``BREAK_SEEDS`` lists
+the seeds of runs that kill their worker. ``BREAK_MEMORY`` lists the seeds of runs that take all
+available memory. While the file ``BREAK_RAY`` exists, Ray does not start.
 """
 
 import functools
