@@ -10,8 +10,8 @@ from service.figures.theme import plotly_template
 
 def strip_template(figure: Figure) -> Figure:
     """Remove the template, which a report stores once for all its figures."""
-    kept = {name: value for name, value in figure["layout"].items() if name != "template"}
-    return {"data": figure["data"], "layout": kept}
+    layout = {name: value for name, value in figure["layout"].items() if name != "template"}
+    return {"data": figure["data"], "layout": layout}
 
 
 def to_script_json(value: object) -> Markup:

@@ -69,19 +69,19 @@ def wide_grid(count: int, columns: int) -> PlotGrid:
 
 
 def add_axes(
-    figure: dict[str, Any], number: int, place: Place, x: dict[str, Any], y: dict[str, Any]
+    figure: dict[str, Any], number: int, domain: Place, x: dict[str, Any], y: dict[str, Any]
 ) -> dict[str, str]:
     """Add the axes of a plot, counted from 0; return the axis names for its traces."""
     suffix = "" if number == 0 else str(number + 1)
-    across, upward = place
+    across, upward = domain
     figure["layout"][f"xaxis{suffix}"] = {"domain": across, "anchor": f"y{suffix}", **x}
     figure["layout"][f"yaxis{suffix}"] = {"domain": upward, "anchor": f"x{suffix}", **y}
     return {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}"}
 
 
-def add_caption(figure: dict[str, Any], text: str, place: Place, shift: int = 4) -> None:
+def add_caption(figure: dict[str, Any], text: str, domain: Place, shift: int = 4) -> None:
     """Write a caption above a plot, `shift` px away."""
-    across, upward = place
+    across, upward = domain
     caption: dict[str, Any] = {
         "text": text,
         "xref": "paper",

@@ -35,8 +35,8 @@ class _Band:
 
     def add_quantiles(self, sigma: float, quantiles: Sequence[float]) -> None:
         self.x.append(sigma)
-        for values, place in ((self.low, 0), (self.middle, 2), (self.high, 4)):
-            values.append(quantiles[place])
+        for values, index in ((self.low, 0), (self.middle, 2), (self.high, 4)):
+            values.append(quantiles[index])
 
 
 @dataclass(slots=True)
@@ -69,9 +69,9 @@ def plot_noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure
         "data": [],
         "layout": base_layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
-    told: set[str] = set()
+    in_legend: set[str] = set()
     for number, panel in enumerate(panels):
-        _add_panel(figure, number, panel, grid.place(number), unit, told)
+        _add_panel(figure, number, panel, grid.place(number), unit, in_legend)
     return figure
 
 
@@ -92,24 +92,33 @@ def _build_panels(summary: SummaryOut, unit: str) -> list[_Panel]:
             _get_band(response, name).add_quantiles(group.sigma, group.rms_noise_free)
         if group.rms_floor is not None:
             response.floor[group.sigma] = group.rms_floor
-        for one in group.parameters:
+        for parameter in group.parameters:
             _add_parameter_error(
-                panels.setdefault(one.name, _parameter_panel(one)), name, group.sigma, one
+                panels.setdefault(parameter.name, _parameter_panel(parameter)),
+                name,
+                group.sigma,
+                parameter,
             )
-    return [one for one in panels.values() if one.bands]
+    return [panel for panel in panels.values() if panel.bands]
 
 
-def _add_parameter_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut) -> None:
-    if one.error is not None:
-        _get_band(panel, name).add_quantiles(sigma, one.error)
-    if one.floor is not None:
-        panel.floor[sigma] = one.floor
+def _add_parameter_error(
+    panel: _Panel, name: str, sigma: float, parameter: ParameterSummaryOut
+) -> None:
+    if parameter.error is not None:
+        _get_band(panel, name).add_quantiles(sigma, parameter.error)
+    if parameter.floor is not None:
+        panel.floor[sigma] = parameter.floor
 
 
-def _parameter_panel(one: ParameterSummaryOut) -> _Panel:
-    suffix = bracket_unit(one.unit)
-    known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
-    return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
+def _parameter_panel(parameter: ParameterSummaryOut) -> _Panel:
+    suffix = bracket_unit(parameter.unit)
+    reference = (
+        "" if parameter.reference is None else f" − {parameter.reference:.6g}".replace("−-", "+")
+    )
+    return _Panel(
+        f"<b>{parameter.name}</b>{reference}", f"error of {parameter.name}{suffix}", is_signed=True
+    )
 
 
 def _get_band(panel: _Panel, name: str) -> _Band:
@@ -138,13 +147,13 @@ def _line_style(name: str, number: int) -> dict[str, Any]:
 
 
 def _add_panel(
-    figure: Figure, number: int, panel: _Panel, place: Place, unit: str, told: set[str]
+    figure: Figure, number: int, panel: _Panel, domain: Place, unit: str, in_legend: set[str]
 ) -> None:
     small = {"size": 11}
     at = add_axes(
         figure,
         number,
-        place,
+        domain,
         {
             "rangemode": "tozero",
             "nticks": 7,
@@ -159,14 +168,14 @@ def _add_panel(
         },
     )
     for place_in_order, (name, band) in enumerate(panel.bands.items()):
-        first = name not in told
-        told.add(name)
+        first = name not in in_legend
+        in_legend.add(name)
         label = name if number == 0 else f"{panel.title}: {name}"
         figure["data"] += _band_traces(
             band, label, name, _line_style(name, place_in_order), at, first
         )
-    figure["data"] += _floor_traces(panel, at, told)
-    add_caption(figure, panel.caption, place)
+    figure["data"] += _floor_traces(panel, at, in_legend)
+    add_caption(figure, panel.caption, domain)
 
 
 def _band_traces(
@@ -208,7 +217,7 @@ def _band_traces(
     ]
 
 
-def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
+def _floor_traces(panel: _Panel, at: dict[str, str], in_legend: set[str]) -> list[dict[str, Any]]:
     """Draw the Cramér–Rao bound: for parameters, the 5 and 95 % quantiles that it implies."""
     x = sorted(panel.floor)
     if not x:
@@ -223,13 +232,13 @@ def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dic
                 "mode": "lines",
                 "name": name,
                 "legendgroup": name,
-                "showlegend": name not in told,
+                "showlegend": name not in in_legend,
                 "x": to_json_numbers(x),
-                "y": to_json_numbers(sign * panel.floor[one] for one in x),
+                "y": to_json_numbers(sign * panel.floor[sigma] for sigma in x),
                 "line": dict(_FLOOR_STYLE),
                 **at,
                 "hovertemplate": "bound, σ %{x:.4g}: %{y:.4g}<extra></extra>",
             }
         )
-        told.add(name)
+        in_legend.add(name)
     return lines

@@ -37,7 +37,7 @@ def to_json_numbers(values: Iterable[float]) -> list[float | None]:
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-def base_layout(height: int, **more: Any) -> dict[str, Any]:
+def base_layout(height: int, **options: Any) -> dict[str, Any]:
     """Build the layout that all figures share; `uirevision` keeps a zoom during live updates."""
     shared: dict[str, Any] = {
         "height": height,
@@ -47,7 +47,7 @@ def base_layout(height: int, **more: Any) -> dict[str, Any]:
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0, "xanchor": "left"},
         "template": theme.plotly_template("light"),
     }
-    return {**shared, **more}
+    return {**shared, **options}
 
 
 def empty_figure() -> Figure:
@@ -223,24 +223,24 @@ def _last_abscissa(run: RunFigureData, abscissa: Abscissa) -> int:
 def _step_points(
     points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
 ) -> tuple[list[int], Any]:
-    kept = [points[i] for i in stride_indices(len(points), 990)]
-    ahead = [end] if _abscissa_value(kept[-1], abscissa) < end else []
-    return [*(_abscissa_value(p, abscissa) for p in kept), *ahead], [
-        *kept,
-        *([kept[-1]] if ahead else []),
+    thinned = [points[i] for i in stride_indices(len(points), 990)]
+    ahead = [end] if _abscissa_value(thinned[-1], abscissa) < end else []
+    return [*(_abscissa_value(p, abscissa) for p in thinned), *ahead], [
+        *thinned,
+        *([thinned[-1]] if ahead else []),
     ]
 
 
 def _island_line(
     number: int, points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
 ) -> dict[str, Any]:
-    x, kept = _step_points(points, abscissa, end)
+    x, thinned = _step_points(points, abscissa, end)
     return {
         "type": "scatter",
         "mode": "lines",
         "name": f"island {number + 1}",
         "x": x,
-        "y": to_json_numbers(p.rms for p in kept),
+        "y": to_json_numbers(p.rms for p in thinned),
         "line": {**theme.series_style(number), "shape": "hv"},
         "hovertemplate": f"island {number + 1}<br>%{{x}} {abscissa}: %{{y:.5g}}<extra></extra>",
     }
@@ -249,28 +249,28 @@ def _island_line(
 def _phase_markers(run: RunFigureData, abscissa: Abscissa) -> list[dict[str, Any]]:
     markers = []
     for phase, (name, symbol) in _PHASE_MARKERS.items():
-        found = [
+        marked = [
             (number, point)
             for number, points in enumerate(run.history)
             for point in points
             if point.phase == phase
         ]
-        if not found:
+        if not marked:
             continue
-        found = [found[i] for i in stride_indices(len(found))]
+        marked = [marked[i] for i in stride_indices(len(marked))]
         markers.append(
             {
                 "type": "scatter",
                 "mode": "markers",
                 "name": name,
-                "x": [_abscissa_value(p, abscissa) for _, p in found],
-                "y": to_json_numbers(p.rms for _, p in found),
+                "x": [_abscissa_value(p, abscissa) for _, p in marked],
+                "y": to_json_numbers(p.rms for _, p in marked),
                 "marker": {
                     "symbol": symbol,
                     "size": 10 if phase == "refinement" else 6,
-                    "color": [theme.series_style(i)["color"] for i, _ in found],
+                    "color": [theme.series_style(i)["color"] for i, _ in marked],
                 },
-                "text": [f"island {i + 1}" for i, _ in found],
+                "text": [f"island {i + 1}" for i, _ in marked],
                 "hovertemplate": f"{name}, %{{text}}<br>%{{x}}: %{{y:.5g}}<extra></extra>",
             }
         )
@@ -312,12 +312,12 @@ def _final_fitness(island: tuple[float, float | None]) -> float:
 
 
 def _add_parameter_plot(
-    figure: Figure, run: RunFigureData, number: int, parameter: FreeParameter, place: Place
+    figure: Figure, run: RunFigureData, number: int, parameter: FreeParameter, domain: Place
 ) -> None:
     at = add_axes(
         figure,
         number,
-        place,
+        domain,
         {
             "rangemode": "tozero",
             "nticks": 5,
@@ -328,8 +328,8 @@ def _add_parameter_plot(
     end = _last_abscissa(run, "generations")
     for island, points in enumerate(run.history):
         if points:
-            x, kept = _step_points(points, "generations", end)
-            y: Floats = np.array([p.parameters[number] for p in kept], dtype=np.float64)
+            x, thinned = _step_points(points, "generations", end)
+            y: Floats = np.array([p.parameters[number] for p in thinned], dtype=np.float64)
             figure["data"].append(
                 {
                     "type": "scatter",
@@ -346,7 +346,7 @@ def _add_parameter_plot(
     figure["layout"]["shapes"] += [
         _bound_line(bound, at) for bound in (parameter.lower, parameter.upper)
     ]
-    add_caption(figure, _parameter_caption(parameter), place)
+    add_caption(figure, _parameter_caption(parameter), domain)
 
 
 def _bounds_axis(parameter: FreeParameter) -> dict[str, Any]:

@@ -24,40 +24,40 @@ def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int
             grid.n_rows * _ROW_PX, showlegend=False, shapes=[], margin={**MARGIN, "b": 44}
         ),
     }
-    for number, one in enumerate(profiles):
+    for number, profile in enumerate(profiles):
         is_first = number % grid.n_columns == 0
         at = add_axes(
             figure,
             number,
             grid.place(number),
-            {"title": {"text": append_unit(one.name, one.unit)}, "nticks": 6},
+            {"title": {"text": append_unit(profile.name, profile.unit)}, "nticks": 6},
             {
                 "nticks": 5,
                 "range": [0, _MAX_THRESHOLDS * threshold],
                 **({"title": {"text": "likelihood ratio"}} if is_first else {}),
             },
         )
-        figure["data"].append(_profile_trace(one, at))
-        figure["layout"]["shapes"] += _threshold_shapes(one, at, threshold)
+        figure["data"].append(_profile_trace(profile, at))
+        figure["layout"]["shapes"] += _threshold_shapes(profile, at, threshold)
     return figure
 
 
-def _profile_trace(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
+def _profile_trace(profile: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
     return {
         "type": "scatter",
         "mode": "lines+markers",
-        "name": one.name,
-        "x": one.values,
-        "y": one.ratio,
+        "name": profile.name,
+        "x": profile.values,
+        "y": profile.ratio,
         **at,
         "line": {"color": theme.BLUE, "width": 1.5},
         "marker": {"color": theme.BLUE, "size": 4},
-        "hovertemplate": f"{one.name} = %{{x:.6g}}: %{{y:.3g}}<extra></extra>",
+        "hovertemplate": f"{profile.name} = %{{x:.6g}}: %{{y:.3g}}<extra></extra>",
     }
 
 
 def _threshold_shapes(
-    one: ProfileOut, at: dict[str, str], threshold: float
+    profile: ProfileOut, at: dict[str, str], threshold: float
 ) -> list[dict[str, Any]]:
     """Draw the threshold, and a vertical line at each end of the interval that is not open."""
     style = {"color": theme.GREY, "width": 1, "dash": "dot"}
@@ -82,7 +82,7 @@ def _threshold_shapes(
             "yref": at["yaxis"],
             "line": style,
         }
-        for end in one.interval95
+        for end in profile.interval95
         if end is not None
     ]
     return [level, *ends]

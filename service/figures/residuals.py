@@ -33,8 +33,8 @@ def plot_residuals(
             meta={"experiments": list(names)},
         ),
     }
-    for number, one in enumerate(functions):
-        _add_correlation(figure, number, one, grid.place(number))
+    for number, function in enumerate(functions):
+        _add_correlation(figure, number, function, grid.place(number))
     return figure
 
 
@@ -47,34 +47,38 @@ def residuals_height(n_functions: int, columns: int = 2) -> int:
     return _grid(n_functions, columns).height(_MARGIN)
 
 
-def _add_correlation(figure: Figure, number: int, one: CorrelationTrace, place: Place) -> None:
-    shown = one.lags != 0 if one.is_auto else np.ones(one.lags.size, dtype=bool)
-    lags, values = one.lags[shown], one.values[shown]
-    bands = one.band95[shown], one.band99[shown]
+def _add_correlation(
+    figure: Figure, number: int, correlation: CorrelationTrace, domain: Place
+) -> None:
+    shown = (
+        correlation.lags != 0 if correlation.is_auto else np.ones(correlation.lags.size, dtype=bool)
+    )
+    lags, values = correlation.lags[shown], correlation.values[shown]
+    bands = correlation.band95[shown], correlation.band99[shown]
     reach = 1.2 * max(float(np.max(np.abs(values))), float(np.max(bands[1])), 1e-12)
     edge = 0.7
     at = add_axes(
         figure,
         number,
-        place,
+        domain,
         {
             "nticks": 7,
             "showgrid": False,
             "range": [float(lags[0]) - edge, float(lags[-1]) + edge],
             "zeroline": False,
-            "title": {"text": _lag_title(one), "font": {"size": 11}, "standoff": 4},
+            "title": {"text": _lag_title(correlation), "font": {"size": 11}, "standoff": 4},
         },
         {"nticks": 5, "range": [-reach, reach]},
     )
     figure["data"] += _band_traces(lags, bands, at, first=number == 0)
-    figure["data"].append(_correlation_bars(one, lags, values, bands[1], at))
-    add_caption(figure, one.title, place, shift=3)
+    figure["data"].append(_correlation_bars(correlation, lags, values, bands[1], at))
+    add_caption(figure, correlation.title, domain, shift=3)
 
 
-def _lag_title(one: CorrelationTrace) -> str:
-    if one.period is None:
+def _lag_title(correlation: CorrelationTrace) -> str:
+    if correlation.period is None:
         return "lag [samples]"
-    return f"lag [samples of {one.period:.4g} s]"
+    return f"lag [samples of {correlation.period:.4g} s]"
 
 
 def _band_traces(
@@ -114,12 +118,12 @@ def _band_traces(
 
 
 def _correlation_bars(
-    one: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, at: dict[str, str]
+    correlation: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, at: dict[str, str]
 ) -> dict[str, Any]:
     outside = np.abs(values) > band99
     return {
         "type": "bar",
-        "name": one.title.partition("<br>")[0],
+        "name": correlation.title.partition("<br>")[0],
         "x": to_json_numbers(lags),
         "y": to_json_numbers(values),
         **at,

@@ -38,8 +38,8 @@ def plot_response(
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
         span = window_slice(signal.times, start, stop)
         figure["data"].append(signal_line(signal, span, f"y{number}", theme.GREEN, legend=True))
-        known = _recent_history(signal, _HISTORY_FRACTION * _record_duration(experiment))
-        figure["data"] += _history_traces(known, start, stop, f"y{number}", theme.GREEN)
+        history = _recent_history(signal, _HISTORY_FRACTION * _record_duration(experiment))
+        figure["data"] += _history_traces(history, start, stop, f"y{number}", theme.GREEN)
         name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
     figure["layout"].update(_validation_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
@@ -123,7 +123,7 @@ def _output_traces(
     output: OutputTraces, span: slice, axis: str, in_legend: bool
 ) -> list[dict[str, Any]]:
     times, values = output.measured.times[span], output.measured.values[span]
-    kept = thin_indices(values, MAX_POINTS)
+    shown = thin_indices(values, MAX_POINTS)
     identified = output.identified[span]
     also = thin_indices(identified, MAX_POINTS)
     shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
@@ -131,9 +131,9 @@ def _output_traces(
         {
             **shared,
             "name": "measured",
-            "x": to_json_numbers(times[kept]),
-            "y": to_json_numbers(values[kept]),
-            **_measured_style(times, kept.size),
+            "x": to_json_numbers(times[shown]),
+            "y": to_json_numbers(values[shown]),
+            **_measured_style(times, shown.size),
             "hovertemplate": "%{y:.6g}<extra>measured</extra>",
         },
         {
@@ -161,15 +161,15 @@ def _residual_trace(
 ) -> dict[str, Any]:
     times = output.measured.times[span]
     values = output.measured.values[span] - output.identified[span]
-    kept = thin_indices(values, MAX_POINTS)
+    shown = thin_indices(values, MAX_POINTS)
     return {
         "type": "scatter",
         "mode": "lines",
         "name": "residual",
         "yaxis": axis_id(axis),
         "showlegend": in_legend,
-        "x": to_json_numbers(times[kept]),
-        "y": to_json_numbers(values[kept]),
+        "x": to_json_numbers(times[shown]),
+        "y": to_json_numbers(values[shown]),
         "line": {"color": theme.VERMILLION, "width": 1},
         "hovertemplate": "%{y:.4g}<extra>residual</extra>",
     }
@@ -180,22 +180,22 @@ def signal_line(
 ) -> dict[str, Any]:
     """Draw a signal as one line of a stack, thinned to what a screen shows."""
     times, values = signal.times[span], signal.values[span]
-    kept = thin_indices(values, MAX_POINTS)
+    shown = thin_indices(values, MAX_POINTS)
     return {
         "type": "scatter",
         "mode": "lines",
         "name": signal.name,
         "yaxis": axis_id(axis),
         "showlegend": legend,
-        "x": to_json_numbers(times[kept]),
-        "y": to_json_numbers(values[kept]),
+        "x": to_json_numbers(times[shown]),
+        "y": to_json_numbers(values[shown]),
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
     }
 
 
 def _record_duration(experiment: ExperimentTraces) -> float:
-    return max((float(np.ptp(one.measured.times)) for one in experiment.outputs), default=0.0)
+    return max((float(np.ptp(output.measured.times)) for output in experiment.outputs), default=0.0)
 
 
 def _recent_history(signal: SignalTrace, seconds: float) -> SignalTrace | None:
@@ -218,8 +218,8 @@ def _history_traces(
     )
     label = f"{history.name}, before the record"
     look = {**drawn["line"], "dash": "dot"}
-    told = f"%{{y:.6g}}<extra>{label}</extra>"
-    return [{**drawn, "name": label, "line": look, "hovertemplate": told}]
+    hover_text = f"%{{y:.6g}}<extra>{label}</extra>"
+    return [{**drawn, "name": label, "line": look, "hovertemplate": hover_text}]
 
 
 def _validation_shading(experiment: ExperimentTraces) -> dict[str, Any]:

@@ -18,7 +18,7 @@ _WHOLE_SPAN = slice(None)
 _LINE_STYLE = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
 
 
-def plot_simulation(found: RunSimulationOut, step_time: float | None = None) -> Figure:
+def plot_simulation(simulation: RunSimulationOut, step_time: float | None = None) -> Figure:
     """Draw outputs over time with the reference and the settling band, then the inputs.
 
     Parameters
@@ -26,50 +26,57 @@ def plot_simulation(found: RunSimulationOut, step_time: float | None = None) -> 
     step_time : float, optional
         Time (s) of the reference's step; the settling time counts from it.
     """
-    below = list(found.inputs)
-    if found.command is not None and _command_differs(found, found.command):
-        below.append(found.command)
-    figure = stack_plots([_OUTPUT_PX] * len(found.outputs) + [_INPUT_PX] * len(below))
-    controlled = found.metrics.output if found.metrics else None
-    for number, output in enumerate(found.outputs, 1):
-        if found.reference is not None and controlled in (None, output.name):
-            figure["data"].append(_signal_trace(found.reference, number, theme.GREY, dash="dash"))
+    below = list(simulation.inputs)
+    if simulation.command is not None and _command_differs(simulation, simulation.command):
+        below.append(simulation.command)
+    figure = stack_plots([_OUTPUT_PX] * len(simulation.outputs) + [_INPUT_PX] * len(below))
+    controlled = simulation.metrics.output if simulation.metrics else None
+    for number, output in enumerate(simulation.outputs, 1):
+        if simulation.reference is not None and controlled in (None, output.name):
+            figure["data"].append(
+                _signal_trace(simulation.reference, number, theme.GREY, dash="dash")
+            )
         figure["data"].append(_signal_trace(output, number, theme.BLUE))
         name_axis(figure, number, f"{output.name}{bracket_unit(output.unit)}")
-        if found.metrics is not None and output.name == controlled:
+        if simulation.metrics is not None and output.name == controlled:
             figure["layout"]["shapes"] = [
-                *_settling_shapes(found.metrics, number, step_time or 0.0)
+                *_settling_shapes(simulation.metrics, number, step_time or 0.0)
             ]
-    for number, signal in enumerate(below, len(found.outputs) + 1):
-        is_command = signal is found.command
+    for number, signal in enumerate(below, len(simulation.outputs) + 1):
+        is_command = signal is simulation.command
         colour = theme.VERMILLION if is_command else theme.GREEN
         figure["data"].append(_signal_trace(signal, number, colour))
-        if found.command is not None and signal.values == found.command.values:
-            figure["layout"].setdefault("shapes", []).extend(_limit_lines(found.controller, number))
+        if simulation.command is not None and signal.values == simulation.command.values:
+            figure["layout"].setdefault("shapes", []).extend(
+                _limit_lines(simulation.controller, number)
+            )
         name = "command" if is_command else signal.name
         name_axis(figure, number, f"{name}{bracket_unit(signal.unit)}")
     return figure
 
 
-def apply_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:
+def apply_units(simulation: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:
     """Set the units of signals for which the model declares none."""
 
-    def told(one: SeriesOut) -> SeriesOut:
-        return one.model_copy(update={"unit": units.get(one.name, one.unit)})
+    def with_unit(series: SeriesOut) -> SeriesOut:
+        return series.model_copy(update={"unit": units.get(series.name, series.unit)})
 
     changes: dict[str, Any] = {
-        "outputs": [told(one) for one in found.outputs],
-        "inputs": [told(one) for one in found.inputs],
+        "outputs": [with_unit(output) for output in simulation.outputs],
+        "inputs": [with_unit(signal) for signal in simulation.inputs],
     }
-    if found.metrics is not None:
-        unit = units.get(found.metrics.output, found.metrics.unit)
-        changes["metrics"] = found.metrics.model_copy(update={"unit": unit})
-    return found.model_copy(update=changes)
+    if simulation.metrics is not None:
+        unit = units.get(simulation.metrics.output, simulation.metrics.unit)
+        changes["metrics"] = simulation.metrics.model_copy(update={"unit": unit})
+    return simulation.model_copy(update=changes)
 
 
-def _command_differs(found: RunSimulationOut, command: SeriesOut) -> bool:
+def _command_differs(simulation: RunSimulationOut, command: SeriesOut) -> bool:
     """Whether the command differs from all inputs, as with a transport between them."""
-    return all(one.values != command.values or one.times != command.times for one in found.inputs)
+    return all(
+        signal.values != command.values or signal.times != command.times
+        for signal in simulation.inputs
+    )
 
 
 def _signal_trace(

@@ -85,8 +85,10 @@ class SvgAxis:
         """Compute the position (px) of a value; None if it has none."""
         if value is None or not isfinite(value) or (self.is_log and value <= 0):
             return None
-        place = log10(value) if self.is_log else value
-        return self.start + (place - self.low) / (self.high - self.low) * (self.stop - self.start)
+        position = log10(value) if self.is_log else value
+        return self.start + (position - self.low) / (self.high - self.low) * (
+            self.stop - self.start
+        )
 
     def fraction_to_pixel(self, part: float) -> float:
         """Compute the position (px) of a fraction of the axis, from 0 to 1."""
@@ -96,9 +98,9 @@ class SvgAxis:
         """Yield positions (px) and labels of the ticks inside the range."""
         decades = self.is_log and self.high - self.low >= 1
         for value in _decade_ticks(self) if decades else _round_ticks(self):
-            place = self.to_pixel(value)
-            if place is not None:
-                yield place, format_tick(value)
+            position = self.to_pixel(value)
+            if position is not None:
+                yield position, format_tick(value)
 
 
 def build_axes(
@@ -112,7 +114,7 @@ def build_axes(
         Edges (px) of the area that the axes share.
     """
     left, right, top, bottom = box
-    found = {}
+    axes = {}
     for key, layout in figure["layout"].items():
         kind, _, number = key.partition("axis")
         if kind not in ("x", "y") or "axis" not in key:
@@ -122,7 +124,7 @@ def build_axes(
         edges = (left, right) if kind == "x" else (bottom, top)
         is_log = layout.get("type") == "log"
         low, high = _axis_range(figure, name, layout, is_log)
-        found[name] = SvgAxis(
+        axes[name] = SvgAxis(
             name=name,
             title=str((layout.get("title") or {}).get("text", "")),
             is_log=is_log,
@@ -132,7 +134,7 @@ def build_axes(
             stop=edges[0] + last * (edges[1] - edges[0]),
             n_ticks=layout.get("nticks", 7),
         )
-    return found
+    return axes
 
 
 def format_tick(value: float) -> str:
@@ -202,10 +204,10 @@ def _axis_values(
 
 def _trace_extents(trace: PlotlyTrace, kind: str) -> Iterator[float]:
     errors = (trace.get("error_y") or {}).get("array") if kind == "y" else None
-    for place, value in enumerate(trace[kind]):
+    for index, value in enumerate(trace[kind]):
         if value is None or not isfinite(value):
             continue
-        reach = (errors[place] or 0.0) if errors else 0.0
+        reach = (errors[index] or 0.0) if errors else 0.0
         yield value - reach
         yield value + reach
     if kind == "y" and trace.get("type") == "bar":
@@ -223,7 +225,7 @@ def _round_ticks(axis: SvgAxis) -> Iterator[float]:
     low, high = (10**axis.low, 10**axis.high) if axis.is_log else (axis.low, axis.high)
     rough = (high - low) / max(axis.n_ticks, 1)
     power = 10.0 ** floor(log10(rough))
-    step = next(power * one for one in _TICK_STEPS if power * one >= rough * (1 - 1e-9))
+    step = next(power * factor for factor in _TICK_STEPS if power * factor >= rough * (1 - 1e-9))
     for number in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1):
         yield number * step
 
@@ -245,7 +247,7 @@ _TAG_SPANS = {
 
 def is_drawable(figure: Figure) -> bool:
     """Whether the figure has only lines, points and bands."""
-    return bool(figure["data"]) and all(one["type"] == "scatter" for one in figure["data"])
+    return bool(figure["data"]) and all(trace["type"] == "scatter" for trace in figure["data"])
 
 
 def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
@@ -261,8 +263,13 @@ def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
     legend = list(_lay_out_legend(figure, width))
     rows = 1 + max((row for _, row, _ in legend), default=-1)
     margin, height = figure["layout"]["margin"], figure["layout"]["height"]
-    more = max(rows - 1, 0) * _LEGEND_ROW_PX  # the layout has room for one row
-    box = (margin["l"], width - margin["r"], margin["t"] + more, height + more - margin["b"])
+    legend_height = max(rows - 1, 0) * _LEGEND_ROW_PX  # the layout has room for one row
+    box = (
+        margin["l"],
+        width - margin["r"],
+        margin["t"] + legend_height,
+        height + legend_height - margin["b"],
+    )
     axes = build_axes(figure, box)
     parts = [
         *_draw_grid(figure, axes),
@@ -276,7 +283,7 @@ def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
         *_draw_legend(legend),
     ]
     return Markup(
-        f'<svg class="drawn" viewBox="0 0 {width} {height + more}" role="img" '
+        f'<svg class="drawn" viewBox="0 0 {width} {height + legend_height}" role="img" '
         f'aria-label="{escape(title)}">{"".join(parts)}</svg>'
     )
 
@@ -291,18 +298,18 @@ def _draw_grid(figure: Figure, axes: Mapping[str, SvgAxis]) -> Iterator[str]:
         # If several plots share an axis, the plot that it is anchored to has its labels.
         is_below = figure["layout"][f"xaxis{x.name[1:]}"].get("anchor", "y") == y.name
         for axis in (x, y):
-            for place, label in axis.tick_positions():
-                yield _draw_tick(axis, x, y, place, label if axis is y or is_below else "")
+            for position, label in axis.tick_positions():
+                yield _draw_tick(axis, x, y, position, label if axis is y or is_below else "")
         yield (f'<path class="frame" d="M{x.start:.1f} {y.stop:.1f}V{y.start:.1f}H{x.stop:.1f}"/>')
 
 
-def _draw_tick(axis: SvgAxis, x: SvgAxis, y: SvgAxis, place: float, label: str) -> str:
+def _draw_tick(axis: SvgAxis, x: SvgAxis, y: SvgAxis, position: float, label: str) -> str:
     if axis is x:
-        line = f"M{place:.1f} {y.start:.1f}V{y.stop:.1f}"
-        at = f'x="{place:.1f}" y="{y.start + 15:.1f}" text-anchor="middle"'
+        line = f"M{position:.1f} {y.start:.1f}V{y.stop:.1f}"
+        at = f'x="{position:.1f}" y="{y.start + 15:.1f}" text-anchor="middle"'
     else:
-        line = f"M{x.start:.1f} {place:.1f}H{x.stop:.1f}"
-        at = f'x="{x.start - 6:.1f}" y="{place + 4:.1f}" text-anchor="end"'
+        line = f"M{x.start:.1f} {position:.1f}H{x.stop:.1f}"
+        at = f'x="{x.start - 6:.1f}" y="{position + 4:.1f}" text-anchor="end"'
     return f'<path class="grid" d="{line}"/><text {at}>{escape(label)}</text>'
 
 
@@ -323,20 +330,24 @@ def _draw_labels(
         if y.title:
             at = f"translate({x.start - 48:.1f} {0.5 * (y.start + y.stop):.1f}) rotate(-90)"
             yield _draw_title(y.title, f'transform="{at}"')
-    for axis in (one for name, one in axes.items() if name.startswith("x") and one.title):
+    for axis in (
+        titled_axis
+        for name, titled_axis in axes.items()
+        if name.startswith("x") and titled_axis.title
+    ):
         below = str(figure["layout"][f"xaxis{axis.name[1:]}"].get("anchor", "y"))
-        place = axes[below].start + 34
-        yield _draw_title(axis.title, f'x="{axis.fraction_to_pixel(0.5):.1f}" y="{place:.1f}"')
+        position = axes[below].start + 34
+        yield _draw_title(axis.title, f'x="{axis.fraction_to_pixel(0.5):.1f}" y="{position:.1f}"')
     left, right, top, bottom = box
-    for one in figure["layout"].get("annotations", ()):
-        x_at = left + one["x"] * (right - left)
-        if one.get("xref") != "paper":
-            x_at = axes["x"].to_pixel(one["x"]) or left
-        y_at = bottom - one["y"] * (bottom - top)
-        drop = 12 if one.get("yanchor") == "top" else -one.get("yshift", 0)
+    for annotation in figure["layout"].get("annotations", ()):
+        x_at = left + annotation["x"] * (right - left)
+        if annotation.get("xref") != "paper":
+            x_at = axes["x"].to_pixel(annotation["x"]) or left
+        y_at = bottom - annotation["y"] * (bottom - top)
+        drop = 12 if annotation.get("yanchor") == "top" else -annotation.get("yshift", 0)
         yield (
-            f'<text x="{x_at + one.get("xshift", 0):.1f}" y="{y_at + drop:.1f}">'
-            f"{to_markup(one['text'])}</text>"
+            f'<text x="{x_at + annotation.get("xshift", 0):.1f}" y="{y_at + drop:.1f}">'
+            f"{to_markup(annotation['text'])}</text>"
         )
 
 
@@ -347,21 +358,24 @@ def _draw_title(text: str, at: str) -> str:
 def _draw_shapes(
     figure: Figure, axes: Mapping[str, SvgAxis], box: tuple[float, float, float, float]
 ) -> Iterator[str]:
-    for one in figure["layout"].get("shapes", ()):
-        x = [_to_pixel(one.get("xref", "x"), one[k], axes, box[:2]) for k in ("x0", "x1")]
-        y = [_to_pixel(one.get("yref", "y"), one[k], axes, (box[3], box[2])) for k in ("y0", "y1")]
-        known = [place for place in (*x, *y) if place is not None]
-        if len(known) == 4:
-            yield _draw_shape(one, *known)
+    for shape in figure["layout"].get("shapes", ()):
+        x = [_to_pixel(shape.get("xref", "x"), shape[k], axes, box[:2]) for k in ("x0", "x1")]
+        y = [
+            _to_pixel(shape.get("yref", "y"), shape[k], axes, (box[3], box[2]))
+            for k in ("y0", "y1")
+        ]
+        positions = [position for position in (*x, *y) if position is not None]
+        if len(positions) == 4:
+            yield _draw_shape(shape, *positions)
 
 
-def _draw_shape(one: Mapping[str, Any], x0: float, x1: float, y0: float, y1: float) -> str:
-    if one["type"] == "rect":
+def _draw_shape(shape: Mapping[str, Any], x0: float, x1: float, y0: float, y1: float) -> str:
+    if shape["type"] == "rect":
         return (
             f'<rect x="{min(x0, x1):.1f}" y="{min(y0, y1):.1f}" width="{abs(x1 - x0):.1f}" '
-            f'height="{abs(y1 - y0):.1f}" fill="{one["fillcolor"]}"/>'
+            f'height="{abs(y1 - y0):.1f}" fill="{shape["fillcolor"]}"/>'
         )
-    return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" {_stroke_attributes(one["line"])}/>'
+    return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" {_stroke_attributes(shape["line"])}/>'
 
 
 def _to_pixel(
@@ -397,12 +411,12 @@ def _thin_line(
     """Compute the positions of a line, thinned for a drawing; None at a gap."""
     values = np.array([np.nan if v is None else v for v in trace["y"]], dtype=np.float64)
     whole = bool(np.isfinite(values).all())
-    kept = (
+    shown = (
         thin_indices(values, MAX_LINE_POINTS)
         if whole
         else stride_indices(values.size, MAX_LINE_POINTS)
     )
-    return [(x.to_pixel(trace["x"][i]), y.to_pixel(trace["y"][i])) for i in kept]
+    return [(x.to_pixel(trace["x"][i]), y.to_pixel(trace["y"][i])) for i in shown]
 
 
 def _path_data(places: Sequence[tuple[float | None, float | None]], trace: PlotlyTrace) -> str:
@@ -413,14 +427,14 @@ def _path_data(places: Sequence[tuple[float | None, float | None]], trace: Plotl
         if across is None or up is None:
             before = None
             continue
-        here = f"{across:.1f}", f"{up:.1f}"
-        if here == before:
+        point = f"{across:.1f}", f"{up:.1f}"
+        if point == before:
             continue
         if before is None:
-            words.append(f"M{here[0]} {here[1]}")
+            words.append(f"M{point[0]} {point[1]}")
         else:
-            words.append(f"H{here[0]}V{here[1]}" if is_held else f"L{here[0]} {here[1]}")
-        before = here
+            words.append(f"H{point[0]}V{point[1]}" if is_held else f"L{point[0]} {point[1]}")
+        before = point
     return "".join(words)
 
 
@@ -459,8 +473,8 @@ def _draw_markers(trace: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> Iterator[str]:
             yield draw_marker(shape, across, up, 0.5 * marker.get("size", 6), colour)
 
 
-def _marker_property(value: Any, place: int) -> str:
-    return str(value[place] if isinstance(value, list) else value)
+def _marker_property(value: Any, index: int) -> str:
+    return str(value[index] if isinstance(value, list) else value)
 
 
 def _stroke_attributes(line: Mapping[str, Any]) -> str:

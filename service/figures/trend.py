@@ -20,26 +20,30 @@ _EXPECTED_LABEL = "what the reference expects"
 AxisNames = dict[str, str]
 
 
-def plot_trend(found: TrendOut, columns: int = 2) -> Figure:
+def plot_trend(trend: TrendOut, columns: int = 2) -> Figure:
     """Draw estimates with error bars over x, one small plot per quantity.
 
     Each plot has the chosen law as a line in its confidence band, and the other law dotted.
     Predictions are diamonds with their intervals. Rings mark outliers and drifted estimates.
     """
-    shown = [one for one in found.quantities if any(p.value is not None for p in one.points)]
+    shown = [
+        quantity
+        for quantity in trend.quantities
+        if any(p.value is not None for p in quantity.points)
+    ]
     grid = wide_grid(len(shown), columns)
     figure: Figure = {
         "data": [],
         "layout": base_layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
-    told: set[str] = set()
-    for number, one in enumerate(shown):
-        at = _add_axes(figure, number, one, found.x, grid.place(number))
-        for trace in _quantity_traces(one):
+    in_legend: set[str] = set()
+    for number, quantity in enumerate(shown):
+        at = _add_axes(figure, number, quantity, trend.x, grid.place(number))
+        for trace in _quantity_traces(quantity):
             name = trace["legendgroup"]
-            first = name not in told and trace.get("showlegend", True)
-            label = name if first else f"{one.name}: {name}"
-            told.update({name} if first else ())
+            first = name not in in_legend and trace.get("showlegend", True)
+            label = name if first else f"{quantity.name}: {name}"
+            in_legend.update({name} if first else ())
             figure["data"].append({**trace, "name": label, "showlegend": first, **at})
     return figure
 
@@ -49,61 +53,63 @@ def trend_height(n_quantities: int, columns: int = 2) -> int:
     return wide_grid(n_quantities, columns).height(WIDE_MARGIN)
 
 
-def _add_axes(figure: Figure, number: int, one: QuantityOut, x: str, place: Place) -> AxisNames:
+def _add_axes(
+    figure: Figure, number: int, quantity: QuantityOut, x: str, domain: Place
+) -> AxisNames:
     small = {"size": 11}
     at = add_axes(
         figure,
         number,
-        place,
+        domain,
         {
             "nticks": 7,
             "rangemode": "tozero",
             "title": {"text": x, "font": small, "standoff": 4},
             **({} if number == 0 else {"matches": "x"}),
         },
-        {"nticks": 6, "title": {"text": append_unit(one.name, one.unit), "font": small}},
+        {"nticks": 6, "title": {"text": append_unit(quantity.name, quantity.unit), "font": small}},
     )
-    add_caption(figure, _law_caption(one), place)
+    add_caption(figure, _law_caption(quantity), domain)
     return at
 
 
-def _law_caption(one: QuantityOut) -> str:
-    chosen = next((law for law in one.laws if law.is_chosen), None)
+def _law_caption(quantity: QuantityOut) -> str:
+    chosen = next((law for law in quantity.laws if law.is_chosen), None)
     if chosen is None:
-        return f"<b>{one.name}</b>: no law"
-    return f"<b>{one.name}</b> = {_law_formula(chosen)}"
+        return f"<b>{quantity.name}</b>: no law"
+    return f"<b>{quantity.name}</b> = {_law_formula(chosen)}"
 
 
 def _law_formula(law: LawOut) -> str:
-    a, b = (f"{one.value:.4g}".replace("-", "−") for one in law.coefficients)
+    a, b = (f"{coefficient.value:.4g}".replace("-", "−") for coefficient in law.coefficients)
     return f"{a} + {b}·x".replace("+ −", "− ") if law.law == "line" else f"{a}·x<sup>{b}</sup>"
 
 
-def _quantity_traces(one: QuantityOut) -> list[dict[str, Any]]:
-    known = [point for point in one.points if point.value is not None]
+def _quantity_traces(quantity: QuantityOut) -> list[dict[str, Any]]:
+    estimated = [point for point in quantity.points if point.value is not None]
     return [
-        *_law_traces(one.band),
-        *_other_law_traces(one),
-        *_reference_traces(known),
-        *_prediction_traces(one.predictions),
-        *_flag_traces(known),
-        _estimate_trace(known),
+        *_law_traces(quantity.band),
+        *_other_law_traces(quantity),
+        *_reference_traces(estimated),
+        *_prediction_traces(quantity.predictions),
+        *_flag_traces(estimated),
+        _estimate_trace(estimated),
     ]
 
 
 def _scatter_trace(
-    group: str, mode: str, x: list[Any], y: list[Any], **more: Any
+    group: str, mode: str, x: list[Any], y: list[Any], **options: Any
 ) -> dict[str, Any]:
-    return {"type": "scatter", "legendgroup": group, "mode": mode, "x": x, "y": y, **more}
+    return {"type": "scatter", "legendgroup": group, "mode": mode, "x": x, "y": y, **options}
 
 
 def _law_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     if not places:
         return []
-    x = to_json_numbers(place.x for place in places)
+    x = to_json_numbers(point.x for point in places)
     edge = {"line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
     low, high, middle = (
-        _to_json_numbers([getattr(place, name) for place in places])
+        _to_json_numbers([getattr(point, name) for point in places])
         for name in ("lower", "upper", "value")
     )
     return [
@@ -120,13 +126,13 @@ def _law_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     ]
 
 
-def _other_law_traces(one: QuantityOut) -> list[dict[str, Any]]:
+def _other_law_traces(quantity: QuantityOut) -> list[dict[str, Any]]:
     """Draw the law that was not chosen, over the same range."""
-    law = next((law for law in one.laws if not law.is_chosen), None)
+    law = next((law for law in quantity.laws if not law.is_chosen), None)
     if law is None:
         return []
     a, b = (coefficient.value for coefficient in law.coefficients)
-    x = [place.x for place in one.band]
+    x = [point.x for point in quantity.band]
     y = [a + b * at if law.law == "line" else _power_law(a, b, at) for at in x]
     return [
         _scatter_trace(
@@ -144,16 +150,16 @@ def _power_law(a: float, b: float, x: float) -> float:
     return float(a * x**b) if x > 0 else float("nan")
 
 
-def _estimate_trace(known: list[PointOut]) -> dict[str, Any]:
+def _estimate_trace(points: list[PointOut]) -> dict[str, Any]:
     colour = theme.VERMILLION
     return _scatter_trace(
         _ESTIMATES_LABEL,
         "markers",
-        to_json_numbers(point.x for point in known),
-        _to_json_numbers([point.value for point in known]),
+        to_json_numbers(point.x for point in points),
+        _to_json_numbers([point.value for point in points]),
         error_y={
             "type": "data",
-            "array": _to_json_numbers([p.stderr or 0.0 for p in known]),
+            "array": _to_json_numbers([p.stderr or 0.0 for p in points]),
             "color": colour,
             "thickness": 1.4,
             "width": 4,
@@ -161,31 +167,33 @@ def _estimate_trace(known: list[PointOut]) -> dict[str, Any]:
         marker={
             "color": colour,
             "size": 7,
-            "symbol": ["circle" if p.is_used else "circle-open" for p in known],
+            "symbol": ["circle" if p.is_used else "circle-open" for p in points],
         },
-        customdata=[[f"{p.stderr:.3g}" if p.stderr else "–", len(p.runs), p.status] for p in known],
+        customdata=[
+            [f"{p.stderr:.3g}" if p.stderr else "–", len(p.runs), p.status] for p in points
+        ],
         hovertemplate="%{x:.4g}: %{y:.5g} ± %{customdata[0]}<br>%{customdata[1]} runs, "
         "%{customdata[2]}<extra></extra>",
     )
 
 
 def _prediction_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
-    known = [one for one in places if one.value is not None and one.upper is not None]
-    if not known:
+    predicted = [point for point in places if point.value is not None and point.upper is not None]
+    if not predicted:
         return []
     return [
         _scatter_trace(
             _PREDICTED_LABEL,
             "markers",
-            to_json_numbers(one.x for one in known),
-            _to_json_numbers([one.value for one in known]),
+            to_json_numbers(point.x for point in predicted),
+            _to_json_numbers([point.value for point in predicted]),
             error_y={
                 "type": "data",
                 "symmetric": True,
                 "color": theme.GREEN,
                 "thickness": 1.4,
                 "width": 6,
-                "array": _to_json_numbers([_half_width(one) for one in known]),
+                "array": _to_json_numbers([_half_width(point) for point in predicted]),
             },
             marker={"color": theme.GREEN, "size": 9, "symbol": "diamond-open"},
             hovertemplate="predicted at %{x:.4g}: %{y:.4g} ± %{error_y.array:.2g}<extra></extra>",
@@ -193,12 +201,12 @@ def _prediction_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     ]
 
 
-def _half_width(one: LawPointOut) -> float:
-    return 0.5 * ((one.upper or 0.0) - (one.lower or 0.0))
+def _half_width(point: LawPointOut) -> float:
+    return 0.5 * ((point.upper or 0.0) - (point.lower or 0.0))
 
 
-def _flag_traces(known: list[PointOut]) -> list[dict[str, Any]]:
-    flagged = [p for p in known if p.is_outlier or any(one.drifted for one in p.drifts)]
+def _flag_traces(points: list[PointOut]) -> list[dict[str, Any]]:
+    flagged = [p for p in points if p.is_outlier or any(drift.drifted for drift in p.drifts)]
     if not flagged:
         return []
     return [
@@ -218,8 +226,8 @@ def _flag_traces(known: list[PointOut]) -> list[dict[str, Any]]:
     ]
 
 
-def _reference_traces(known: list[PointOut]) -> list[dict[str, Any]]:
-    pairs = [(p.x, one.expected) for p in known for one in p.drifts]
+def _reference_traces(points: list[PointOut]) -> list[dict[str, Any]]:
+    pairs = [(p.x, drift.expected) for p in points for drift in p.drifts]
     if not pairs:
         return []
     return [

@@ -50,18 +50,20 @@ def _to_operation(
         summary=item.get("description") or item.get("summary", ""),
         parameters=tuple(
             ApiField(
-                one["name"],
-                f"{_describe_schema(one.get('schema', {}))}, {one['in']}",
-                one.get("required", False),
-                _format_default(one.get("schema", {})),
-                one.get("description", ""),
+                parameter["name"],
+                f"{_describe_schema(parameter.get('schema', {}))}, {parameter['in']}",
+                parameter.get("required", False),
+                _format_default(parameter.get("schema", {})),
+                parameter.get("description", ""),
             )
-            for one in item.get("parameters", ())
+            for parameter in item.get("parameters", ())
         ),
         media_types=tuple(content),
         body=_describe_schema(schema) if schema else "",
         fields=tuple(_iterate_fields(document, schema)),
-        answers=tuple((code, one["description"]) for code, one in item["responses"].items()),
+        answers=tuple(
+            (code, response["description"]) for code, response in item["responses"].items()
+        ),
     )
 
 
@@ -70,13 +72,13 @@ def _iterate_fields(document: Mapping[str, Any], schema: Mapping[str, Any]) -> I
     if "$ref" in schema:
         target = document["components"]["schemas"][schema["$ref"].rpartition("/")[2]]
     required = target.get("required", ())
-    for name, one in target.get("properties", {}).items():
+    for name, field in target.get("properties", {}).items():
         yield ApiField(
             name,
-            _describe_schema(one),
+            _describe_schema(field),
             name in required,
-            _format_default(one),
-            one.get("description", ""),
+            _format_default(field),
+            field.get("description", ""),
         )
 
 
@@ -85,7 +87,9 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
     if "$ref" in schema:
         return str(schema["$ref"].rpartition("/")[2])
     if "anyOf" in schema or "oneOf" in schema:
-        return " or ".join(_describe_schema(one) for one in schema.get("anyOf") or schema["oneOf"])
+        return " or ".join(
+            _describe_schema(option) for option in schema.get("anyOf") or schema["oneOf"]
+        )
     if "enum" in schema:
         return " | ".join(str(value) for value in schema["enum"])
     if "const" in schema:

@@ -57,21 +57,21 @@ def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> Gr
         return None
     error = SummaryQuantity("rms_noise_free" if SIGMA_PATH in keys else "rms")
     named = [GroupKey("axis", path) for path in keys]
-    found = get_groups(session, job, named, [error], MAX_CELLS)
-    is_cut, found = len(found) > MAX_CELLS, found[:MAX_CELLS]
-    split = len(keys) - 1 if _fits_as_columns([one.key[-1] for one in found]) else len(keys)
-    columns = _distinct_keys([one.key[split:] for one in found])
-    shares = _rank_medians(found, error)
+    groups = get_groups(session, job, named, [error], MAX_CELLS)
+    is_cut, groups = len(groups) > MAX_CELLS, groups[:MAX_CELLS]
+    split = len(keys) - 1 if _fits_as_columns([group.key[-1] for group in groups]) else len(keys)
+    columns = _distinct_keys([group.key[split:] for group in groups])
+    shares = _rank_medians(groups, error)
     cells = {
-        to_json(one.key): _to_cell_view(one, keys, error, share, chosen)
-        for one, share in zip(found, shares, strict=True)
+        to_json(group.key): _to_cell_view(group, keys, error, share, chosen)
+        for group, share in zip(groups, shares, strict=True)
     }
     rows = [
         (
             [format_value(value) for value in row],
             [cells.get(to_json((*row, *column))) for column in columns],
         )
-        for row in _distinct_keys([one.key[:split] for one in found])
+        for row in _distinct_keys([group.key[:split] for group in groups])
     ]
     return GridView(
         quantity="RMS error against the record without noise" if SIGMA_PATH in keys else "RMS",
@@ -90,7 +90,7 @@ def cell_query(cell: Mapping[str, Any]) -> str:
 
 
 def _fits_as_columns(values: Sequence[Any]) -> bool:
-    return len({to_json(one) for one in values}) <= MAX_COLUMNS
+    return len({to_json(value) for value in values}) <= MAX_COLUMNS
 
 
 def _distinct_keys(keys: Sequence[CellKey]) -> list[CellKey]:
@@ -133,14 +133,15 @@ def _has_ended_runs(group: RunGroup) -> bool:
     return any(n for state, n in group.states.items() if state.is_terminal)
 
 
-def _rank_medians(found: Sequence[RunGroup], error: SummaryQuantity) -> list[float]:
+def _rank_medians(groups: Sequence[RunGroup], error: SummaryQuantity) -> list[float]:
     """Rank the medians of the cells, from 0 to 1, for their colours."""
     medians = [
-        one.quantiles[error][MEDIAN_INDEX] if error in one.quantiles else None for one in found
+        group.quantiles[error][MEDIAN_INDEX] if error in group.quantiles else None
+        for group in groups
     ]
     ranked = sorted({value for value in medians if value is not None})
-    place = {value: number / max(len(ranked) - 1, 1) for number, value in enumerate(ranked)}
-    return [0.0 if value is None else place[value] for value in medians]
+    rank = {value: number / max(len(ranked) - 1, 1) for number, value in enumerate(ranked)}
+    return [0.0 if value is None else rank[value] for value in medians]
 
 
 def _axis_label(path: str) -> str:

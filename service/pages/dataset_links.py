@@ -25,11 +25,13 @@ def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
         {
             "role": role,
             "label": label,
-            "id": one,
-            "name": _dataset_name(session, one),
-            "parents": [e.parent for e in lineage.list_ancestors(one) if e.child == one],
+            "id": dataset_id,
+            "name": _dataset_name(session, dataset_id),
+            "parents": [
+                e.parent for e in lineage.list_ancestors(dataset_id) if e.child == dataset_id
+            ],
         }
-        for role, label, one in islice(_iterate_datasets(job.spec), MAX_LISTED_DATASETS)
+        for role, label, dataset_id in islice(_iterate_datasets(job.spec), MAX_LISTED_DATASETS)
     ]
 
 
@@ -46,13 +48,13 @@ def _iterate_datasets(spec: Document) -> Iterator[tuple[str, str, str]]:
     for axis in axes:
         labels = axis["labels"] or [{}] * len(axis["values"])
         for value, label in zip(axis["values"], labels, strict=True):
-            for one in [value] if isinstance(value, str) else value:
-                yield "estimation", format_labels(label), one
+            for dataset in [value] if isinstance(value, str) else value:
+                yield "estimation", format_labels(label), dataset
     if not axes:
-        for one in spec["datasets"]:
-            yield "estimation", "", one
-    for one in (spec["validation"] or {}).get("datasets") or []:
-        yield "validation", "", one
+        for dataset in spec["datasets"]:
+            yield "estimation", "", dataset
+    for dataset in (spec["validation"] or {}).get("datasets") or []:
+        yield "validation", "", dataset
 
 
 def _dataset_name(session: Session, dataset_id: str) -> str:

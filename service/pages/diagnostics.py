@@ -69,59 +69,67 @@ def to_diagnostics(result: Document) -> Diagnostics:
     tests = tested.get("tests", [])
     onsets = result.get("onset_delays", [])
     groups = result.get("identifiability", {}).get("groups", [])
-    several = len({one["experiment"] for one in onsets}) > 1
+    several = len({onset["experiment"] for onset in onsets}) > 1
     verdicts = {True: "passed", False: "failed", None: "not tested"}
     return Diagnostics(
         verdict=verdicts[tested["passed"]] if tests else "",
         data=tested.get("data", ""),
-        tests=[_to_test_view(one) for one in tests],
-        n_figures=sum(one["experiment"] == 0 and one["outcome"] != "not tested" for one in tests),
-        onsets=[_to_onset_view(one, several) for one in onsets],
-        groups=[_format_group(one) for one in groups],
+        tests=[_to_test_view(test) for test in tests],
+        n_figures=sum(
+            test["experiment"] == 0 and test["outcome"] != "not tested" for test in tests
+        ),
+        onsets=[_to_onset_view(onset, several) for onset in onsets],
+        groups=[_format_group(group) for group in groups],
         criteria=result.get("criteria", {}),
         selection=[
             SelectedTermView(
-                one["term"],
-                format_number(one["err"]),
-                format_number(max(1.0 - one["cumulated"], 0.0)),
+                term["term"],
+                format_number(term["err"]),
+                format_number(max(1.0 - term["cumulated"], 0.0)),
             )
-            for one in result.get("selection", ())
+            for term in result.get("selection", ())
         ],
     )
 
 
-def to_correlation_trace(one: CorrelationFunction) -> CorrelationTrace:
+def to_correlation_trace(correlation: CorrelationFunction) -> CorrelationTrace:
     """Convert a correlation function to the data of its figure."""
-    test = one.test
+    test = correlation.test
     of = "" if test.input is None else f" with {test.input}"
     kind = "autocorrelation" if test.input is None else "correlation"
     title = f"{kind} of the residual of {test.output}{of}: {test.outcome}"
     return CorrelationTrace(
-        title, test.input is None, one.period, one.lags, one.values, one.band95, one.band99
+        title,
+        test.input is None,
+        correlation.period,
+        correlation.lags,
+        correlation.values,
+        correlation.band95,
+        correlation.band99,
     )
 
 
 def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int = 2) -> Figure:
     """Draw the residual correlations of one experiment; empty if none was tested."""
     functions = [
-        to_correlation_trace(one)
-        for one in tested.correlations
-        if one.test.experiment == experiment and one.values.size
+        to_correlation_trace(correlation)
+        for correlation in tested.correlations
+        if correlation.test.experiment == experiment and correlation.values.size
     ]
     return plot_residuals(functions, columns, tested.experiments)
 
 
-def _to_test_view(one: Document) -> ResidualTestView:
-    what = "white" if one["test"] == "whiteness" else f"independent of {one['input']}"
+def _to_test_view(test: Document) -> ResidualTestView:
+    what = "white" if test["test"] == "whiteness" else f"independent of {test['input']}"
     return ResidualTestView(
-        experiment=one["experiment"] + 1,
-        output=one["output"],
+        experiment=test["experiment"] + 1,
+        output=test["output"],
         hypothesis=what,
-        inside95=_format_percent(one.get("inside95")),
-        inside99=_format_percent(one.get("inside99")),
-        p=format_p_value(one.get("p")),
-        outcome=one["outcome"],
-        reason=one.get("reason") or "",
+        inside95=_format_percent(test.get("inside95")),
+        inside99=_format_percent(test.get("inside99")),
+        p=format_p_value(test.get("p")),
+        outcome=test["outcome"],
+        reason=test.get("reason") or "",
     )
 
 
@@ -129,16 +137,16 @@ def _format_percent(part: float | None) -> str:
     return DASH if part is None else f"{100 * part:.0f}\u202f%"
 
 
-def _to_onset_view(one: Document, several: bool) -> OnsetView:
-    where = f", experiment {one['experiment'] + 1}" if several else ""
-    pair = f"{one['output']} behind {one['input']}{where}"
-    if one["delay"] is None:
-        return OnsetView(pair, "", one.get("reason") or "")
-    value, spread = format_estimate(one["delay"], one.get("spread"))
-    steps = "one step" if one["events"] == 1 else f"{one['events']} steps"
+def _to_onset_view(onset: Document, several: bool) -> OnsetView:
+    where = f", experiment {onset['experiment'] + 1}" if several else ""
+    pair = f"{onset['output']} behind {onset['input']}{where}"
+    if onset["delay"] is None:
+        return OnsetView(pair, "", onset.get("reason") or "")
+    value, spread = format_estimate(onset["delay"], onset.get("spread"))
+    steps = "one step" if onset["events"] == 1 else f"{onset['events']} steps"
     scatter = f", spread {spread}\u202fs" if spread else ""
     return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")
 
 
-def _format_group(one: Document) -> str:
-    return f"{one['expression']} = {join_estimate(one['value'], one.get('stderr'))}"
+def _format_group(group: Document) -> str:
+    return f"{group['expression']} = {join_estimate(group['value'], group.get('stderr'))}"

@@ -42,13 +42,17 @@ def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParame
 
     They come from the result once the run has ended; before, from the model and the request.
     """
-    known = stored.parameters(session)
+    parameters = stored.parameters(session)
     if stored.estimates:
-        scales = {one.name: one.scale for one in known}
-        return [_to_estimated_parameter(one, scales) for one in stored.estimates if is_free(one)]
+        scales = {parameter.name: parameter.scale for parameter in parameters}
+        return [
+            _to_estimated_parameter(estimate, scales)
+            for estimate in stored.estimates
+            if is_free(estimate)
+        ]
     if stored.model.rule is not None:
         return []  # only the result says which candidates are selected
-    return [_to_free_parameter(one) for one in known if one.is_free]
+    return [_to_free_parameter(parameter) for parameter in parameters if parameter.is_free]
 
 
 def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
@@ -65,10 +69,10 @@ def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
         history=history,
         parameters=_match_history_width(list_free_parameters(session, stored), history),
         epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
-        migrations=sorted({one.epoch for one in runs.read_migrations(run.id)}),
+        migrations=sorted({migration.epoch for migration in runs.read_migrations(run.id)}),
         islands=[
-            (_replace_none(one.get("champion_rms"), inf), one.get("refined_rms"))
-            for one in stored.result.get("islands", ())
+            (_replace_none(island.get("champion_rms"), inf), island.get("refined_rms"))
+            for island in stored.result.get("islands", ())
         ],
         correlation=_to_correlation(stored.result.get("correlation")),
     )
@@ -86,29 +90,29 @@ def _replace_none(value: float | None, otherwise: float) -> float:
 
 
 def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
-    found: list[list[IslandImprovement]] = []
+    by_island: list[list[IslandImprovement]] = []
     for island, points in groupby(rows, key=lambda row: row.island):
-        while len(found) < island:  # an island without any improvement yet
-            found.append([])
-        found.append(
+        while len(by_island) < island:  # an island without any improvement yet
+            by_island.append([])
+        by_island.append(
             [
                 IslandImprovement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
                 for p in points
             ]
         )
-    return found
+    return by_island
 
 
 def _match_history_width(
-    known: list[FreeParameter], history: Sequence[Sequence[IslandImprovement]]
+    parameters: list[FreeParameter], history: Sequence[Sequence[IslandImprovement]]
 ) -> list[FreeParameter]:
     """Match the number of parameters to the history's columns; the model may have changed."""
     points = [point for island in history for point in island]
     if not points:
-        return known
+        return parameters
     width = len(points[0].parameters)
-    unknown = range(min(len(known), width), width)
-    return known[:width] + [_infer_parameter(points, column) for column in unknown]
+    unknown = range(min(len(parameters), width), width)
+    return parameters[:width] + [_infer_parameter(points, column) for column in unknown]
 
 
 def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreeParameter:
@@ -120,16 +124,16 @@ def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreePa
 
 
 def _to_estimated_parameter(
-    one: Mapping[str, Any], scales: Mapping[str, ParameterScale]
+    estimate: Mapping[str, Any], scales: Mapping[str, ParameterScale]
 ) -> FreeParameter:
     return FreeParameter(
-        one["name"],
-        one.get("unit", "1"),
-        one["lower"],
-        one["upper"],
-        scales.get(one["name"], "linear"),
-        value=one["value"],
-        stderr=one.get("stderr"),
+        estimate["name"],
+        estimate.get("unit", "1"),
+        estimate["lower"],
+        estimate["upper"],
+        scales.get(estimate["name"], "linear"),
+        value=estimate["value"],
+        stderr=estimate.get("stderr"),
     )
 
 
@@ -152,18 +156,21 @@ def read_run_experiments(
         return []
     fitted = _by_experiment(read_fitted_signals(store, stored.run))
     estimation, validation = fitted["estimation"], fitted["validation"]
-    kept = stored.body["validation"] or {}
+    validation_settings = stored.body["validation"] or {}
     inputs = list(_read_inputs(session, store, stored, stored.body["datasets"]))
-    found = [
+    experiments = [
         ExperimentTraces(
             f"estimation {number}", _to_output_traces(parts), _get_inputs(inputs, number)
         )
         for number, parts in estimation.items()
     ]
-    if kept.get("fraction") is not None:
-        return [_join_validation(one, validation.get(n, ())) for n, one in enumerate(found, 1)]
-    other = list(_read_inputs(session, store, stored, kept.get("datasets") or []))
-    return found + [
+    if validation_settings.get("fraction") is not None:
+        return [
+            _join_validation(experiment, validation.get(n, ()))
+            for n, experiment in enumerate(experiments, 1)
+        ]
+    other = list(_read_inputs(session, store, stored, validation_settings.get("datasets") or []))
+    return experiments + [
         ExperimentTraces(
             f"validation {number}", _to_output_traces(parts), _get_inputs(other, number), -inf
         )
@@ -175,16 +182,16 @@ def _by_experiment(
     fits: Iterable[FittedOutput],
 ) -> dict[FitRole, dict[int, Sequence[FittedOutput]]]:
     """Group the outputs by role and by number of the experiment."""
-    found: dict[FitRole, dict[int, list[FittedOutput]]] = {"estimation": {}, "validation": {}}
+    by_role: dict[FitRole, dict[int, list[FittedOutput]]] = {"estimation": {}, "validation": {}}
     for fit in fits:
-        found[fit.role].setdefault(fit.number, []).append(fit)
-    return {role: dict(sorted(numbered.items())) for role, numbered in found.items()}
+        by_role[fit.role].setdefault(fit.number, []).append(fit)
+    return {role: dict(sorted(numbered.items())) for role, numbered in by_role.items()}
 
 
 def _to_output_traces(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]:
     return tuple(
-        OutputTraces(SignalTrace(one.name, one.unit, one.times, one.measured), one.simulated)
-        for one in parts
+        OutputTraces(SignalTrace(part.name, part.unit, part.times, part.measured), part.simulated)
+        for part in parts
     )
 
 
@@ -206,7 +213,7 @@ def _join_validation(
         )
         for first, rest in zip(experiment.outputs, later, strict=True)
     )
-    since = min(float(one.times[0]) for one in later)
+    since = min(float(output.times[0]) for output in later)
     return ExperimentTraces(
         experiment.name.replace("estimation", "record"), outputs, experiment.inputs, since
     )
@@ -237,6 +244,6 @@ def _to_signal_trace(channel: Channel) -> SignalTrace:
     held, before = channel.hold == "zero", None
     if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
-        times, values = (np.append(known, own[0]) for known, own in pairs)
+        times, values = (np.append(history, samples[0]) for history, samples in pairs)
         before = SignalTrace(channel.name, channel.unit, times, values, held)
     return SignalTrace(channel.name, channel.unit, channel.times, channel.values, held, before)

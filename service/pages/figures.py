@@ -65,7 +65,7 @@ def load_run_figure(
         figure = figures_signals.plot_response(
             experiments[choice.experiment], choice.start, choice.stop
         )
-        figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
+        figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
         return figure
     if name == "residuals":
         tested = analyse_residuals(session, store, stored)
@@ -91,16 +91,16 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
         return figures.empty_figure()
-    found = summarise_job(session, job.id, keys, errors_only=True)
-    return plot_noise_sweep(found, find_rms_unit(session, job.spec), min(choice.columns, 2))
+    summary = summarise_job(session, job.id, keys, errors_only=True)
+    return plot_noise_sweep(summary, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
 
 def load_trend_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     """Draw estimates over the label of a batch; empty if the job requests no trend."""
-    found = load_trend(session, JobRepository(session).get(job_id))
-    if found is None:
+    trend = load_trend(session, JobRepository(session).get(job_id))
+    if trend is None:
         return figures.empty_figure()
-    return plot_trend(found, min(choice.columns, 2))
+    return plot_trend(trend, min(choice.columns, 2))
 
 
 def _check_experiment(number: int, count: int) -> None:

@@ -75,7 +75,7 @@ def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> s
         "jobs.html",
         jobs=jobs,
         state=state.value if state else "",
-        states=[one.value for one in JobState],
+        states=[state_name.value for state_name in JobState],
         any_open=any(job.is_open for job in jobs),
         cursor=cursor,
         filter_query=_encode_query(chosen),
@@ -124,7 +124,7 @@ def job_page(
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
         commands=_request_commands(view, base_url),
-        events=[to_event_view(one) for one in _latest_events(session, job)],
+        events=[to_event_view(event) for event in _latest_events(session, job)],
     )
 
 
@@ -136,13 +136,22 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     InvalidRequest
         If the runs cannot be compared.
     """
-    found = compare_runs(session, runs)
+    comparison = compare_runs(session, runs)
     rows = []
-    for one in found.parameters:
-        known = {value.run: join_estimate(value.value, value.stderr) for value in one.values}
-        texts = [known.get(run.run, "") for run in found.runs]
-        rows.append({"name": one.name, "unit": one.unit, "differs": one.differs, "texts": texts})
-    return render_template("compare.html", found=found, parameters=rows)
+    for parameter in comparison.parameters:
+        texts_by_run = {
+            value.run: join_estimate(value.value, value.stderr) for value in parameter.values
+        }
+        texts = [texts_by_run.get(run.run, "") for run in comparison.runs]
+        rows.append(
+            {
+                "name": parameter.name,
+                "unit": parameter.unit,
+                "differs": parameter.differs,
+                "texts": texts,
+            }
+        )
+    return render_template("compare.html", found=comparison, parameters=rows)
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:
@@ -176,7 +185,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         "dataset.html",
         dataset=dataset,
         height=figures_signals.signals_height(dataset.n_channels),
-        has_history=any(one["history_samples"] for one in dataset.channels),
+        has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _object_href(name)}
             for direction, name, relation in edges
@@ -232,7 +241,7 @@ def _comparison_query(runs: Sequence[Run]) -> str:
         if "/model" in run.cell and run.result is not None:
             first.setdefault(repr(run.cell["/model"]), run.id)
     chosen = list(first.values())[:MAX_COMPARED_RUNS]
-    return urlencode([("run", one) for one in chosen]) if len(chosen) > 1 else ""
+    return urlencode([("run", run_id) for run_id in chosen]) if len(chosen) > 1 else ""
 
 
 def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
@@ -244,16 +253,16 @@ def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
 
 
 def _load_trend_view(session: Session, job: Job) -> TrendView | None:
-    found = load_trend(session, job)
-    return None if found is None else to_trend_view(found)
+    trend = load_trend(session, job)
+    return None if trend is None else to_trend_view(trend)
 
 
 def _find_best_run(runs: RunRepository, job: Job) -> Run | None:
     if job.n_runs == 1 or job.best_rms is None:
-        found: Sequence[Run] = runs.list_page(job.id, limit=1).items
+        candidates: Sequence[Run] = runs.list_page(job.id, limit=1).items
     else:
-        found = runs.list_page(job.id, limit=1, order="best_rms").items
-    return found[0] if found else None
+        candidates = runs.list_page(job.id, limit=1, order="best_rms").items
+    return candidates[0] if candidates else None
 
 
 def _latest_events(session: Session, job: Job) -> list[Any]:
@@ -291,7 +300,7 @@ MAX_CHOICES = 200
 def noise_sweep_page(session: Session) -> str:
     """Render the form of a noise sweep."""
     chosen = NoiseSweepIn.model_fields["methods"].default
-    methods = [(one, one in chosen) for one in SEARCH_METHODS]
+    methods = [(method, method in chosen) for method in SEARCH_METHODS]
     return render_template(
         "noise_sweep.html",
         models=_list_models(session),
@@ -312,8 +321,8 @@ def reidentify_page(session: Session) -> str:
 
 def _list_models(session: Session) -> Sequence[ModelOut]:
     """List every model once, under the name of its latest version."""
-    found = models.list_models(session, None, MAX_CHOICES).items
-    return list({one.name: one for one in reversed(found)}.values())[::-1]
+    listed = models.list_models(session, None, MAX_CHOICES).items
+    return list({model.name: model for model in reversed(listed)}.values())[::-1]
 
 
 def _list_datasets(session: Session) -> Sequence[Dataset]:

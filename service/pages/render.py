@@ -67,19 +67,19 @@ def compress_plotly() -> bytes:
 @cache
 def template_environment() -> Environment:
     """Load the templates; users' texts are escaped, and an undefined variable is an error."""
-    made = Environment(
+    environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(TEMPLATE_FILTERS)
-    made.globals["default_algorithm"] = GeneticAlgorithm()
-    made.globals.update(
+    environment.filters.update(TEMPLATE_FILTERS)
+    environment.globals["default_algorithm"] = GeneticAlgorithm()
+    environment.globals.update(
         static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_file_name()}"
     )
-    return made
+    return environment
 
 
 def render_template(template: str, **context: Any) -> str:

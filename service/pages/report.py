@@ -62,7 +62,7 @@ def render_large_report(
     store: ObjectStore,
     job: Job,
     trend: TrendOut | None,
-    made: datetime,
+    created: datetime,
     base_url: str,
 ) -> str:
     """Render the report of a job with more runs than a page lists.
@@ -72,7 +72,7 @@ def render_large_report(
     base_url : str
         Address of the service, for links to all runs.
     """
-    view = to_job_view(job, find_rms_unit(session, job.spec), made)
+    view = to_job_view(job, find_rms_unit(session, job.spec), created)
     best, worst = _best_and_worst_runs(session, job, is_batch=view.is_batch)
     failed = (
         RunRepository(session)
@@ -82,13 +82,13 @@ def render_large_report(
     grid = build_cell_grid(session, job, {})
     shown = [("The best run", best[:1]), ("The worst run that succeeded", worst[:1])]
     summaries = {
-        name: [load_run_row(session, StoredRun.from_rows(job, run)) for run in found]
-        for name, found in (("best", best), ("worst", worst), ("failed", failed))
+        name: [load_run_row(session, StoredRun.from_rows(job, run)) for run in ranked]
+        for name, ranked in (("best", best), ("worst", worst), ("failed", failed))
     }
     return render_template(
         "report_large.html",
         job=view,
-        made=made,
+        made=created,
         **summaries,
         order="fit" if view.is_batch else "RMS",
         grid=_truncate_grid(grid),
@@ -142,29 +142,30 @@ def _overview_drawings(
     session: Session, job: Job, trend: TrendOut | None
 ) -> list[tuple[str, Markup]]:
     """Draw the figures that cover all runs; each has a title."""
-    found = [
+    titled = [
         ("Errors against the noise", load_noise_figure(session, job.id, FigureChoice(columns=2)))
     ]
     if trend is not None:
-        found.append((f"Trend over {trend.x}", plot_trend(trend, 2)))
-    return _draw_figures(found)
+        titled.append((f"Trend over {trend.x}", plot_trend(trend, 2)))
+    return _draw_figures(titled)
 
 
 def _build_section(
     session: Session, store: ObjectStore, stored: StoredRun, why: str
 ) -> _ReportSection:
     evidence = read_run_figure_data(session, stored)
-    made = [("Progress of every island", figures.plot_history(evidence))]
+    titled = [("Progress of every island", figures.plot_history(evidence))]
     experiments = read_run_experiments(session, store, stored)[:1]
-    made += [
-        ("Measured against identified", figures_signals.plot_response(one)) for one in experiments
+    titled += [
+        ("Measured against identified", figures_signals.plot_response(experiment))
+        for experiment in experiments
     ]
-    made.append(("Convergence of the parameters", figures.plot_convergence(evidence)))
-    return _ReportSection(why, load_full_run(session, stored), _draw_figures(made))
+    titled.append(("Convergence of the parameters", figures.plot_convergence(evidence)))
+    return _ReportSection(why, load_full_run(session, stored), _draw_figures(titled))
 
 
-def _draw_figures(made: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
-    return [(title, to_svg(figure, title)) for title, figure in made if is_drawable(figure)]
+def _draw_figures(titled: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
+    return [(title, to_svg(figure, title)) for title, figure in titled if is_drawable(figure)]
 
 
 MAX_FULL_RUNS = 6
@@ -177,10 +178,10 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
     If the job has more runs than a page lists, the report summarises them.
     """
     job = JobRepository(session).get(job_id)
-    made, batch = datetime.now(UTC), load_trend(session, job)
+    created, batch = datetime.now(UTC), load_trend(session, job)
     if job.n_runs > MAX_LISTED_RUNS:
-        return render_large_report(session, store, job, batch, made, base_url)
-    view = to_job_view(job, find_rms_unit(session, job.spec), made)
+        return render_large_report(session, store, job, batch, created, base_url)
+    view = to_job_view(job, find_rms_unit(session, job.spec), created)
     runs = RunRepository(session).list_page(job.id, limit=MAX_LISTED_RUNS).items
     is_in_order = view.is_batch or len(runs) <= MAX_FULL_RUNS
     order: RunOrder = "number" if is_in_order else "best_rms"
@@ -189,7 +190,7 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
     return render_template(
         "report.html",
         job=view,
-        made=made,
+        made=created,
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in runs],
         overview=_overview_figures(session, job),
         trend=None if batch is None else to_trend_view(batch),
@@ -221,14 +222,14 @@ def security_policy() -> str:
 
 def _overview_figures(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of the figures that cover all runs."""
-    found = load_noise_figure(session, job.id, FigureChoice(columns=2))
-    if not found["data"]:
+    figure = load_noise_figure(session, job.id, FigureChoice(columns=2))
+    if not figure["data"]:
         return []
     return [
         (
             "Errors against the noise",
-            found["layout"]["height"],
-            to_script_json(strip_template(found)),
+            figure["layout"]["height"],
+            to_script_json(strip_template(figure)),
         )
     ]
 
@@ -238,24 +239,24 @@ def _run_figures(
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures that have data."""
     evidence = read_run_figure_data(session, stored)
-    made = [("Progress of every island", figures.plot_history(evidence))]
+    titled = [("Progress of every island", figures.plot_history(evidence))]
     for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
         title = f"Measured against identified: {experiment.name}"
-        made.append((title, figures_signals.plot_response(experiment)))
+        titled.append((title, figures_signals.plot_response(experiment)))
     tested = analyse_residuals(session, store, stored)
     if tested is not None:
-        made += [
+        titled += [
             (f"Correlation of the residuals: {name}", plot_residual_tests(tested, number))
             for number, name in enumerate(tested.experiments[:MAX_EXPERIMENTS])
         ]
-    made += [
+    titled += [
         ("Convergence of the parameters", figures.plot_convergence(evidence)),
         ("Correlation of the estimates", figures.plot_correlation(evidence)),
         ("What each island found", figures.plot_waterfall(evidence)),
     ]
     return [
         (title, figure["layout"]["height"], to_script_json(strip_template(figure)))
-        for title, figure in made
+        for title, figure in titled
         if any(_has_points(trace) for trace in figure["data"])
     ]
 

@@ -77,19 +77,21 @@ class _FormContext:
     @property
     def input_choices(self) -> list[tuple[str, str]]:
         """Choices of the controlled input."""
-        return [(one.name, one.name) for one in self.model.inputs]
+        return [(signal.name, signal.name) for signal in self.model.inputs]
 
     @property
     def output_choices(self) -> list[tuple[str, str]]:
         """Choices of the controlled output."""
-        return [(one.name, one.name) for one in self.model.outputs]
+        return [(output.name, output.name) for output in self.model.outputs]
 
     @property
     def gain_unit(self) -> str:
         """Unit of the gain, if the model has one input and one output."""
         if len(self.model.inputs) != 1 or len(self.model.outputs) != 1:
             return ""
-        above, below = (self.units[one[0].name] for one in (self.model.inputs, self.model.outputs))
+        above, below = (
+            self.units[signals[0].name] for signals in (self.model.inputs, self.model.outputs)
+        )
         if "1" in (above, below):
             return above if below == "1" else f"1/{below}"
         return "" if above == below else f"{above}/({below})"
@@ -97,7 +99,7 @@ class _FormContext:
     @property
     def recording_choices(self) -> list[tuple[str, str]]:
         """Choices of a stored recording."""
-        return [("", "choose one…"), *((one.id, one.name) for one in self.datasets)]
+        return [("", "choose one…"), *((dataset.id, dataset.name) for dataset in self.datasets)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,7 @@ def simulate_page(
         If there is no such run.
     """
     with database.read_session() as session:
-        known = _load_form_context(session, run_id, query)
+        form = _load_form_context(session, run_id, query)
     kind: SimulationKind = "loop"
     context: dict[str, Any] = {}
     faults: list[FieldError] = []
@@ -128,30 +130,30 @@ def simulate_page(
     try:
         kind = read_kind(query)
         if has_request(query):
-            wanted = parse_query(known.model, query)
-            figure, context = _simulate_query(database, store, known, wanted)
+            wanted = parse_query(form.model, query)
+            figure, context = _simulate_query(database, store, form, wanted)
             if query.get("format") == "csv":
                 return SimulationAnswer(to_csv(figure), is_csv=True)
-            context |= _figure_context(figure) | _request_context(known.run, wanted, base_url)
+            context |= _figure_context(figure) | _request_context(form.run, wanted, base_url)
     except (ServiceError, StorageError, SysidError) as error:
-        faults = [to_form_fault(one) for one in _to_field_errors(error)]
+        faults = [to_form_fault(fault) for fault in _to_field_errors(error)]
         status = error.status if isinstance(error, Unavailable) else 422
     page = render_template(
         "simulate.html",
-        known=known,
+        known=form,
         kind=kind,
         kinds=NOISE_KINDS,
         tunings=TUNINGS,
         choices=CHOICES,
         values={
-            **known.defaults,
-            **(_shift_step_time(known.defaults) if kind == "loop" else {}),
+            **form.defaults,
+            **(_shift_step_time(form.defaults) if kind == "loop" else {}),
             **(IMPLIED_VALUES if has_request(query) else {}),
             **query,
             **_controller_values(context.get("result")),
         },
         faults={f.pointer[1:]: f.detail for f in faults},
-        lines=[_format_fault(one) for one in faults],
+        lines=[_format_fault(fault) for fault in faults],
         query=_encode_query(query),
         times=multiply_units,
         bracket=bracket_unit,
@@ -165,9 +167,9 @@ def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) 
     run, job, fitted_to = stored.run, stored.job, stored.body["datasets"][0]
     datasets = list(DatasetRepository(session).list_page(limit=MAX_LISTED_DATASETS).items)
     for wanted in (query.get("dataset"), fitted_to):
-        if wanted and wanted not in [one.id for one in datasets]:
+        if wanted and wanted not in [dataset.id for dataset in datasets]:
             datasets += _find_dataset(session, wanted)
-    fitted = next((one for one in datasets if one.id == fitted_to), None)
+    fitted = next((dataset for dataset in datasets if dataset.id == fitted_to), None)
     return _FormContext(
         run=run.id,
         title=f"run {run.number + 1}",
@@ -190,12 +192,16 @@ def _find_dataset(session: Session, dataset: str) -> list[Dataset]:
 
 def _signal_units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
     """Unit of every signal: the model's, or the recording's if the model declares none."""
-    recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
+    recorded = {
+        channel["name"]: str(channel["unit"]) for channel in (fitted.channels if fitted else [])
+    }
     model, by_signal = stored.model, stored.channels.by_signal
-    own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
+    declared = {channel.name: channel.unit for channel in model.inputs} | {
+        o.name: o.unit for o in model.outputs
+    }
     return {
         name: recorded.get(by_signal[name], unit) if unit == "1" else unit
-        for name, unit in own.items()
+        for name, unit in declared.items()
     }
 
 
@@ -214,7 +220,7 @@ def _default_values(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]
         "skip": "0",
         "duration": f"{duration:.6g}",
         "sample_time": f"{period:.6g}",
-        **{f"channel.{name}": one for name, one in stored.channels.by_signal.items()},
+        **{f"channel.{name}": channel for name, channel in stored.channels.by_signal.items()},
     }
 
 
@@ -230,9 +236,9 @@ def _default_step(stored: StoredRun) -> dict[str, str]:
 
     A step from 0 to 1 would lie outside this range for most plants, such as outputs in Pa.
     """
-    told = (stored.result.get("agreement") or {}).get("estimation", [])
-    of_output = (one for one in told if one["output"] == stored.model.outputs[0].name)
-    spans = [one["span"] for one in of_output if None not in one["span"]]
+    agreement = (stored.result.get("agreement") or {}).get("estimation", [])
+    of_output = (entry for entry in agreement if entry["output"] == stored.model.outputs[0].name)
+    spans = [entry["span"] for entry in of_output if None not in entry["span"]]
     if not spans:
         return {}
     low, high = min(span[0] for span in spans), max(span[1] for span in spans)
@@ -256,25 +262,25 @@ def _round_text(value: float) -> str:
 
 
 def _simulate_query(
-    database: Database, store: ObjectStore, known: _FormContext, wanted: SimulationQuery
+    database: Database, store: ObjectStore, form: _FormContext, wanted: SimulationQuery
 ) -> tuple[Figure, dict[str, Any]]:
     if wanted.kind == "recording":
         body = _validate_body(FreeRunIn, wanted.body)
-        free = free_runs.simulate_free_run(database, store, known.run, body)
-        name = next((d.name for d in known.datasets if d.id == free.dataset), free.dataset)
+        free = free_runs.simulate_free_run(database, store, form.run, body)
+        name = next((d.name for d in form.datasets if d.id == free.dataset), free.dataset)
         return plot_response(_to_experiment_traces(free)), {
             "free": free,
             "dataset_name": name,
             "records": MAX_LISTED_RECORDS,
         }
     body = _validate_body(RunSimulateIn, wanted.body)
-    told = run_simulations.simulate_run(database, store, known.run, body, MAX_POINTS)
-    found = apply_units(told, known.units)
+    simulation = run_simulations.simulate_run(database, store, form.run, body, MAX_POINTS)
+    with_units = apply_units(simulation, form.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
-    entered = known.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
-    return plot_simulation(found, since), {
-        "result": found,
-        "verdict": _step_verdict(found),
+    entered = form.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
+    return plot_simulation(with_units, since), {
+        "result": with_units,
+        "verdict": _step_verdict(with_units),
         "command_unit": entered,
     }
 
@@ -286,11 +292,11 @@ def _validate_body(kind: type[Any], body: Mapping[str, Any]) -> Any:
         raise InvalidRequest(explain_errors(error.errors(), body, kind)) from None
 
 
-def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
+def _controller_values(simulation: RunSimulationOut | None) -> dict[str, str]:
     """Return a rule's settings as values of the form, as a start for tuning by hand."""
-    if found is None or found.tuning is None or found.controller is None:
+    if simulation is None or simulation.tuning is None or simulation.controller is None:
         return {}
-    used = found.controller
+    used = simulation.controller
     chosen = {
         "gain": used.gain,
         "integral_time": used.integral_time,
@@ -299,9 +305,9 @@ def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
     return {name: "" if value is None else f"{value:.6g}" for name, value in chosen.items()}
 
 
-def _step_verdict(found: RunSimulationOut) -> tuple[str, str]:
+def _step_verdict(simulation: RunSimulationOut) -> tuple[str, str]:
     """Judge a step response: style class and text."""
-    metrics: StepMetricsOut | None = found.metrics
+    metrics: StepMetricsOut | None = simulation.metrics
     if metrics is None:
         return "", ""
     if metrics.runs_away:
@@ -315,16 +321,16 @@ def _to_experiment_traces(free: FreeRun) -> ExperimentTraces:
     """Return the traces of the first record; a table shows the agreement of all records."""
     record, simulated = free.records[0], free.simulated[0]
     outputs = tuple(
-        OutputTraces(SignalTrace(one.name, one.unit, one.times, one.values), values)
-        for one, values in zip(record.outputs, simulated, strict=True)
+        OutputTraces(SignalTrace(output.name, output.unit, output.times, output.values), values)
+        for output, values in zip(record.outputs, simulated, strict=True)
     )
     return ExperimentTraces("record 1", outputs, _to_input_traces(record))
 
 
 def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
     return tuple(
-        SignalTrace(one.name, one.unit, one.times, one.values, one.hold == "zero")
-        for one in record.inputs
+        SignalTrace(signal.name, signal.unit, signal.times, signal.values, signal.hold == "zero")
+        for signal in record.inputs
     )
 
 

@@ -55,8 +55,8 @@ TUNINGS = {
 }
 """Choices of rule and controller; a rule chooses gain and times itself."""
 CHOICES = {
-    "derivative_on": [(one, one) for one in get_args(DerivativeOn)],
-    "anti_windup": [(one, one) for one in get_args(AntiWindup)],
+    "derivative_on": [(name, name) for name in get_args(DerivativeOn)],
+    "anti_windup": [(name, name) for name in get_args(AntiWindup)],
 }
 """Values and texts of the controller's fields with fixed choices."""
 _NUMBER_FIELDS = (
@@ -122,7 +122,7 @@ def has_request(query: Mapping[str, str]) -> bool:
 
 def list_form_fields(model: Model, kind: SimulationKind) -> list[str]:
     """List the names of the fields of a form."""
-    inputs = [f"input.{one.name}" for one in model.inputs]
+    inputs = [f"input.{signal.name}" for signal in model.inputs]
     if kind == "recording":
         signals = list(chain(*list_signals(model)))
         return ["dataset", "skip", *(f"channel.{name}" for name in signals)]
@@ -157,11 +157,11 @@ def parse_query(model: Model, query: Mapping[str, str]) -> SimulationQuery:
         With a fault for every unknown field and every invalid number; its pointer is ``?name``.
     """
     kind = read_kind(query)
-    known = list_form_fields(model, kind)
+    fields = list_form_fields(model, kind)
     faults = [
-        FieldError(f"?{name}", f"there is no such field{suggest_name(name, known)}")
+        FieldError(f"?{name}", f"there is no such field{suggest_name(name, fields)}")
         for name in query
-        if name not in (*known, "kind", "format")
+        if name not in (*fields, "kind", "format")
     ]
     reader = _QueryReader(query)
     make = {"loop": _loop_body, "recording": _recording_body, "signal": _signal_body}[kind]
@@ -204,27 +204,27 @@ class _QueryReader:
 
     def read_number(self, name: str, default: float | None = None) -> float | None:
         """Read a number; the default if the field is empty or invalid."""
-        given = self.read_text(name)
-        if not given:
+        text = self.read_text(name)
+        if not text:
             return default
         try:
-            value = float(given)
+            value = float(text)
         except ValueError:
             value = float("nan")
         if isfinite(value):
             return value
-        self.faults.append(FieldError(f"?{name}", f"found {given!r}; need a number"))
+        self.faults.append(FieldError(f"?{name}", f"found {text!r}; need a number"))
         return default
 
     def read_samples(self) -> tuple[int, float]:
         """Read number of samples and sampling period (s) from the fields; both are required."""
         duration, period = self.read_number("duration"), self.read_number("sample_time")
         for name, value in (("duration", duration), ("sample_time", period)):
-            if any(one.pointer == f"?{name}" for one in self.faults):
+            if any(fault.pointer == f"?{name}" for fault in self.faults):
                 continue
             if value is None or value <= 0:
-                found = "it is missing" if value is None else f"found {value:g}"
-                self.faults.append(FieldError(f"?{name}", f"{found}; need a time above 0 s"))
+                problem = "it is missing" if value is None else f"found {value:g}"
+                self.faults.append(FieldError(f"?{name}", f"{problem}; need a time above 0 s"))
         if not duration or not period or self.faults:
             return 2, 1.0
         count = duration / period
@@ -257,11 +257,11 @@ def _loop_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
         "time_constant": reader.read_number("time_constant"),
         "delay": reader.read_number("transport_delay"),
     }
-    given = {name: value for name, value in transport.items() if value is not None}
-    if given:
-        control["transport"] = given
+    present = {name: value for name, value in transport.items() if value is not None}
+    if present:
+        control["transport"] = present
     samples, period = reader.read_samples()
-    others = [one.name for one in model.inputs if one.name != control["input"]]
+    others = [signal.name for signal in model.inputs if signal.name != control["input"]]
     return {
         "control": control,
         "inputs": dict(_input_expressions(reader, others, "0")),
@@ -273,27 +273,27 @@ def _loop_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
 def _controller_body(reader: _QueryReader) -> dict[str, Any]:
     """Read the controller's settings; with a tuning rule only those that the rule does not set."""
     tuning = reader.read_text("tuning", MANUAL_TUNING)
-    found: dict[str, Any] = {}
+    body: dict[str, Any] = {}
     if tuning == MANUAL_TUNING:
-        found["gain"] = reader.read_number("gain", 1.0)
+        body["gain"] = reader.read_number("gain", 1.0)
         names: tuple[str, ...] = (*_TUNED_FIELDS[1:], *_NUMBER_FIELDS)
     else:
         rule, _, controller = tuning.partition(" ")
-        found["tuning"] = {"rule": rule, "controller": controller}
+        body["tuning"] = {"rule": rule, "controller": controller}
         wanted = reader.read_number("closed_loop_time_constant")
         if wanted is not None:
-            found["tuning"]["closed_loop_time_constant"] = wanted
+            body["tuning"]["closed_loop_time_constant"] = wanted
         names = _NUMBER_FIELDS
         if tuning not in TUNINGS:
-            known = ", ".join(TUNINGS)
-            reader.faults.append(FieldError("?tuning", f"found {tuning!r}; need one of {known}"))
-    given = {name: reader.read_number(name) for name in names}
-    found |= {name: value for name, value in given.items() if value is not None}
-    return found | {name: text for name in _CHOICE_FIELDS if (text := reader.read_text(name))}
+            choices = ", ".join(TUNINGS)
+            reader.faults.append(FieldError("?tuning", f"found {tuning!r}; need one of {choices}"))
+    numbers = {name: reader.read_number(name) for name in names}
+    body |= {name: value for name, value in numbers.items() if value is not None}
+    return body | {name: text for name in _CHOICE_FIELDS if (text := reader.read_text(name))}
 
 
 def _signal_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
-    names = [one.name for one in model.inputs]
+    names = [signal.name for signal in model.inputs]
     samples, period = reader.read_samples()
     return {
         "inputs": dict(_input_expressions(reader, names, "")),

@@ -53,12 +53,12 @@ def load_trend(session: Session, job: Job) -> TrendOut | None:
         return None
 
 
-def to_trend_view(found: TrendOut) -> TrendView:
+def to_trend_view(trend: TrendOut) -> TrendView:
     """Build the view of a trend."""
-    document = found.model_dump()
+    document = trend.model_dump()
     tables = build_tables(document, TYPESET)
     return TrendView(
-        x=found.x,
+        x=trend.x,
         headings=tables.headings,
         rows=tables.rows,
         laws=[
@@ -68,16 +68,16 @@ def to_trend_view(found: TrendOut) -> TrendView:
         predictions=tables.predictions,
         reasons=[f"{name}: {reason}" for name, reason in tables.reasons],
         notes=list_notes(document),
-        reference=found.reference,
+        reference=trend.reference,
         reference_text=format_reference(document),
-        suggested_run=_suggest_run(found),
-        suggested_name=next(iter(found.reference_names), ""),
+        suggested_run=_suggest_run(trend),
+        suggested_name=next(iter(trend.reference_names), ""),
         height=trend_height(max(len(tables.headings), 1)),
     )
 
 
-def _suggest_run(found: TrendOut) -> str:
-    runs = {place.x: place.runs[0] for place in found.places if place.runs}
+def _suggest_run(trend: TrendOut) -> str:
+    runs = {point.x: point.runs[0] for point in trend.places if point.runs}
     middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
-    known = None if found.reference_x is None else runs.get(found.reference_x)
-    return known or next(iter(middle), "")
+    at_reference = None if trend.reference_x is None else runs.get(trend.reference_x)
+    return at_reference or next(iter(middle), "")

@@ -162,7 +162,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         is_open=not run.state.is_terminal,
         cell_text=format_cell(run.cell, run.labels),
         unit=unit,
-        estimates=[to_estimate_view(one) for one in result.get("parameters", ())],
+        estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
         warnings=result.get("warnings", ()),
         has_signals=run.signals_sha256 is not None,
         heights=heights,
@@ -170,20 +170,20 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
     )
 
 
-def to_estimate_view(one: Document) -> EstimateView:
+def to_estimate_view(estimate: Document) -> EstimateView:
     """Build a row of the table from an entry of the result's ``parameters``."""
-    stderr = one["stderr"]
-    value, error = format_estimate(one["value"], stderr)
-    bounds = [one[name] for name in ("lower", "upper") if one[name] is not None]
+    stderr = estimate["stderr"]
+    value, error = format_estimate(estimate["value"], stderr)
+    bounds = [estimate[name] for name in ("lower", "upper") if estimate[name] is not None]
     return EstimateView(
-        name=one["name"],
-        unit=one["unit"],
+        name=estimate["name"],
+        unit=estimate["unit"],
         value_text=value,
         stderr_text=error,
-        interval_text=format_interval(one["interval95"], stderr),
+        interval_text=format_interval(estimate["interval95"], stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=one["status"],
-        reason=one["reason"] or "",
+        status=estimate["status"],
+        reason=estimate["reason"] or "",
     )
 
 
@@ -196,9 +196,9 @@ def to_event_view(event: Event) -> EventView:
         return EventView(event.created_at, event.kind, f"{data.get('state', '')}{attempt}{error}")
     text = data.get("message")
     if text is None:
-        known = ((name.replace("_", " "), value) for name, value in data.items())
+        entries = ((name.replace("_", " "), value) for name, value in data.items())
         text = ", ".join(
-            f"{name} {format_value(value)}" for name, value in known if value is not None
+            f"{name} {format_value(value)}" for name, value in entries if value is not None
         )
     return EventView(event.created_at, event.kind, str(text))
 
@@ -210,13 +210,13 @@ def sweep_axes(spec: Document) -> list[Document]:
 
 def format_cell(cell: Document, labels: Document) -> str:
     """Describe a run's place in its sweep; labels replace the ids of datasets."""
-    told = {path: value for path, value in cell.items() if not (labels and path == DATASETS_PATH)}
-    pairs = [(_axis_name(path, told), value) for path, value in told.items()]
+    shown = {path: value for path, value in cell.items() if not (labels and path == DATASETS_PATH)}
+    pairs = [(_axis_name(path, shown), value) for path, value in shown.items()]
     return ", ".join(f"{name} {format_value(value)}" for name, value in [*labels.items(), *pairs])
 
 
 def _axis_name(path: str, others: Iterable[str]) -> str:
     """Last part of a pointer; the whole pointer if others end alike, such as two seeds."""
     last = path.rsplit("/", 1)[-1]
-    same = [one for one in others if one.rsplit("/", 1)[-1] == last]
+    same = [path for path in others if path.rsplit("/", 1)[-1] == last]
     return last if len(same) == 1 else path.removeprefix("/").replace("/", " ")

@@ -79,12 +79,12 @@ def build_sections(bench: StudyBench) -> list[Section]:
 
 
 def _corrected_section(bench: StudyBench, record: str) -> Section:
-    found = bench.compare_methods(job_body(record, {}, "k_b = k_a"))
+    runs = bench.compare_methods(job_body(record, {}, "k_b = k_a"))
     steps = {
-        method: bench.client.simulate_run(one.run["id"], loop_body({}))
-        for method, one in found.items()
+        method: bench.client.simulate_run(run.run["id"], loop_body({}))
+        for method, run in runs.items()
     }
-    exact = bench.client.simulate_run(found["improved"].run["id"], loop_body(TRUE_PARAMETERS))
+    exact = bench.client.simulate_run(runs["improved"].run["id"], loop_body(TRUE_PARAMETERS))
     return Section(
         f"{TITLE}, k_b = k_a and A_m given",
         "Model `actuator` (Eq. 23 to 25) from the pressure difference to the angle of the arm. "
@@ -92,44 +92,48 @@ def _corrected_section(bench: StudyBench, record: str) -> Section:
         f"estimates as true values, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. The "
         "paper has neither A_m nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs "
         "from k_a. No record of P_a and θ can determine k_b separately from A_m (next section).",
-        [_estimates_table(found, "Table 4"), _step_table(steps, exact)],
-        _build_plots(found, steps, exact),
-        _build_checks(found, steps, exact),
-        links=[found["improved"].run["job"]],
+        [_estimates_table(runs, "Table 4"), _step_table(steps, exact)],
+        _build_plots(runs, steps, exact),
+        _build_checks(runs, steps, exact),
+        links=[runs["improved"].run["job"]],
     )
 
 
 def _printed_section(bench: StudyBench, record: str) -> Section:
-    found = bench.compare_methods(job_body(record, SEPARATE_K_B, "as printed, k_b by itself"))
-    groups = found["improved"].run["identifiability"]["groups"]
-    told = "; ".join(
-        f"{one['expression']} = {format_number(one['value'], 5)}"
-        for one in groups
-        if one["value"] is not None
+    runs = bench.compare_methods(job_body(record, SEPARATE_K_B, "as printed, k_b by itself"))
+    groups = runs["improved"].run["identifiability"]["groups"]
+    combinations = "; ".join(
+        f"{group['expression']} = {format_number(group['value'], 5)}"
+        for group in groups
+        if group["value"] is not None
     )
     return Section(
         f"{TITLE}, as printed: k_b and k_a both estimated",
         "The six numbers of Table 4 are estimated together, as printed. Multiply k_b, k_c, J, F_c, "
         "F_max and B by one factor: the angle nearly stays the same. (B is fixed here and has "
         "little effect.) So the data determine five numbers, and the sixth direction is a ridge."
-        + (f" lagid reports combinations instead of the single values: {told}." if told else ""),
-        [_estimates_table(found, "Table 4, as printed")],
+        + (
+            f" lagid reports combinations instead of the single values: {combinations}."
+            if combinations
+            else ""
+        ),
+        [_estimates_table(runs, "Table 4, as printed")],
         [
             Plot(
                 "Figure 20, as printed: RMS of the best individual",
-                figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+                figures.plot_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
                 "Paper: falls gradually under the proposed search. Ours: "
-                f"{_format_final_rms(found)}. A low RMS does not determine six numbers.",
+                f"{_format_final_rms(runs)}. A low RMS does not determine six numbers.",
             )
         ],
-        links=[found["improved"].run["job"]],
+        links=[runs["improved"].run["job"]],
     )
 
 
-def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
+def _estimates_table(runs: Mapping[str, MethodRun], title: str) -> ReportTable:
     rows = []
     for name in PARAMETER_NAMES:
-        unit = found["improved"].get_parameter(name)["unit"]
+        unit = runs["improved"].get_parameter(name)["unit"]
         true = TRUE_PARAMETERS.get(name, TRUE_PARAMETERS["k_a"])
         paper = (published.TABLE_4.simple[name], published.TABLE_4.proposed[name])
         rows.append(
@@ -137,7 +141,7 @@ def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
                 f"{name} [{unit}]",
                 f"{true:.6g}",
                 *(f"{value:.6g}" for value in paper),
-                *(_format_cell(found[method], name) for method in METHODS),
+                *(_format_cell(runs[method], name) for method in METHODS),
             ]
         )
     rows.append(
@@ -146,7 +150,7 @@ def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
             f"{1e3 * SIGMA:g}",
             "",
             "",
-            *(f"{1e3 * found[m].run['rms']:.4f}" for m in METHODS),
+            *(f"{1e3 * runs[m].run['rms']:.4f}" for m in METHODS),
         ]
     )
     headings = ["parameter", "true", "paper, simple", "paper, proposed"]
@@ -159,23 +163,23 @@ def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
     )
 
 
-def _format_cell(found: MethodRun, name: str) -> str:
-    status = found.get_parameter(name)["status"]
-    text = format_estimate(found, name)
+def _format_cell(run: MethodRun, name: str) -> str:
+    status = run.get_parameter(name)["status"]
+    text = format_estimate(run, name)
     return text if status == "identified" or text.endswith(")") else f"{text} ({status})"
 
 
 def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> ReportTable:
     def row(name: str, answer: Mapping[str, Any]) -> list[str]:
-        found = answer["metrics"]
-        if found["runs_away"]:
-            return [name, _format_seconds(found["rise_time"]), "runs away", "", ""]
+        metrics = answer["metrics"]
+        if metrics["runs_away"]:
+            return [name, _format_seconds(metrics["rise_time"]), "runs away", "", ""]
         return [
             name,
-            _format_seconds(found["rise_time"]),
-            f"{found['overshoot_percent']:.1f}",
-            _format_seconds(found["settling_time"]),
-            f"{_to_degrees(found['steady_error']):.2f}",
+            _format_seconds(metrics["rise_time"]),
+            f"{metrics['overshoot_percent']:.1f}",
+            _format_seconds(metrics["settling_time"]),
+            f"{_to_degrees(metrics['steady_error']):.2f}",
         ]
 
     return ReportTable(
@@ -186,7 +190,7 @@ def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> ReportTab
 
 
 def _build_plots(
-    found: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
+    runs: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
 ) -> list[Plot]:
     series = exact["outputs"][0]
     heavy = {"color": theme.GREY, "width": 4}
@@ -196,10 +200,13 @@ def _build_plots(
         )
     ]
     for method, answer in steps.items():
-        one = answer["outputs"][0]
+        output = answer["outputs"][0]
         data.append(
             figures.line_trace(
-                method, one["times"], _to_degrees_series(one), line=figures.method_style(method)
+                method,
+                output["times"],
+                _to_degrees_series(output),
+                line=figures.method_style(method),
             )
         )
     level = {"color": theme.GREY, "dash": "dot", "width": 1}
@@ -208,9 +215,9 @@ def _build_plots(
     return [
         Plot(
             "Figure 20: RMS of the best individual",
-            figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+            figures.plot_rms_history(runs, "mrad", 1e3 * SIGMA, scale=1e3),
             "Paper: the error becomes smaller gradually under the proposed search. "
-            f"Ours: {_format_final_rms(found)}; the noise has {1e3 * SIGMA:g} mrad.",
+            f"Ours: {_format_final_rms(runs)}; the noise has {1e3 * SIGMA:g} mrad.",
         ),
         Plot(
             "Figure 21: step response under P control",
@@ -221,7 +228,7 @@ def _build_plots(
         ),
         Plot(
             "Response to the record's input",
-            figures.plot_responses(found),
+            figures.plot_responses(runs),
             "Not in the paper: the record itself, with breaks where the arm sticks, and the "
             "residuals.",
         ),
@@ -229,10 +236,10 @@ def _build_plots(
 
 
 def _build_checks(
-    found: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
+    runs: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
 ) -> list[Check]:
     off = {
-        name: abs(found["improved"].get_estimate(name) / value - 1)
+        name: abs(runs["improved"].get_estimate(name) / value - 1)
         for name, value in TRUE_PARAMETERS.items()
     }
     worst = max(off, key=lambda name: off[name])
@@ -252,15 +259,15 @@ def _build_checks(
     ]
 
 
-def _greatest_distance(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
+def _greatest_distance(first: Mapping[str, Any], other: Mapping[str, Any]) -> float:
     """Greatest difference (degrees) between two responses, which may be thinned differently."""
-    a, b = one["outputs"][0], other["outputs"][0]
-    there = np.interp(a["times"], b["times"], b["values"])
-    return _to_degrees(float(np.max(np.abs(np.asarray(a["values"]) - there))))
+    a, b = first["outputs"][0], other["outputs"][0]
+    interpolated = np.interp(a["times"], b["times"], b["values"])
+    return _to_degrees(float(np.max(np.abs(np.asarray(a["values"]) - interpolated))))
 
 
-def _format_final_rms(found: Mapping[str, MethodRun]) -> str:
-    return ", ".join(f"{m} ends at {1e3 * found[m].run['rms']:.3g} mrad" for m in METHODS)
+def _format_final_rms(runs: Mapping[str, MethodRun]) -> str:
+    return ", ".join(f"{m} ends at {1e3 * runs[m].run['rms']:.3g} mrad" for m in METHODS)
 
 
 def _to_degrees_series(series: Mapping[str, Any]) -> list[float | None]:

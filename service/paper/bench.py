@@ -16,8 +16,8 @@ class StudyFailed(ServiceError):
     """A job of the study did not succeed."""
 
     def __init__(self, name: str, job: Document) -> None:
-        found = job.get("error") or f"{job['progress']['failed']} of its runs failed"
-        super().__init__(f"the job {name!r} ({job['id']}) {job['state']}: {found}")
+        reason = job.get("error") or f"{job['progress']['failed']} of its runs failed"
+        super().__init__(f"the job {name!r} ({job['id']}) {job['state']}: {reason}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,12 @@ class MethodRun:
 
     def get_standard_error(self, name: str) -> float | None:
         """Return the standard error of a parameter; None if there is none."""
-        found = self.get_parameter(name)["stderr"]
-        return None if found is None else float(found)
+        stderr = self.get_parameter(name)["stderr"]
+        return None if stderr is None else float(stderr)
 
     def get_parameter(self, name: str) -> Document:
         """Return the entry of one parameter."""
-        return next(one for one in self.run["parameters"] if one["name"] == name)
+        return next(parameter for parameter in self.run["parameters"] if parameter["name"] == name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +90,11 @@ class StudyBench:
 
 def champion_history(history: Document) -> list[ArchipelagoImprovement]:
     """Compute the best of all islands over the generations, from each island's history."""
-    points = [one for island in history["islands"] for one in island]
-    kept: list[ArchipelagoImprovement] = []
-    for point in sorted(points, key=lambda one: (one["generation"], -one["rms"])):
-        if kept and point["rms"] >= kept[-1].rms:
+    points = [point for island in history["islands"] for point in island]
+    improvements: list[ArchipelagoImprovement] = []
+    for point in sorted(points, key=lambda point: (point["generation"], -point["rms"])):
+        if improvements and point["rms"] >= improvements[-1].rms:
             continue
         values = dict(zip(history["names"], point["parameters"], strict=True))
-        kept.append(ArchipelagoImprovement(point["generation"], point["rms"], values))
-    return kept
+        improvements.append(ArchipelagoImprovement(point["generation"], point["rms"], values))
+    return improvements

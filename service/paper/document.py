@@ -54,7 +54,9 @@ def to_markdown(section: Section) -> str:
         if table.note:
             blocks.append(table.note)
     if section.checks:
-        blocks.append("\n".join(f"- {describe_check(one)}: {one.text}" for one in section.checks))
+        blocks.append(
+            "\n".join(f"- {describe_check(check)}: {check.text}" for check in section.checks)
+        )
     return "\n\n".join(blocks) + "\n"
 
 

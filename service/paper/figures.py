@@ -40,38 +40,42 @@ def line_trace(name: str, x: Sequence[float], y: Sequence[float | None], **looks
     }
 
 
-def make_axis(title: str, **more: Any) -> dict[str, Any]:
+def make_axis(title: str, **options: Any) -> dict[str, Any]:
     """Build an axis with its title."""
-    return {"title": {"text": title}, **more}
+    return {"title": {"text": title}, **options}
 
 
-def plot_lines(data: list[Line], x: str, y: str, **more: Any) -> Figure:
+def plot_lines(data: list[Line], x: str, y: str, **layout: Any) -> Figure:
     """Draw lines in one pair of axes."""
     return {
         "data": data,
-        "layout": base_layout(HEIGHT_PX, **{"xaxis": make_axis(x), "yaxis": make_axis(y), **more}),
+        "layout": base_layout(
+            HEIGHT_PX, **{"xaxis": make_axis(x), "yaxis": make_axis(y), **layout}
+        ),
     }
 
 
 def plot_convergence(
-    found: Mapping[str, MethodRun], names: Sequence[str], true: Mapping[str, float]
+    runs: Mapping[str, MethodRun], names: Sequence[str], true: Mapping[str, float]
 ) -> Figure:
     """Draw the champion's parameters over the generations, by method, one plot per parameter."""
-    end = _last_generation(found)
+    end = _last_generation(runs)
     data: list[Line] = []
     axes: dict[str, Any] = {}
     width = 1 / len(names)
     for number, name in enumerate(names):
         tag = "" if number == 0 else str(number + 1)
-        place = {"xaxis": f"x{tag}", "yaxis": f"y{tag}", "showlegend": number == 0}
-        for method, one in found.items():
-            x = [float(point.generation) for point in one.progress]
-            y = [point.parameters[name] for point in one.progress]
+        axis_names = {"xaxis": f"x{tag}", "yaxis": f"y{tag}", "showlegend": number == 0}
+        for method, run in runs.items():
+            x = [float(point.generation) for point in run.progress]
+            y = [point.parameters[name] for point in run.progress]
             looks = {**method_style(method), "shape": "hv"}
-            data.append(line_trace(method, [*x, end], [*y, y[-1]], line=looks, **place))
+            data.append(line_trace(method, [*x, end], [*y, y[-1]], line=looks, **axis_names))
         if name in true:
             level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
-            data.append(line_trace("true value", [0, end], [true[name]] * 2, line=level, **place))
+            data.append(
+                line_trace("true value", [0, end], [true[name]] * 2, line=level, **axis_names)
+            )
         last = number + 1 == len(names)
         span = {
             "domain": [
@@ -80,29 +84,29 @@ def plot_convergence(
             ]
         }
         axes[f"xaxis{tag}"] = make_axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
-        unit = next(iter(found.values())).get_parameter(name)["unit"]
+        unit = next(iter(runs.values())).get_parameter(name)["unit"]
         axes[f"yaxis{tag}"] = make_axis(append_unit(name, unit), anchor=f"x{tag}")
     return {"data": data, "layout": base_layout(HEIGHT_PX, **axes)}
 
 
 def plot_rms_history(
-    found: Mapping[str, MethodRun], unit: str, noise: float | None = None, *, scale: float = 1.0
+    runs: Mapping[str, MethodRun], unit: str, noise: float | None = None, *, scale: float = 1.0
 ) -> Figure:
     """Draw the champion's RMS over the generations, by method, and the noise's deviation.
 
     `scale` converts the results' unit into `unit`, which is also the unit of `noise`.
     """
-    end = _last_generation(found)
+    end = _last_generation(runs)
     data = []
-    for method, one in found.items():
-        x = [float(point.generation) for point in one.progress]
-        y = [scale * point.rms for point in one.progress]
+    for method, run in runs.items():
+        x = [float(point.generation) for point in run.progress]
+        y = [scale * point.rms for point in run.progress]
         looks = {**method_style(method), "shape": "hv"}
         data.append(line_trace(method, [*x, end], [*y, y[-1]], line=looks))
     if noise is not None:
         level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
         data.append(line_trace("noise", [0, end], [noise] * 2, line=level))
-    values = [scale * point.rms for one in found.values() for point in one.progress]
+    values = [scale * point.rms for run in runs.values() for point in run.progress]
     marks = decade_marks(min(values), max(values))
     log = make_axis(f"RMS [{unit}]", type="log", tickvals=marks, ticktext=[f"{v:g}" for v in marks])
     return plot_lines(
@@ -118,22 +122,22 @@ def decade_marks(low: float, high: float) -> list[float]:
     marks = [float(f"{digit}e{power}") for power in range(first, last) for digit in (1, 2, 5)]
     below = max((v for v in marks if v <= low), default=marks[0])
     above = min((v for v in marks if v >= high), default=marks[-1])
-    kept = [v for v in marks if below <= v <= above]
-    return kept if len(kept) <= 9 else [v for v in kept if f"{v:e}".startswith("1")]
+    visible = [v for v in marks if below <= v <= above]
+    return visible if len(visible) <= 9 else [v for v in visible if f"{v:e}".startswith("1")]
 
 
-def plot_responses(found: Mapping[str, MethodRun], experiment: int = 0) -> Figure:
+def plot_responses(runs: Mapping[str, MethodRun], experiment: int = 0) -> Figure:
     """Draw the measured output and each method's model output; below, the residuals."""
-    first = next(iter(found.values())).response["experiments"][experiment]["measured"][0]
+    first = next(iter(runs.values())).response["experiments"][experiment]["measured"][0]
     dots = {"mode": "markers", "marker": {"color": theme.GREY, "size": 4}}
     data = [line_trace("measured", first["times"], first["values"], **dots)]
-    for method, one in found.items():
-        shown = one.response["experiments"][experiment]
+    for method, run in runs.items():
+        shown = run.response["experiments"][experiment]
         series, measured = shown["simulated"][0], shown["measured"][0]
         looks = method_style(method)
         data.append(line_trace(method, series["times"], series["values"], line=looks))
-        there = np.interp(measured["times"], series["times"], _to_array(series["values"]))
-        rest = (_to_array(measured["values"]) - there).tolist()
+        interpolated = np.interp(measured["times"], series["times"], _to_array(series["values"]))
+        rest = (_to_array(measured["values"]) - interpolated).tolist()
         thin = {**looks, "width": 1}
         data.append(
             line_trace(method, measured["times"], rest, line=thin, yaxis="y2", showlegend=False)
@@ -174,5 +178,5 @@ def marker_trace(name: str, x: Sequence[float], y: Sequence[float], method: str)
     return line_trace(name, x, y, mode="markers", marker=marker, showlegend=False)
 
 
-def _last_generation(found: Mapping[str, MethodRun]) -> float:
-    return float(max(one.run["generations"] for one in found.values()))
+def _last_generation(runs: Mapping[str, MethodRun]) -> float:
+    return float(max(run.run["generations"] for run in runs.values()))

@@ -32,17 +32,17 @@ NOISE_MODEL = {
 SAMPLING = {"samples": published.SAMPLES, "sample_time": published.SAMPLE_TIME}
 
 
-def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def model_document(recursion: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """Build Example 1's recursion with φ as a second input."""
     after, unit = NOISE_TERMS[kind]
-    equation = str(known["equations"]["x"])
+    equation = str(recursion["equations"]["x"])
     if equation.count(BARE_TERM) != 1:
         raise ValueError(f"the recursion {equation!r} must contain {BARE_TERM!r} exactly once")
     return {
-        **known,
+        **recursion,
         "name": f"duffing-{kind}-noise",
-        "inputs": {**known["inputs"], "phi": "1"},
-        "parameters": {**known["parameters"], "sigma": {"lower": 0, "upper": 10, "unit": unit}},
+        "inputs": {**recursion["inputs"], "phi": "1"},
+        "parameters": {**recursion["parameters"], "sigma": {"lower": 0, "upper": 10, "unit": unit}},
         "equations": {"x": equation.replace(BARE_TERM, after)},
     }
 
@@ -50,7 +50,7 @@ def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
 def build_section(bench: StudyBench, exact: str) -> Section:
     """Build the section for both kinds of noise; `exact` is the dataset without noise."""
     draws = 3 if bench.quick else 8
-    known = bench.client.model(EXAMPLE_1.recursion)["document"]
+    recursion = bench.client.model(EXAMPLE_1.recursion)["document"]
     bench.say("paper Figure 15: records with noise inside the equation")
     noise = bench.client.simulate_dataset(
         {
@@ -60,14 +60,14 @@ def build_section(bench: StudyBench, exact: str) -> Section:
             "noise": {"sigma": 1.0, "seed": 1},
         }
     )["id"]
-    force, printed = (model_document(known, kind) for kind in NOISE_TERMS)
+    force, printed = (model_document(recursion, kind) for kind in NOISE_TERMS)
     records = [
         (sigma, _simulate_record(bench, force, noise, sigma, draw))
         for sigma in FORCE_SIGMAS
         for draw in range(draws)
     ]
-    kept = [(sigma, record) for sigma, record in records if record is not None]
-    runs = bench.run_job(job_body(kept, exact))
+    stable_records = [(sigma, record) for sigma, record in records if record is not None]
+    runs = bench.run_job(job_body(stable_records, exact))
     lost = [
         (
             sigma,
@@ -143,7 +143,7 @@ def _simulate_record(
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": published.OMEGA}
     phi = {"kind": "dataset", "dataset": noise, "channel": f"phi_{draw}"}
     try:
-        made = bench.client.simulate_dataset(
+        dataset = bench.client.simulate_dataset(
             {
                 **SAMPLING,
                 "name": f"paper example 1, φ of σ {sigma:g}, draw {draw}",
@@ -156,7 +156,7 @@ def _simulate_record(
         if "diverges" not in str(problem):
             raise
         return None
-    return str(made["id"])
+    return str(dataset["id"])
 
 
 def _select_errors(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> list[float]:

@@ -65,7 +65,7 @@ def group_replicates(
     runs: Sequence[dict[str, Any]], field: str
 ) -> dict[str, list[ReplicateErrors]]:
     """Compute quantiles of one result field over the replicates, by method and σ."""
-    found: dict[str, list[ReplicateErrors]] = {}
+    groups: dict[str, list[ReplicateErrors]] = {}
     for method in METHODS:
         for sigma in SIGMAS:
             values = [
@@ -76,8 +76,10 @@ def group_replicates(
                 and run[field] is not None
             ]
             low, middle, high = (float(q) for q in np.quantile(values, QUANTILES))
-            found.setdefault(method, []).append(ReplicateErrors(sigma, values, (low, middle, high)))
-    return found
+            groups.setdefault(method, []).append(
+                ReplicateErrors(sigma, values, (low, middle, high))
+            )
+    return groups
 
 
 def response_floor(sigma: float) -> float:
@@ -89,8 +91,8 @@ def build_sections(bench: StudyBench) -> list[Section]:
     """Build the section of the sweep: a table and two figures."""
     replicates = 3 if bench.quick else 20
     record, exact = (
-        bench.client.simulate_dataset(noise_free_body(published.SAMPLES + more))["id"]
-        for more in (0, 1)
+        bench.client.simulate_dataset(noise_free_body(published.SAMPLES + additional))["id"]
+        for additional in (0, 1)
     )
     runs = bench.run_job(job_body(record, exact, replicates))
     errors, fits = group_replicates(runs, "rms_validation"), group_replicates(runs, "rms")
@@ -105,15 +107,14 @@ def build_sections(bench: StudyBench) -> list[Section]:
                 Plot(
                     "Figure 15: error of the identified response",
                     plot_spread(errors, True),
-                    "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
-                    "10 to 90 % (band) and single runs (points). The error of `improved` is "
-                    "proportional to σ from the start, along the bound σ√(p/N), without a knee. "
-                    "The paper's two methods also have a search error. It hides the noise's error "
-                    "at small σ: a flat part and a rise like the paper's. At large noise, a "
-                    "search that stops early does not fit the noise, so the simple one is no "
-                    "worse. "
-                    "The parameters' bounds keep all errors below the Cramér–Rao bound, which "
-                    "ignores them.",
+                    "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median "
+                    "(line), 10 to 90 % (band) and single runs (points). The error of "
+                    "`improved` is proportional to σ from the start, along the bound σ√(p/N), "
+                    "with no knee. The paper's two methods also have a search error. It hides "
+                    "the noise error at small σ: a flat part and a rise like the paper's. At "
+                    "large noise, a search that stops early does not fit the noise, so the "
+                    "simple one is no worse. The parameters' bounds keep all errors below the "
+                    "Cramér–Rao bound, which ignores them.",
                 ),
                 Plot(
                     "Figure 15, measured otherwise: RMS against the noisy record",
@@ -130,13 +131,13 @@ def build_sections(bench: StudyBench) -> list[Section]:
     ]
 
 
-def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
+def plot_spread(groups: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
     """Draw median, band and points over σ."""
     data = []
-    for method, spread in found.items():
-        x = [one.sigma for one in spread]
-        low, middle, high = ([one.quantiles[n] for one in spread] for n in range(3))
-        single = [(one.sigma, value) for one in spread for value in one.values]
+    for method, spread in groups.items():
+        x = [errors.sigma for errors in spread]
+        low, middle, high = ([errors.quantiles[n] for errors in spread] for n in range(3))
+        single = [(errors.sigma, value) for errors in spread for value in errors.values]
         data += [
             figures.band_trace(x, low, high, method),
             figures.marker_trace(method, [s for s, _ in single], [v for _, v in single], method),
@@ -149,11 +150,11 @@ def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> di
     return figures.plot_lines(data, "standard deviation of the noise σ [m]", "RMS error [m]")
 
 
-def _median_table(found: dict[str, list[ReplicateErrors]]) -> ReportTable:
+def _median_table(groups: dict[str, list[ReplicateErrors]]) -> ReportTable:
     rows = [
         [
             f"{sigma:g}",
-            *(f"{found[method][n].quantiles[1]:.4f}" for method in METHODS),
+            *(f"{groups[method][n].quantiles[1]:.4f}" for method in METHODS),
             f"{response_floor(sigma):.4f}",
         ]
         for n, sigma in enumerate(SIGMAS)
@@ -161,12 +162,14 @@ def _median_table(found: dict[str, list[ReplicateErrors]]) -> ReportTable:
     return ReportTable("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao bound"], rows)
 
 
-def _build_checks(found: dict[str, list[ReplicateErrors]]) -> list[Check]:
+def _build_checks(groups: dict[str, list[ReplicateErrors]]) -> list[Check]:
     ratios = [
-        one.quantiles[1] / response_floor(one.sigma) for one in found["improved"] if one.sigma > 0
+        errors.quantiles[1] / response_floor(errors.sigma)
+        for errors in groups["improved"]
+        if errors.sigma > 0
     ]
     worst = max(
-        found["improved"][n].quantiles[1] / found["simple"][n].quantiles[1]
+        groups["improved"][n].quantiles[1] / groups["simple"][n].quantiles[1]
         for n, sigma in enumerate(SIGMAS)
         if 0 < sigma <= 0.2
     )

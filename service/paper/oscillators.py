@@ -118,17 +118,17 @@ def build_sections(bench: StudyBench, example: Example) -> list[Section]:
 
 def _build_section(bench: StudyBench, example: Example, reading: EquationReading) -> Section:
     record = bench.client.simulate_dataset(record_body(example, reading))
-    found = bench.compare_methods(job_body(example, reading, record["id"]))
+    runs = bench.compare_methods(job_body(example, reading, record["id"]))
     least = reading_bound(example, reading)
     return Section(
         f"Table {example.table}, Figures {example.figures[0]} to {example.figures[-1]}: "
         f"Example {example.number}, {reading.title}",
         f"Model `{reading.model}`: {reading.remark}. {published.SAMPLES} samples, "
         f"h = {published.SAMPLE_TIME:g} s, measurement noise of sd {published.SIGMA:g} m.",
-        [estimates_table(example, found, least), efforts_table(found)],
-        build_plots(example, found),
-        build_checks(example, found, least),
-        links=[found["improved"].run["job"]],
+        [estimates_table(example, runs, least), efforts_table(runs)],
+        build_plots(example, runs),
+        build_checks(example, runs, least),
+        links=[runs["improved"].run["job"]],
     )
 
 
@@ -141,25 +141,25 @@ def reading_bound(example: Example, reading: EquationReading) -> dict[str, float
 
 
 def estimates_table(
-    example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
+    example: Example, runs: Mapping[str, MethodRun], least: Mapping[str, float]
 ) -> ReportTable:
     """Build the table of the paper's columns and ours, with standard errors and the bound."""
     rows = []
     for name, true in example.true.items():
-        unit = found["improved"].get_parameter(name)["unit"]
+        unit = runs["improved"].get_parameter(name)["unit"]
         rows.append(
             [
                 f"{name} [{unit}]",
                 f"{true:g}",
                 f"{example.columns.simple[name]:.6f}",
                 f"{example.columns.proposed[name]:.6f}",
-                *(format_estimate(found[method], name) for method in METHODS),
+                *(format_estimate(runs[method], name) for method in METHODS),
                 format_number(least[name], 2),
             ]
         )
     for name, true in example.true.items():
         printed = (example.columns.simple[name], example.columns.proposed[name])
-        ours = [found[method].get_estimate(name) for method in METHODS]
+        ours = [runs[method].get_estimate(name) for method in METHODS]
         rows.append(
             [
                 f"error of {name}",
@@ -191,43 +191,43 @@ def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
         for name, true in example.true.items()
     }
     text = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
-    told = f"The paper's proposed errors over the Cramér–Rao sd of this record: {text}"
+    comparison = f"The paper's proposed errors over the Cramér–Rao sd of this record: {text}"
     if below := [name for name, ratio in ratios.items() if ratio < 0.5]:
         return (
-            f"{told}. Errors below half of it ({', '.join(below)}) are smaller than an ideal "
+            f"{comparison}. Errors below half of it ({', '.join(below)}) are smaller than an ideal "
             "estimator's on average: a lucky draw, or less noise than here."
         )
-    return f"{told}."
+    return f"{comparison}."
 
 
-def format_estimate(found: MethodRun, name: str) -> str:
+def format_estimate(run: MethodRun, name: str) -> str:
     """Format an estimate with its standard error, or with its status if there is none."""
-    text = join_estimate(found.get_estimate(name), found.get_standard_error(name))
-    return text if "±" in text else f"{text} ({found.get_parameter(name)['status']})"
+    text = join_estimate(run.get_estimate(name), run.get_standard_error(name))
+    return text if "±" in text else f"{text} ({run.get_parameter(name)['status']})"
 
 
-def efforts_table(found: Mapping[str, MethodRun]) -> ReportTable:
+def efforts_table(runs: Mapping[str, MethodRun]) -> ReportTable:
     """Build the table of RMS and number of simulations of each method."""
     return ReportTable(
         "Search",
         ["", *METHODS],
         [
-            ["RMS [m]", *(f"{found[m].run['rms']:.6f}" for m in METHODS)],
-            ["simulations", *(str(found[m].run["evaluations"]) for m in METHODS)],
+            ["RMS [m]", *(f"{runs[m].run['rms']:.6f}" for m in METHODS)],
+            ["simulations", *(str(runs[m].run["evaluations"]) for m in METHODS)],
         ],
     )
 
 
-def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
+def build_plots(example: Example, runs: Mapping[str, MethodRun]) -> list[Plot]:
     """Draw the four figures of an example."""
     names = list(example.true)
     firsts, lasts, rms, response = example.figures
-    ends = {method: _absolute_errors(found[method], example.true) for method in METHODS}
-    reached = {method: found[method].run["rms"] for method in METHODS}
+    ends = {method: _absolute_errors(runs[method], example.true) for method in METHODS}
+    reached = {method: runs[method].run["rms"] for method in METHODS}
     return [
         Plot(
             f"Figure {number}: convergence of {' and '.join(pair)}",
-            figures.plot_convergence(found, pair, example.true),
+            figures.plot_convergence(runs, pair, example.true),
             "Paper: the proposed search continues to the true values after the simple one has "
             f"stopped. Ours: {_describe_ends(ends, pair)}",
         )
@@ -235,7 +235,7 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
     ] + [
         Plot(
             f"Figure {rms}: RMS of the best individual",
-            figures.plot_rms_history(found, "m", published.SIGMA),
+            figures.plot_rms_history(runs, "m", published.SIGMA),
             f"Paper: the simple search {example.simple_search_remark}"
             ", the proposed one continues in steps. Ours: "
             + ", ".join(f"{method} ends at {value:.5f} m" for method, value in reached.items())
@@ -243,7 +243,7 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
         ),
         Plot(
             f"Figure {response}: responses",
-            figures.plot_responses(found),
+            figures.plot_responses(runs),
             "Paper: the simple search leaves a visible residual, the proposed one lies on the "
             "exact solution. Ours: RMS over the sd of the noise is "
             + ", ".join(f"{value / published.SIGMA:.2f} ({m})" for m, value in reached.items())
@@ -252,8 +252,8 @@ def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
     ]
 
 
-def _absolute_errors(found: MethodRun, true: Mapping[str, float]) -> dict[str, float]:
-    return {name: abs(found.get_estimate(name) - value) for name, value in true.items()}
+def _absolute_errors(run: MethodRun, true: Mapping[str, float]) -> dict[str, float]:
+    return {name: abs(run.get_estimate(name) - value) for name, value in true.items()}
 
 
 def _describe_ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
@@ -265,11 +265,11 @@ def _describe_ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) ->
 
 
 def build_checks(
-    example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
+    example: Example, runs: Mapping[str, MethodRun], least: Mapping[str, float]
 ) -> list[Check]:
     """Check the paper's claim and the estimates of `improved`."""
-    rms = {method: found[method].run["rms"] for method in METHODS}
-    ours = found["improved"]
+    rms = {method: runs[method].run["rms"] for method in METHODS}
+    ours = runs["improved"]
     within = {
         name: abs(ours.get_estimate(name) - true) / least[name]
         for name, true in example.true.items()

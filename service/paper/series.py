@@ -67,7 +67,7 @@ def build_sections(bench: StudyBench) -> list[Section]:
 
 
 def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[float], list[float]]:
-    made = bench.client.simulate_dataset(
+    dataset = bench.client.simulate_dataset(
         {
             "name": f"paper Figure 2, n = {n}, T = {period:g} s",
             "model": model_document(n),
@@ -76,7 +76,7 @@ def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[flo
             "sample_time": period,
         }
     )
-    series = bench.client.signals(made["id"])["channels"][0]
+    series = bench.client.signals(dataset["id"])["channels"][0]
     return series["times"], series["values"]
 
 

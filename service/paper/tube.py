@@ -21,8 +21,8 @@ L_TOLERANCE_S, T_TOLERANCE = 0.010, 0.03
 def find_records_folder() -> Path | None:
     """Find the folder of the reference records below LAGID_DATA; None if they are absent."""
     data = os.environ.get("LAGID_DATA")
-    found = Path(data or Path("..") / "shared" / "data") / "tube_reference"
-    return found if all(one.is_file() for one in _record_files(found)) else None
+    folder = Path(data or Path("..") / "shared" / "data") / "tube_reference"
+    return folder if all(path.is_file() for path in _record_files(folder)) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +39,12 @@ def store_records(bench: StudyBench) -> TubeRecords:
     """Store the reference records of LAGID_DATA or, if absent, records of the reference plant."""
     source = find_records_folder()
     if source is not None:
-        ids = [bench.client.add_dataset(one, name=one.stem)["id"] for one in _record_files(source)]
+        ids = [
+            bench.client.add_dataset(path, name=path.stem)["id"] for path in _record_files(source)
+        ]
         return TubeRecords(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
     bench.say("paper Table 3: the reference plant makes the records, as LAGID_DATA has none")
-    made = [
+    datasets = [
         bench.client.simulate_dataset(
             {
                 "name": f"paper Table 3: tube {LENGTH_M} m, pattern {pattern}",
@@ -52,7 +54,7 @@ def store_records(bench: StudyBench) -> TubeRecords:
         )["id"]
         for pattern in (1, 2)
     ]
-    return TubeRecords(made, "P1", "P2", "LAGID_DATA has no records, so the service made them")
+    return TubeRecords(datasets, "P1", "P2", "LAGID_DATA has no records, so the service made them")
 
 
 def _record_files(source: Path) -> list[Path]:
@@ -72,7 +74,7 @@ def job_body(records: TubeRecords) -> dict[str, Any]:
             "axes": [
                 {
                     "path": "/datasets",
-                    "values": [[one] for one in records.datasets],
+                    "values": [[dataset] for dataset in records.datasets],
                     "labels": labels,
                 },
                 {"path": "/algorithm/method", "values": list(METHODS)},
@@ -85,29 +87,33 @@ def build_sections(bench: StudyBench) -> list[Section]:
     """Build the section."""
     records = store_records(bench)
     runs = bench.run_job(job_body(records))
-    found: list[dict[str, MethodRun]] = [{}, {}]
+    by_pattern: list[dict[str, MethodRun]] = [{}, {}]
     for run in runs:
         pattern = int(run["labels"]["pattern"]) - 1
-        found[pattern][run["cell"]["/algorithm/method"]] = bench.read_run(run)
+        by_pattern[pattern][run["cell"]["/algorithm/method"]] = bench.read_run(run)
     return [
         Section(
             TITLE,
             "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to the "
             f"pressure at the other. {records.origin}: a gas-dynamic model of the paper's tube "
             "with 12-bit gauges and noise of 0.5 kPa. The paper's own records are not published.",
-            [_estimates_table(found)],
-            [plot for n, one in enumerate(found) for plot in _build_plots(bench, n, one, records)],
-            build_checks(found),
+            [_estimates_table(by_pattern)],
+            [
+                plot
+                for n, by_method in enumerate(by_pattern)
+                for plot in _build_plots(bench, n, by_method, records)
+            ],
+            build_checks(by_pattern),
             links=[runs[0]["job"]],
         )
     ]
 
 
-def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
+def _estimates_table(by_pattern: list[dict[str, MethodRun]]) -> ReportTable:
     rows = []
     for name in PARAMETER_NAMES:
-        unit = found[0]["improved"].get_parameter(name)["unit"]
-        for n, by_method in enumerate(found):
+        unit = by_pattern[0]["improved"].get_parameter(name)["unit"]
+        for n, by_method in enumerate(by_pattern):
             printed = published.TABLE_3[n]
             label = name if unit == "1" else f"{name} [{unit}]"
             rows.append(
@@ -118,7 +124,7 @@ def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
                     *(format_estimate(by_method[method], name) for method in METHODS),
                 ]
             )
-    for n, by_method in enumerate(found):
+    for n, by_method in enumerate(by_pattern):
         rms = (f"{by_method[m].run['rms'] / 1e3:.3f}" for m in METHODS)
         rows.append([f"RMS [kPa], pattern {n + 1}", "", "", *rms])
     return ReportTable(
@@ -131,30 +137,30 @@ def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
 
 
 def _build_plots(
-    bench: StudyBench, number: int, found: Mapping[str, MethodRun], records: TubeRecords
+    bench: StudyBench, number: int, runs: Mapping[str, MethodRun], records: TubeRecords
 ) -> list[Plot]:
     pattern = number + 1
-    rms = ", ".join(f"{m} ends at {found[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
+    rms = ", ".join(f"{m} ends at {runs[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
     return [
         Plot(
             f"Figure 17: input and output, pattern {pattern}",
-            _plot_signals(bench, found, records, number),
+            _plot_signals(bench, runs, records, number),
             "Paper: the outlet follows the inlet late and smoothed. Ours: the same, with the "
             "response of the model identified by `improved`.",
         ),
         Plot(
             f"Figure 18: RMS of the best individual, pattern {pattern}",
-            figures.plot_rms_history(found, "kPa", scale=1e-3),
+            figures.plot_rms_history(runs, "kPa", scale=1e-3),
             f"Paper: the error of the proposed search is smaller. Ours: {rms}.",
         ),
     ]
 
 
 def _plot_signals(
-    bench: StudyBench, found: Mapping[str, MethodRun], records: TubeRecords, number: int
+    bench: StudyBench, runs: Mapping[str, MethodRun], records: TubeRecords, number: int
 ) -> dict[str, Any]:
     answer = bench.client.signals(records.datasets[number], 900)
-    channels = {one["name"]: one for one in answer["channels"]}
+    channels = {channel["name"]: channel for channel in answer["channels"]}
     looks = {records.inlet: (theme.GREEN, "inlet (1)"), records.outlet: (theme.GREY, "outlet (2)")}
     data = [
         figures.line_trace(
@@ -165,7 +171,7 @@ def _plot_signals(
         )
         for name, (colour, text) in looks.items()
     ]
-    model = found["improved"].response["experiments"][0]["simulated"][0]
+    model = runs["improved"].response["experiments"][0]["simulated"][0]
     dashed = {**figures.method_style("improved"), "dash": "dash", "width": 1.4}
     data.append(figures.line_trace("model", model["times"], _to_kilo(model["values"]), line=dashed))
     return figures.plot_lines(data, "time [s]", "pressure [kPa absolute]")
@@ -175,9 +181,9 @@ def _to_kilo(values: list[float | None]) -> list[float | None]:
     return [None if value is None else value / 1e3 for value in values]
 
 
-def build_checks(found: list[dict[str, MethodRun]]) -> list[Check]:
+def build_checks(by_pattern: list[dict[str, MethodRun]]) -> list[Check]:
     """Check that the two patterns give the same tube."""
-    first, second = (one["improved"] for one in found)
+    first, second = (by_method["improved"] for by_method in by_pattern)
     lag = abs(first.get_estimate("L") - second.get_estimate("L"))
     constant = abs(first.get_estimate("T") - second.get_estimate("T")) / first.get_estimate("T")
     return [
