@@ -1,1 +1,1 @@
-"""Recordings: records, holds, initial history, resampling, splitting, derivation, noise."""
+"""Recordings: channels, holds, history, resampling, splitting, derivation, noise."""

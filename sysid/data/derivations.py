@@ -1,7 +1,7 @@
-"""Recordings made from recordings: pure functions, named and parametrised by plain values.
+"""Derivation of recordings from recordings, by steps with plain values.
 
 A step is a mapping with one key, such as ``{"trim": {"start": 2, "stop": 8}}``. The steps of a
-list are taken one after the other.
+list are applied in order.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,22 +30,22 @@ StepFunction = Callable[[Recording, StepArguments], Recording]
 
 
 def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recording:
-    """Take all steps.
+    """Apply derivation steps to a recording, in order.
 
     Raises
     ------
     InvalidSettings
-        With the JSON pointer of what cannot be used, such as ``/steps/2/pool/bin``.
+        With the JSON pointer of the invalid part, such as ``/steps/2/pool/bin``.
     """
     if not isinstance(steps, list | tuple) or not steps:
         raise InvalidSettings("/steps", f"found {steps!r}; need a list with one step or more")
-    for place, step in enumerate(steps):
+    for number, step in enumerate(steps):
         if not isinstance(step, Mapping) or len(step) != 1:
             raise InvalidSettings(
-                f"/steps/{place}", f"found {step!r}; need an object with one key, the step's name"
+                f"/steps/{number}", f"found {step!r}; need an object with one key, the step's name"
             )
         ((name, value),) = step.items()
-        pointer = f"/steps/{place}/{name}"
+        pointer = f"/steps/{number}/{name}"
         if name not in STEPS:
             raise InvalidSettings(pointer, f"there is no such step{suggest_name(str(name), STEPS)}")
         try:
@@ -55,31 +55,33 @@ def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -
     return recording
 
 
-def add_noise(recording: Recording, given: StepArguments) -> Recording:
+def add_noise(recording: Recording, arguments: StepArguments) -> Recording:
     """Add noise of standard deviation `sigma` (in the channel's unit) to the named channels.
 
-    The draw depends on the seed and on the channel's place in the list, as the noise of a job
-    depends on the output's place: the same numbers either way.
+    The draw depends on the seed and on the channel's position in the list. The noise of a job
+    depends on the output's position in the same way, so the numbers are equal.
     """
-    given.reject_others("sigma", "seed", "channels", "kind", "terms", "mean")
-    names = given.read_texts("channels")
+    arguments.reject_others("sigma", "seed", "channels", "kind", "terms", "mean")
+    names = arguments.read_texts("channels")
     try:
         noise = Noise(
-            given.read_number("sigma"),
-            given.read_whole_number("seed", 0),
-            given.read_choice("kind", NOISE_KINDS, "gaussian"),
-            given.read_whole_number("terms", 12, most=1000),
-            given.read_number("mean", 0.0),
+            arguments.read_number("sigma"),
+            arguments.read_whole_number("seed", 0),
+            arguments.read_choice("kind", NOISE_KINDS, "gaussian"),
+            arguments.read_whole_number("terms", 12, most=1000),
+            arguments.read_number("mean", 0.0),
         )
     except InvalidSettings as error:
-        given.fail(error.pointer.rpartition("/")[2], error.detail)
+        arguments.fail(error.pointer.rpartition("/")[2], error.detail)
     return _change_channels(
-        recording, names, lambda one: _add_channel_noise(one, noise, names.index(one.name))
+        recording,
+        names,
+        lambda channel: _add_channel_noise(channel, noise, names.index(channel.name)),
     )
 
 
 def _add_channel_noise(channel: Channel, noise: Noise, stream: int) -> Channel:
-    """Noise on the samples first, so that their draw is the same with a history and without."""
+    """Add noise; the samples are drawn first, so that a history does not change their draw."""
     size, history = channel.values.size, channel.history
     if history is None:
         return replace(channel, values=channel.values + draw_noise(noise, size, stream))
@@ -91,155 +93,167 @@ def _add_channel_noise(channel: Channel, noise: Noise, stream: int) -> Channel:
     )
 
 
-def trim_recording(recording: Recording, given: StepArguments) -> Recording:
+def trim_recording(recording: Recording, arguments: StepArguments) -> Recording:
     """Keep a span of time (`start` to `stop`, s) or of samples (`rows`: [first, last + 1]).
 
-    What was recorded before the span goes with it as history, unless `history` is false.
+    Samples before the span become its history, unless `history` is false.
     """
-    given.reject_others("start", "stop", "rows", "history")
-    if given.has_argument("rows"):
-        if given.has_argument("start") or given.has_argument("stop"):
-            given.fail(
+    arguments.reject_others("start", "stop", "rows", "history")
+    if arguments.has_argument("rows"):
+        if arguments.has_argument("start") or arguments.has_argument("stop"):
+            arguments.fail(
                 "rows", "cannot be combined with start or stop; give rows, or start and stop"
             )
-        return _attach_or_drop_history(_cut_rows(recording, given), recording, given)
-    if not given.has_argument("start") and not given.has_argument("stop"):
-        given.fail("", "need start, stop (seconds), or rows")
-    start = given.read_number("start", recording.start)
-    stop = given.read_number("stop", recording.stop)
+        return _attach_or_drop_history(_cut_rows(recording, arguments), recording, arguments)
+    if not arguments.has_argument("start") and not arguments.has_argument("stop"):
+        arguments.fail("", "need start, stop (seconds), or rows")
+    start = arguments.read_number("start", recording.start)
+    stop = arguments.read_number("stop", recording.stop)
     if stop <= start:
-        given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
-    return _attach_or_drop_history(_cut_span(recording, start, stop), recording, given)
+        arguments.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
+    return _attach_or_drop_history(_cut_span(recording, start, stop), recording, arguments)
 
 
-def _attach_or_drop_history(part: Recording, whole: Recording, given: StepArguments) -> Recording:
-    if given.read_flag("history", default=True):
+def _attach_or_drop_history(
+    part: Recording, whole: Recording, arguments: StepArguments
+) -> Recording:
+    if arguments.read_flag("history", default=True):
         return attach_history(part, whole)
     return drop_history(part)
 
 
-def _cut_rows(recording: Recording, given: StepArguments) -> Recording:
-    first, last = given.read_range("rows")
+def _cut_rows(recording: Recording, arguments: StepArguments) -> Recording:
+    first, last = arguments.read_range("rows")
     times = recording.channels[0].times
-    if any(not np.array_equal(one.times, times) for one in recording.channels):
-        given.fail("rows", "the channels have different times; give start and stop in seconds")
+    if any(not np.array_equal(channel.times, times) for channel in recording.channels):
+        arguments.fail("rows", "the channels have different times; give start and stop in seconds")
     if last > times.size:
-        given.fail("rows", f"found [{first}, {last}]; the recording has {times.size} rows")
+        arguments.fail("rows", f"found [{first}, {last}]; the recording has {times.size} rows")
     channels = tuple(
-        replace(one, times=one.times[first:last], values=one.values[first:last], history=None)
-        for one in recording.channels
+        replace(
+            channel,
+            times=channel.times[first:last],
+            values=channel.values[first:last],
+            history=None,
+        )
+        for channel in recording.channels
     )
     return Recording(channels, _clip_segments(recording.segments, times[first], times[last - 1]))
 
 
 def _cut_span(recording: Recording, start: float, stop: float) -> Recording:
-    channels = tuple(one.slice_time(start, stop) for one in recording.channels)
+    channels = tuple(channel.slice_time(start, stop) for channel in recording.channels)
     return Recording(channels, _clip_segments(recording.segments, start, stop))
 
 
 def _clip_segments(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[Segment, ...]:
     return tuple(
         replace(
-            one,
-            start=float(max(one.start, start)),
-            stop=float(min(one.stop, stop)),
-            origin=float(one.origin + max(start - one.start, 0.0)),
+            segment,
+            start=float(max(segment.start, start)),
+            stop=float(min(segment.stop, stop)),
+            origin=float(segment.origin + max(start - segment.start, 0.0)),
         )
-        for one in segments
-        if one.start <= stop and one.stop >= start
+        for segment in segments
+        if segment.start <= stop and segment.stop >= start
     )
 
 
-def split_recording(recording: Recording, given: StepArguments) -> Recording:
-    """Keep one part: the last `fraction` of the samples (``validation``) or what comes before.
+def split_recording(recording: Recording, arguments: StepArguments) -> Recording:
+    """Keep the last `fraction` of the samples (``validation``) or those before (``estimation``).
 
-    What was recorded before the part goes with it as history, unless `history` is false.
+    Samples before the part become its history, unless `history` is false.
     """
-    given.reject_others("fraction", "part", "history")
-    part = given.read_choice("part", ("estimation", "validation"))
-    longest = max((one.times for one in recording.channels), key=len)
-    cut = find_cut_time(longest, given.read_number("fraction"), f"{given.pointer}/fraction")
+    arguments.reject_others("fraction", "part", "history")
+    part = arguments.read_choice("part", ("estimation", "validation"))
+    longest = max((channel.times for channel in recording.channels), key=len)
+    cut = find_cut_time(longest, arguments.read_number("fraction"), f"{arguments.pointer}/fraction")
     if part == "validation":
-        return _attach_or_drop_history(_cut_span(recording, cut, np.inf), recording, given)
+        return _attach_or_drop_history(_cut_span(recording, cut, np.inf), recording, arguments)
     before = _cut_span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
-    return _attach_or_drop_history(before, recording, given)
+    return _attach_or_drop_history(before, recording, arguments)
 
 
-def detrend_channels(recording: Recording, given: StepArguments) -> Recording:
-    """Subtract the mean or the straight line of least squares; missing values do not count."""
-    given.reject_others("kind", "channels")
-    degree = ("mean", "linear").index(given.read_choice("kind", ("mean", "linear"), "mean"))
+def detrend_channels(recording: Recording, arguments: StepArguments) -> Recording:
+    """Subtract the mean or the least-squares line; missing values are ignored."""
+    arguments.reject_others("kind", "channels")
+    degree = ("mean", "linear").index(arguments.read_choice("kind", ("mean", "linear"), "mean"))
     names = (
-        given.read_texts("channels") if given.has_argument("channels") else list(recording.names)
+        arguments.read_texts("channels")
+        if arguments.has_argument("channels")
+        else list(recording.names)
     )
 
-    def flat(channel: Channel) -> Channel:
-        known = np.isfinite(channel.values)
-        if np.count_nonzero(known) <= degree:
-            given.fail("", f"channel {channel.name!r} has too few values")
-        trend = np.polynomial.Polynomial.fit(channel.times[known], channel.values[known], degree)
+    def detrend(channel: Channel) -> Channel:
+        is_present = np.isfinite(channel.values)
+        if np.count_nonzero(is_present) <= degree:
+            arguments.fail("", f"channel {channel.name!r} has too few values")
+        trend = np.polynomial.Polynomial.fit(
+            channel.times[is_present], channel.values[is_present], degree
+        )
         return change_values(channel, lambda times, values: np.asarray(values - trend(times)))
 
-    return _change_channels(recording, names, flat)
+    return _change_channels(recording, names, detrend)
 
 
-def subtract_offset(recording: Recording, given: StepArguments) -> Recording:
+def subtract_offset(recording: Recording, arguments: StepArguments) -> Recording:
     """Subtract a number from each named channel."""
-    offsets = {name: given.read_number(name) for name, _ in given.get_items()}
+    offsets = {name: arguments.read_number(name) for name, _ in arguments.get_items()}
     return _change_channels(
         recording,
         list(offsets),
-        lambda one: change_values(one, lambda _, values: values - offsets[one.name]),
+        lambda channel: change_values(channel, lambda _, values: values - offsets[channel.name]),
     )
 
 
-def set_hold(recording: Recording, given: StepArguments) -> Recording:
-    """Say what named channels do between their samples, when they are inputs."""
+def set_hold(recording: Recording, arguments: StepArguments) -> Recording:
+    """Set the intersample behaviour of named channels, for use as inputs."""
     return recording.replace_holds(
-        {name: given.read_choice(name, HOLDS) for name, _ in given.get_items()}
+        {name: arguments.read_choice(name, HOLDS) for name, _ in arguments.get_items()}
     )
 
 
-def set_unit(recording: Recording, given: StepArguments) -> Recording:
-    """Convert named channels to other units; of one that has none the unit is only written down."""
-    units = {name: given.read_text(name) for name, _ in given.get_items()}
-    made = {}
+def set_unit(recording: Recording, arguments: StepArguments) -> Recording:
+    """Convert named channels to other units; a channel without a unit is only labelled."""
+    units = {name: arguments.read_text(name) for name, _ in arguments.get_items()}
+    converted = {}
     for name, unit in units.items():
         channel = recording.channel(name)
-        times = (
+        factor = (
             1.0
             if is_blank_unit(channel.unit) or is_blank_unit(unit)
             else find_conversion_factor(channel.unit, unit)
         )
-        if times is None:
-            unread = [f"{one!r}" for one in (channel.unit, unit) if not is_readable_unit(one)]
-            told = (
+        if factor is None:
+            unread = [f"{text!r}" for text in (channel.unit, unit) if not is_readable_unit(text)]
+            difference = (
                 describe_difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
             )
             need = f"need a unit of the same quantity as {channel.unit}"
-            given.fail(name, f"{told}; {need}{suggest_unit(unit)}")
-        made[name] = replace(_scale_channel(channel, times), unit=unit.strip() or "1")
-    channels = tuple(made.get(one.name, one) for one in recording.channels)
+            arguments.fail(name, f"{difference}; {need}{suggest_unit(unit)}")
+        converted[name] = replace(_scale_channel(channel, factor), unit=unit.strip() or "1")
+    channels = tuple(converted.get(channel.name, channel) for channel in recording.channels)
     return replace(recording, channels=channels)
 
 
-def _scale_channel(channel: Channel, by: float) -> Channel:
-    return channel if by == 1.0 else change_values(channel, lambda _, values: values * by)
+def _scale_channel(channel: Channel, factor: float) -> Channel:
+    return channel if factor == 1.0 else change_values(channel, lambda _, values: values * factor)
 
 
-def rename_channels(recording: Recording, given: StepArguments) -> Recording:
-    """Give channels other names."""
-    names = {old: given.read_text(old) for old, _ in given.get_items()}
+def rename_channels(recording: Recording, arguments: StepArguments) -> Recording:
+    """Rename channels."""
+    names = {old: arguments.read_text(old) for old, _ in arguments.get_items()}
     for old in names:
         recording.channel(old)
     renamed = [names.get(name, name) for name in recording.names]
     for name in renamed:
         if not name or renamed.count(name) > 1:
-            given.fail("", f"two channels would be called {name!r}, or a channel has no name")
+            arguments.fail("", f"two channels would be called {name!r}, or a channel has no name")
     return replace(
         recording,
         channels=tuple(
-            replace(one, name=name) for one, name in zip(recording.channels, renamed, strict=True)
+            replace(channel, name=name)
+            for channel, name in zip(recording.channels, renamed, strict=True)
         ),
     )
 
@@ -251,7 +265,9 @@ def _change_channels(
         recording.channel(name)
     return replace(
         recording,
-        channels=tuple(change(one) if one.name in names else one for one in recording.channels),
+        channels=tuple(
+            change(channel) if channel.name in names else channel for channel in recording.channels
+        ),
     )
 
 

@@ -1,8 +1,8 @@
-"""What recordings that are cut out of others keep of what was recorded before them.
+"""History: the samples before a recording that was cut out of a longer one.
 
-For t < L a model reads u(t - L) from before the record's first sample. Where a record was cut out
-of a longer one that input is known, so it goes with the record: as history, which lags read and
-nothing is compared with.
+For t < L a model reads u(t - L) from before the record's first sample. If the record was cut out
+of a longer one, these samples were measured. They are stored as history. Delays read it; the loss
+does not.
 """
 
 from collections.abc import Callable
@@ -14,42 +14,44 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Recording, Segment
 
 INTERPOLATION_MARGIN = 128
-"""Samples besides those that a lag can reach: between them a band-limited input is interpolated."""
+"""Samples beyond the longest delay, for the interpolation of a band-limited input."""
 
 
 def attach_history(part: Recording, whole: Recording) -> Recording:
-    """A recording with what the one it was cut out of holds before it.
+    """Attach to a part of a recording the samples before it as history.
 
-    As long as the part itself: no lag may be longer than the record it is found from. Where the
-    recording has segments, of the segment that is cut only, since each was measured on its own.
+    The history is as long as the part, because no delay may be longer than its record. With
+    segments it is limited to the segment that is cut, since each was measured on its own.
     """
     earliest = part.start - part.duration
-    since = -np.inf
+    segment_start = -np.inf
     if part.segments:
-        since = _find_segment_start(whole.segments, part.segments[0].start)
+        segment_start = _find_segment_start(whole.segments, part.segments[0].start)
     channels = tuple(
-        _limit_history(one.prepend_history(whole.channel(one.name)), earliest, since)
-        for one in part.channels
+        _limit_history(
+            channel.prepend_history(whole.channel(channel.name)), earliest, segment_start
+        )
+        for channel in part.channels
     )
     return replace(part, channels=channels)
 
 
 def drop_history(recording: Recording) -> Recording:
-    """The recording as if nothing were known of what was before it."""
+    """Remove the history of all channels."""
     return replace(
-        recording, channels=tuple(replace(one, history=None) for one in recording.channels)
+        recording, channels=tuple(replace(channel, history=None) for channel in recording.channels)
     )
 
 
 def change_values(
     channel: Channel, change: Callable[[FloatArray, FloatArray], FloatArray]
 ) -> Channel:
-    """The channel with other values, those of its history changed by the same rule.
+    """Change the values of a channel and of its history by the same rule.
 
     Parameters
     ----------
     change : callable
-        From times (N,) and values (N,) to values (N,).
+        Maps times (N,) and values (N,) to new values (N,).
     """
     history = channel.history
     if history is not None:
@@ -58,18 +60,18 @@ def change_values(
 
 
 def _find_segment_start(segments: tuple[Segment, ...], start: float) -> float:
-    """From when on the segment goes that holds this time; the first one's history is its own."""
+    """Find where the segment at a time starts; -inf for the first, which has its own history."""
     if start <= segments[0].stop:
         return -np.inf
-    return max(one.start for one in segments if one.start <= start)
+    return max(segment.start for segment in segments if segment.start <= start)
 
 
-def _limit_history(channel: Channel, earliest: float, since: float) -> Channel:
+def _limit_history(channel: Channel, earliest: float, segment_start: float) -> Channel:
     if channel.history is None:
         return channel
     times, values = channel.history
     reached = max(int(np.searchsorted(times, earliest)) - INTERPOLATION_MARGIN, 0)
-    first = max(reached, int(np.searchsorted(times, since)))
+    first = max(reached, int(np.searchsorted(times, segment_start)))
     if first == times.size:
         return replace(channel, history=None)
     return replace(channel, history=History(times[first:].copy(), values[first:].copy()))

@@ -1,4 +1,4 @@
-"""Inputs between their samples: each is laid once onto a fine uniform grid that kernels read."""
+"""Interpolation of inputs onto the fine uniform grid that kernels read."""
 
 from dataclasses import dataclass, replace
 from math import ceil
@@ -11,14 +11,14 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, measure_sampling, trim_missing_history
 
 POINTS_PER_SAMPLE = 8
-"""Fine points in a sampling period where the signal between samples is not a straight line."""
+"""Fine points in a sampling period if the signal between samples is not a straight line."""
 
 MAX_POINTS_PER_STEP = 64
-"""Fine points in an integration step at most."""
+"""Most fine points in an integration step."""
 
-_JITTER = 0.05  # of a fine point, that times written with few digits are off
+_JITTER = 0.05  # of a fine point: rounding error of times with few digits
 
-_PERIOD_TOLERANCE = 0.05  # of a sampling period, that samples count as regular
+_PERIOD_TOLERANCE = 0.05  # of a sampling period: deviation that counts as regular
 _HALF_WIDTH = 48  # of the band-limited interpolation, in samples
 _KAISER = 8.0  # 80 dB
 
@@ -30,16 +30,16 @@ class FineInput:
     Attributes
     ----------
     values : FloatArray
-    zero : int
+    start_index : int
         Index of the value at the start of the simulation.
-    points : int
+    points_per_step : int
         Fine points in an integration step.
     begin, end : int
         Where a step begins and ends, in fine points from its start. At a jump the grid holds the
-        mean of both sides, so that a lagged jump is not displaced; an input without lag is read
-        one point behind the jump and one before it.
-    cap : int
-        Fine points before the start.
+        mean of both sides, so that a delayed jump is not displaced. An input without delay is
+        read one point after the jump and one before the next.
+    max_delay : int
+        Largest delay, in fine points.
     """
 
     values: FloatArray
@@ -58,61 +58,68 @@ def interpolate_input(
     lag: float,
     mean: Literal["around", "after"] | None = None,
 ) -> FineInput:
-    """Lay an input onto the fine grid.
+    """Interpolate an input onto the fine grid.
 
-    A held input that is read with an unknown lag is given as its mean over one integration step,
-    `around` the time for a solver, `after` it for a recursion. Read as it is, its jumps would fall
-    between the places that a step looks at, and the response would be a staircase in the lag. The
-    mean over a step enters whole, however the jump lies: the response is as smooth in the lag as
-    the plant makes it, and at whole lags it is what it was.
+    A held input with an unknown delay is replaced by its mean over one integration step: `around`
+    the time for a solver, `after` it for a recursion. Without the mean, its jumps would fall
+    between the points that a step reads. The response would then be a staircase in the delay. The
+    mean contains each jump completely, so the response is as smooth in the delay as the plant
+    makes it. At whole delays the response is unchanged.
 
-    Before its first sample the input is what its history says, and before that its first value.
+    Before its first sample the input is its history; before that it is its first value.
 
     Parameters
     ----------
     start, step, steps : float, float, int
-        First time of the simulation, its integration step, both in s, and how many steps follow.
+        First time of the simulation (s), integration step (s), and number of steps.
     lag : float
-        Largest lag with which the input is read, in steps.
+        Largest delay of the input, in steps.
     mean : {"around", "after"} or None
-        How a held input is averaged; None: it is not.
+        Averaging of a held input; None: none.
     """
     channel = _join_usable_history(channel)
-    points = _count_points(channel, start, step)
-    cap = ceil(lag * points) + 2
-    count = cap + (steps + 2) * points + 2
-    times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (step / points)
+    points_per_step = _count_points(channel, start, step)
+    cap = ceil(lag * points_per_step) + 2
+    count = cap + (steps + 2) * points_per_step + 2
+    times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (
+        step / points_per_step
+    )
     if mean is not None and channel.hold == "zero" and channel.times.size > 1:
-        early = 0.5 * step if mean == "around" else 0.0
-        values = average_held(channel, times - early, step)
-        return FineInput(values, cap, points, 0, points, max(cap - 2, 0))
+        advance = 0.5 * step if mean == "around" else 0.0
+        values = average_held(channel, times - advance, step)
+        return FineInput(values, cap, points_per_step, 0, points_per_step, max(cap - 2, 0))
     jump = 1 if channel.hold == "zero" else 0
     return FineInput(
-        interpolate_channel(channel, times), cap, points, jump, points - jump, max(cap - 2, 0)
+        interpolate_channel(channel, times),
+        cap,
+        points_per_step,
+        jump,
+        points_per_step - jump,
+        max(cap - 2, 0),
     )
 
 
 def _join_usable_history(channel: Channel) -> Channel:
-    """Known history and samples together; of a band-limited channel what keeps its period.
+    """Join history and samples; of a band-limited channel only the regular part of the history.
 
-    Between irregular samples nothing is band-limited, and a gap in what was recorded before must
-    not make a record useless that is regular itself.
+    Band-limited interpolation needs regular samples. A gap in the history must not make a regular
+    record unusable.
     """
-    known = trim_missing_history(channel.history)
-    channel = replace(channel, history=known)
-    if known is None or channel.hold != "band-limited":
+    recorded = trim_missing_history(channel.history)
+    channel = replace(channel, history=recorded)
+    if recorded is None or channel.hold != "band-limited":
         return channel.history_and_samples
     period = (channel.times[-1] - channel.times[0]) / max(channel.times.size - 1, 1)
-    times, values = known
+    times, values = recorded
     expected = channel.times[0] - period * np.arange(times.size, 0, -1)
-    off = np.flatnonzero(np.abs(times - expected) >= 0.5 * _PERIOD_TOLERANCE * period)
-    first = int(off[-1]) + 1 if off.size else 0
+    irregular = np.flatnonzero(np.abs(times - expected) >= 0.5 * _PERIOD_TOLERANCE * period)
+    first = int(irregular[-1]) + 1 if irregular.size else 0
     usable = History(times[first:], values[first:]) if first < times.size else None
     return replace(channel, history=usable).history_and_samples
 
 
 def _count_points(channel: Channel, start: float, step: float) -> int:
-    """Fine points in a step: an even number, so that half steps are fine points too."""
+    """Count the fine points in a step; even, so that half steps are fine points too."""
     period = estimate_sampling_period(channel)
     if period is None:
         return 2
@@ -130,14 +137,14 @@ def _is_aligned(times: FloatArray, start: float, spacing: float) -> bool:
 
 
 def estimate_sampling_period(channel: Channel) -> float | None:
-    """Median distance of neighbouring samples in s; None if no two have different times."""
+    """Estimate the sampling period (s) as a median; None if all times are equal."""
     steps = np.diff(channel.times)
     steps = steps[steps > 0]
     return float(np.median(steps)) if steps.size else None
 
 
 def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
-    """Values of a channel at any times, by its hold; its end values outside its samples."""
+    """Interpolate a channel by its hold; outside its samples its end values hold."""
     if channel.hold == "first" or channel.times.size < 2:
         return np.interp(times, channel.times, channel.values)
     if channel.hold == "zero":
@@ -146,34 +153,34 @@ def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
 
 
 def _interpolate_held(channel: Channel, times: FloatArray) -> FloatArray:
-    """The last sample's value; the mean of both sides where the time is a sample's own."""
+    """Read the last sample's value; at a sample's own time the mean of both sides."""
     tolerance = 1e-6 * (estimate_sampling_period(channel) or 1.0)
     last = channel.times.size - 1
     after = np.searchsorted(channel.times, times + tolerance, side="right") - 1
     before = np.searchsorted(channel.times, times - tolerance, side="right") - 1
     values = channel.values
-    found: FloatArray = 0.5 * (values[np.clip(after, 0, last)] + values[np.clip(before, 0, last)])
-    return found
+    means: FloatArray = 0.5 * (values[np.clip(after, 0, last)] + values[np.clip(before, 0, last)])
+    return means
 
 
 def average_held(channel: Channel, times: FloatArray, width: float) -> FloatArray:
-    """Mean of a held channel over [t, t + width]: the difference of its integral, by `width`."""
+    """Average a held channel over [t, t + width]: difference of its integral over `width`."""
     values, far = channel.values, width + float(np.ptp(times)) + float(np.ptp(channel.times))
     knots = np.concatenate([[channel.times[0] - far], channel.times, [channel.times[-1] + far]])
     held = np.concatenate([values[:1], values])
-    # Counted from the first value, so that a constant stays exactly that.
+    # Relative to the first value, so that a constant stays exact.
     integral = np.concatenate([[0.0], np.cumsum((held - values[0]) * np.diff(knots))])
     rise = np.interp(times + width, knots, integral) - np.interp(times, knots, integral)
-    found: FloatArray = values[0] + rise / width
-    return found
+    means: FloatArray = values[0] + rise / width
+    return means
 
 
 def _interpolate_band_limited(channel: Channel, times: FloatArray) -> FloatArray:
-    """Kaiser-windowed sinc to `POINTS_PER_SAMPLE` points a sample, then a cubic spline through those.
+    """Interpolate by a Kaiser-windowed sinc to `POINTS_PER_SAMPLE`, then by a cubic spline.
 
-    The record is continued at both ends by its point reflection, which keeps value and slope.
+    The record is extended at both ends by point reflection, which keeps value and slope.
     """
-    # Here, as they take most of a second to import and few inputs need them.
+    # Imported here: it takes most of a second, and few inputs need it.
     from scipy.interpolate import CubicSpline
     from scipy.signal import upfirdn
 
@@ -194,5 +201,5 @@ def _interpolate_band_limited(channel: Channel, times: FloatArray) -> FloatArray
     inside = np.clip(times, channel.times[0], channel.times[-1])
     if dense.size == 0:
         return np.interp(times, channel.times, values)
-    found: FloatArray = CubicSpline(places, dense)(inside)
-    return found
+    interpolated: FloatArray = CubicSpline(places, dense)(inside)
+    return interpolated

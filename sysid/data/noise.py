@@ -1,6 +1,6 @@
 """Noise added to a record before fitting, for studies of sensitivity (Eq. 19, 20).
 
-Reading of Eq. 19: φ = χ + σξ, so `sigma` is a standard deviation. Reading of Eq. 20: ψ is uniform
+Interpretation of Eq. 19: φ = χ + σξ, so `sigma` is a standard deviation. Of Eq. 20: ψ is uniform
 in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and excess kurtosis −1.2/N.
 """
 
@@ -53,7 +53,7 @@ class Noise:
 
 
 def draw_noise(noise: Noise, n: int, stream: int = 0) -> FloatArray:
-    """`n` samples of φ (Eq. 19); `stream` tells channels apart."""
+    """Draw `n` samples of φ (Eq. 19); each channel has its own `stream`."""
     generator = np.random.Generator(np.random.Philox(key=[noise.seed, stream]))
     if noise.kind == "gaussian":
         unit = generator.standard_normal(n)
@@ -64,7 +64,7 @@ def draw_noise(noise: Noise, n: int, stream: int = 0) -> FloatArray:
 
 
 def add_output_noise(record: Record, noise: Noise, experiment: int = 0) -> Record:
-    """The record with noise on every output; inputs stay."""
+    """Add noise to every output of a record; the inputs stay unchanged."""
     if noise.sigma == 0 and noise.mean == 0:
         return record
     outputs = tuple(

@@ -1,4 +1,4 @@
-"""Repeats of a measurement: choosing some of them, and pooling them into one record."""
+"""Selection of repeated measurements (segments), and their pooling into one record."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,20 +15,22 @@ SegmentLabel = float | str
 LabelCondition = Callable[[SegmentLabel], bool]
 
 
-def select_segments(recording: Recording, given: StepArguments) -> Recording:
-    """Segments whose labels satisfy every condition; they keep their place on the time axis.
+def select_segments(recording: Recording, arguments: StepArguments) -> Recording:
+    """Select segments whose labels satisfy every condition; their times stay unchanged.
 
     A condition is a value, a list of values, ``{"modulus": m, "remainder": r}``, or
     ``{"min": a, "max": b}``.
     """
     if not recording.segments:
-        given.fail("", "the recording has no segments; name its label columns on upload")
-    conditions = {name: _parse_condition(name, value, given) for name, value in given.get_items()}
+        arguments.fail("", "the recording has no segments; name its label columns on upload")
+    conditions = {
+        name: _parse_condition(name, value, arguments) for name, value in arguments.get_items()
+    }
     for name in conditions:
-        known = {label for segment in recording.segments for label in segment.labels}
-        if name not in known:
-            given.fail(name, f"no segment has such a label{suggest_name(name, known)}")
-    kept = tuple(
+        labels = {label for segment in recording.segments for label in segment.labels}
+        if name not in labels:
+            arguments.fail(name, f"no segment has such a label{suggest_name(name, labels)}")
+    selected = tuple(
         segment
         for segment in recording.segments
         if all(
@@ -36,33 +38,36 @@ def select_segments(recording: Recording, given: StepArguments) -> Recording:
             for name, holds in conditions.items()
         )
     )
-    if not kept:
-        given.fail("", f"none of the {len(recording.segments)} segments satisfies these conditions")
-    is_first = kept[0] is recording.segments[0]
+    if not selected:
+        arguments.fail(
+            "", f"none of the {len(recording.segments)} segments satisfies these conditions"
+        )
+    is_first = selected[0] is recording.segments[0]
     return Recording(
-        tuple(_select_samples(one, kept, is_first) for one in recording.channels), kept
+        tuple(_select_samples(channel, selected, is_first) for channel in recording.channels),
+        selected,
     )
 
 
-def _select_samples(channel: Channel, kept: tuple[Segment, ...], is_first: bool) -> Channel:
-    """Samples of the segments; the history is that of the first one of the recording."""
-    starts = np.searchsorted(channel.times, [one.start for one in kept])
-    stops = np.searchsorted(channel.times, [one.stop for one in kept], side="right")
+def _select_samples(channel: Channel, segments: tuple[Segment, ...], is_first: bool) -> Channel:
+    """Select the samples of segments; only the recording's first segment has a history."""
+    starts = np.searchsorted(channel.times, [segment.start for segment in segments])
+    stops = np.searchsorted(channel.times, [segment.stop for segment in segments], side="right")
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
     history = channel.history if is_first else None
     return replace(channel, times=channel.times[rows], values=channel.values[rows], history=history)
 
 
-def _parse_condition(name: str, value: Any, given: StepArguments) -> LabelCondition:
+def _parse_condition(name: str, value: Any, arguments: StepArguments) -> LabelCondition:
     if isinstance(value, Mapping):
-        inner = StepArguments(f"{given.pointer}/{name}", value)
+        inner = StepArguments(f"{arguments.pointer}/{name}", value)
         if inner.has_argument("modulus"):
             return _match_remainder(inner)
         return _match_range(inner)
     wanted = value if isinstance(value, list | tuple) else [value]
-    for one in wanted:
-        if isinstance(one, bool) or not isinstance(one, int | float | str):
-            given.fail(name, f"found {one!r}; need a number or a text")
+    for entry in wanted:
+        if isinstance(entry, bool) or not isinstance(entry, int | float | str):
+            arguments.fail(name, f"found {entry!r}; need a number or a text")
     return lambda label: label in wanted
 
 
@@ -78,53 +83,54 @@ def _match_range(inner: StepArguments) -> LabelCondition:
     return lambda label: isinstance(label, int | float) and least <= label <= most
 
 
-def pool_segments(recording: Recording, given: StepArguments) -> Recording:
-    """One record of all segments, on their own times.
+def pool_segments(recording: Recording, arguments: StepArguments) -> Recording:
+    """Pool all segments into one record, on their own times.
 
     The input becomes the median of its samples over bins of time, at the mean time of each bin's
-    samples; each output keeps every sample at its own time. This resolves a lag that is shorter
-    than the sampling period when every repeat has another phase. What the input was before
-    ``start`` is its history.
+    samples. Each output keeps every sample at its own time. This resolves a delay shorter than
+    the sampling period if every repeat has another phase. Input samples before ``start`` become
+    its history.
 
-    With ``outputs_from``, conditions as in `select_segments`, outputs are those of some segments
-    only: where every repeat has the same input, those kept for validation may help to tell it.
+    ``outputs_from`` (conditions as in `select_segments`) restricts the outputs to some segments.
+    If every repeat has the same input, validation segments may still improve the input.
     """
-    given.reject_others("input", "outputs", "outputs_from", "bin", "start", "stop")
-    start, width = given.read_number("start", 0.0), given.read_positive("bin")
-    source = recording.channel(given.read_text("input"))
-    kept = _select_output_segments(recording, given)
-    outputs = [kept.channel(name) for name in given.read_texts("outputs")]
+    arguments.reject_others("input", "outputs", "outputs_from", "bin", "start", "stop")
+    start, width = arguments.read_number("start", 0.0), arguments.read_positive("bin")
+    source = recording.channel(arguments.read_text("input"))
+    selected = _select_output_segments(recording, arguments)
+    outputs = [selected.channel(name) for name in arguments.read_texts("outputs")]
     last = max(
-        float(compute_segment_times(one, whole.segments).max())
-        for one, whole in [(source, recording), *((output, kept) for output in outputs)]
+        float(compute_segment_times(signal, whole.segments).max())
+        for signal, whole in [(source, recording), *((output, selected) for output in outputs)]
     )
-    stop = given.read_number("stop", float(np.nextafter(last, np.inf)))
+    stop = arguments.read_number("stop", float(np.nextafter(last, np.inf)))
     if stop <= start:
-        given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
+        arguments.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
     pooled = [_pool_input(source, recording.segments, start, stop, width)]
-    pooled += [_collect_samples(one, kept.segments, start, stop) for one in outputs]
+    pooled += [_collect_samples(signal, selected.segments, start, stop) for signal in outputs]
     for channel in pooled:
         if channel is None:
-            given.fail("", f"a channel has no sample from {start:g} to {stop:g} s")
+            arguments.fail("", f"a channel has no sample from {start:g} to {stop:g} s")
     return Recording(tuple(channel for channel in pooled if channel is not None))
 
 
-def _select_output_segments(recording: Recording, given: StepArguments) -> Recording:
-    if not given.has_argument("outputs_from"):
+def _select_output_segments(recording: Recording, arguments: StepArguments) -> Recording:
+    if not arguments.has_argument("outputs_from"):
         return recording
     return select_segments(
-        recording, StepArguments(f"{given.pointer}/outputs_from", given.get_value("outputs_from"))
+        recording,
+        StepArguments(f"{arguments.pointer}/outputs_from", arguments.get_value("outputs_from")),
     )
 
 
 def compute_segment_times(channel: Channel, segments: tuple[Segment, ...]) -> FloatArray:
-    """Times of all samples, each counted in its own segment, to the nanosecond."""
+    """Compute the times of all samples in their own segments, to the nanosecond."""
     if not segments:
         return channel.times
-    starts = np.array([one.start for one in segments])
-    origins = np.array([one.origin for one in segments])
-    here = np.searchsorted(starts, channel.times, side="right") - 1
-    return np.asarray(np.round(channel.times - starts[here] + origins[here], 9))
+    starts = np.array([segment.start for segment in segments])
+    origins = np.array([segment.origin for segment in segments])
+    numbers = np.searchsorted(starts, channel.times, side="right") - 1
+    return np.asarray(np.round(channel.times - starts[numbers] + origins[numbers], 9))
 
 
 def _collect_samples(
@@ -141,7 +147,7 @@ def _collect_samples(
 def _pool_input(
     channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float
 ) -> Channel | None:
-    """The pooled input; its history is what the repeats recorded before the start."""
+    """Pool the input; its history is the pooled samples before the start."""
     bins = _compute_bin_medians(channel, segments, start, stop, width)
     before = _compute_bin_medians(channel, segments, -np.inf, start, width, first=start)
     if bins is None or before is None:
@@ -157,16 +163,16 @@ def _compute_bin_medians(
     width: float,
     first: float | None = None,
 ) -> Channel | None:
-    """Medians of the samples from start to stop; a bin begins at `first`, or else at the start."""
-    gathered = _collect_samples(channel, segments, start, stop)
-    if gathered is None:
+    """Compute bin medians from start to stop; a bin begins at `first`, by default the start."""
+    samples = _collect_samples(channel, segments, start, stop)
+    if samples is None:
         return None
-    bins = _assign_bins(gathered.times, start if first is None else first, width)
+    bins = _assign_bins(samples.times, start if first is None else first, width)
     firsts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
-    medians = np.array([np.median(part) for part in np.split(gathered.values, firsts[1:])])
+    medians = np.array([np.median(part) for part in np.split(samples.values, firsts[1:])])
     counts = np.diff(firsts, append=bins.size)
-    # Not the bin's middle: where its samples are few or uneven, that would shift the curve in time.
-    means = np.asarray(np.round(np.add.reduceat(gathered.times, firsts) / counts, 9))
+    # Not the bin's middle: with few or uneven samples it would shift the curve in time.
+    means = np.asarray(np.round(np.add.reduceat(samples.times, firsts) / counts, 9))
     return replace(channel, times=means, values=medians)
 
 

@@ -1,4 +1,4 @@
-"""Recordings: channels on their own times, segments, and the record a model is compared with."""
+"""Recordings: channels on their own times, segments, and records for a model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,17 +13,17 @@ Hold = Literal["zero", "first", "band-limited"]
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 
 REGULARITY_TOLERANCE = 1e-2
-"""Part of a period by which times may be off their places and still be regular.
+"""Largest deviation of regular times from a uniform grid, as a part of the period.
 
-Files print times with few digits: 610.35 Hz to 10 µs is off by 0.3 % of a period.
+Files print times with few digits. With 10 µs, 610.35 Hz deviates by 0.3 % of a period.
 """
 
 
-_PERIOD_TOLERANCE = 1e-6  # of a period: how far those of one clock may differ
+_PERIOD_TOLERANCE = 1e-6  # relative difference of the periods of one clock
 
 
 class Sampling(NamedTuple):
-    """How a signal was sampled; `period` (s) is the median distance where it is irregular."""
+    """Sampling of a signal; an irregular one has its median distance as `period` (s)."""
 
     samples: int
     period: float
@@ -37,7 +37,7 @@ class Sampling(NamedTuple):
 
 
 def measure_sampling(times: FloatArray, within: float = REGULARITY_TOLERANCE) -> Sampling:
-    """How times (s) are spaced; regular: each within that part of a period from its place."""
+    """Measure the sampling of times (s); `within` is the tolerance in parts of a period."""
     if times.size < 2:
         return Sampling(times.size, float("nan"), is_regular=False)
     period = float(times[-1] - times[0]) / (times.size - 1)
@@ -48,7 +48,7 @@ def measure_sampling(times: FloatArray, within: float = REGULARITY_TOLERANCE) ->
 
 
 class History(NamedTuple):
-    """Samples from before a channel's first: times (s, not decreasing) and values."""
+    """Samples before a channel's first: times (s, not decreasing) and values."""
 
     times: FloatArray
     values: FloatArray
@@ -67,17 +67,17 @@ class Channel:
     values : FloatArray, shape (N,)
         In `unit`; ``nan`` is a missing value.
     hold : {"zero", "first", "band-limited"}
-        What an input does between its samples.
+        Behaviour of an input between its samples.
     history : History or None
-        What was recorded before the first sample. A lag reads an input there; nothing else does:
-        simulation and comparison begin where the samples do. None: nothing is known, and the
-        first value is taken to have stood all the time before.
+        Samples recorded before the first one. Only delayed inputs read it: simulation and
+        comparison begin at the first sample. None: not recorded; the first value is assumed for
+        all earlier times.
 
     Raises
     ------
     InvalidRecord
-        If the arrays differ in length, are empty, or the times decrease or are not finite; of the
-        history too.
+        If the arrays differ in length or are empty, or the times decrease or are not finite. The
+        same holds for the history.
     """
 
     name: str
@@ -115,7 +115,7 @@ class Channel:
 
     @property
     def history_and_samples(self) -> "Channel":
-        """History and samples as samples of one channel."""
+        """Channel with the history joined to the samples."""
         if self.history is None:
             return self
         times, values = (
@@ -126,16 +126,16 @@ class Channel:
 
     @property
     def sampling(self) -> Sampling:
-        """How this channel was sampled."""
+        """Sampling of this channel."""
         return measure_sampling(self.times)
 
     @property
     def total_samples(self) -> int:
-        """How many samples it has, with those of its history."""
+        """Number of samples, including the history."""
         return self.times.size + (0 if self.history is None else self.history.times.size)
 
     def slice_time(self, start: float, stop: float) -> "Channel":
-        """Return the samples with `start` ≤ time ≤ `stop`; what was cut off before is lost.
+        """Return the samples with `start` ≤ time ≤ `stop`, without those before as history.
 
         Raises
         ------
@@ -148,17 +148,17 @@ class Channel:
                 f"channel {self.name!r} has no sample from {start:g} to {stop:g} s; "
                 f"its samples are from {self.times[0]:g} to {self.times[-1]:g} s"
             )
-        kept = self.history if first == 0 else None
+        history = self.history if first == 0 else None
         return replace(
-            self, times=self.times[first:last], values=self.values[first:last], history=kept
+            self, times=self.times[first:last], values=self.values[first:last], history=history
         )
 
     def slice_with_history(self, start: float, stop: float) -> "Channel":
-        """Return the same samples as `between`, with all that was before them as their history."""
+        """Return the samples of `slice_time`, with all earlier samples as their history."""
         return self.slice_time(start, stop).prepend_history(self)
 
     def prepend_history(self, other: "Channel") -> "Channel":
-        """Return this channel with what another was before it as its history."""
+        """Return this channel with the earlier samples of another channel as its history."""
         whole = other.history_and_samples
         count = int(np.searchsorted(whole.times, self.times[0]))
         history = History(whole.times[:count], whole.values[:count]) if count else None
@@ -169,8 +169,8 @@ class Channel:
 class Segment:
     """A part of a recording that was measured on its own, such as one repeat of a test.
 
-    Segments lie one behind the other on the recording's time axis: a segment's own time is the
-    recording's time minus `start`, plus `origin`.
+    Segments follow one another on the recording's time axis. A segment's own time is the
+    recording's time minus `start` plus `origin`.
     """
 
     start: float
@@ -181,18 +181,18 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """All channels of one dataset, without roles. No segments: it was measured in one piece."""
+    """All channels of one dataset, without roles; without segments it is one measurement."""
 
     channels: tuple[Channel, ...]
     segments: tuple[Segment, ...] = ()
 
     def channel(self, name: str) -> Channel:
-        """The channel of that name.
+        """Return the channel of a name.
 
         Raises
         ------
         InvalidRecord
-            If there is none; the message names the nearest.
+            If there is none; the message suggests the nearest.
         """
         for channel in self.channels:
             if channel.name == name:
@@ -228,7 +228,7 @@ class Recording:
 
     @property
     def sampling(self) -> Sampling:
-        """How the longest channel was sampled."""
+        """Sampling of the longest channel."""
         return max(self.channels, key=lambda channel: channel.times.size).sampling
 
     def replace_holds(self, holds: Mapping[str, Hold]) -> "Recording":
@@ -244,7 +244,8 @@ class Recording:
         return replace(
             self,
             channels=tuple(
-                replace(one, hold=holds.get(one.name, one.hold)) for one in self.channels
+                replace(channel, hold=holds.get(channel.name, channel.hold))
+                for channel in self.channels
             ),
         )
 
@@ -256,13 +257,13 @@ class Recording:
         Parameters
         ----------
         inputs, outputs : mapping of str to str
-            Which channel is which signal of the model: model's name → channel's name.
+            Assignment of channels to signals: model's name → channel's name.
 
         Raises
         ------
         InvalidRecord
-            If a channel is not there or both an input and an output, an input has missing
-            values, an output has no value, or the recording consists of several segments.
+            If a channel is missing, or is both an input and an output. If an input has missing
+            values, or an output has no value. If the recording has several segments.
         """
         for fault in find_shared_channels(inputs, outputs).values():
             raise InvalidRecord(fault)
@@ -272,8 +273,14 @@ class Recording:
                 "Derive one record with 'pool' or 'select', or use every segment as an experiment."
             )
         return Record(
-            tuple(_to_input(self.channel(ours), role) for role, ours in inputs.items()),
-            tuple(_to_output(self.channel(ours), role) for role, ours in outputs.items()),
+            tuple(
+                _to_input(self.channel(name_in_recording), role)
+                for role, name_in_recording in inputs.items()
+            ),
+            tuple(
+                _to_output(self.channel(name_in_recording), role)
+                for role, name_in_recording in outputs.items()
+            ),
             name,
         )
 
@@ -291,37 +298,37 @@ class Recording:
 
     def _cut_segment(self, segment: Segment) -> "Recording":
         cut = [channel.slice_time(segment.start, segment.stop) for channel in self.channels]
-        return Recording(tuple(_shift_to_segment(one, segment) for one in cut))
+        return Recording(tuple(_shift_to_segment(channel, segment) for channel in cut))
 
 
 def find_shared_channels(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
-    """Inputs whose channel is that of an output as well, and what is wrong with that.
+    """Find inputs whose channel is also an output, with a message for each.
 
     Parameters
     ----------
     inputs, outputs : mapping of str to str
         Model's name → channel's name.
     """
-    measured = {channel: name for name, channel in outputs.items()}
+    output_names = {channel: name for name, channel in outputs.items()}
     return {
         name: f"channel {channel!r} is both input {name!r} and output "
-        f"{measured[channel]!r}; an output that is its own input contains no information"
+        f"{output_names[channel]!r}; an output that is its own input contains no information"
         for name, channel in inputs.items()
-        if channel in measured
+        if channel in output_names
     }
 
 
 def to_segment_time(times: FloatArray, segment: Segment) -> FloatArray:
-    """Times of a segment as they were measured, to the nanosecond.
+    """Convert times of a recording to a segment's own times, to the nanosecond.
 
-    The rounding takes away what the place on the recording's axis added to the last digits.
+    The rounding removes the error that the shift on the recording's axis added.
     """
     return np.round(times - segment.start + segment.origin, 9)
 
 
 def _find_first_known_time(channel: Channel) -> float:
-    known = trim_missing_history(channel.history)
-    return float(channel.times[0] if known is None else known.times[0])
+    history = trim_missing_history(channel.history)
+    return float(channel.times[0] if history is None else history.times[0])
 
 
 def _shift_to_segment(channel: Channel, segment: Segment) -> Channel:
@@ -343,7 +350,7 @@ def _to_input(channel: Channel, role: str) -> Channel:
 
 
 def trim_missing_history(history: History | None) -> History | None:
-    """The history behind its last missing value: what lies before that may be of another test."""
+    """Cut a history after its last missing value: earlier samples may be of another test."""
     if history is None:
         return None
     missing = np.flatnonzero(~np.isfinite(history.values))
@@ -363,7 +370,7 @@ def _to_output(channel: Channel, role: str) -> Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """One experiment as a model sees it: channels carry the model's signal names."""
+    """One experiment of a model: channels have the names of the model's signals."""
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
@@ -371,21 +378,22 @@ class Record:
 
     @property
     def history_duration(self) -> float:
-        """For how long (s) before the start all inputs are known; 0 if one is not."""
+        """Time (s) before the start for which all inputs have a history; 0 without one."""
         return max(
-            self.start - max((_find_first_known_time(one) for one in self.inputs), default=np.inf),
+            self.start
+            - max((_find_first_known_time(channel) for channel in self.inputs), default=np.inf),
             0.0,
         )
 
     @property
     def start(self) -> float:
         """First time of any channel, in s."""
-        return min(float(one.times[0]) for one in (*self.inputs, *self.outputs))
+        return min(float(channel.times[0]) for channel in (*self.inputs, *self.outputs))
 
     @property
     def stop(self) -> float:
         """Last time of any channel, in s."""
-        return max(float(one.times[-1]) for one in (*self.inputs, *self.outputs))
+        return max(float(channel.times[-1]) for channel in (*self.inputs, *self.outputs))
 
     @property
     def duration(self) -> float:
@@ -394,11 +402,11 @@ class Record:
 
 
 def find_common_sample_time(records: Sequence[Record]) -> float | None:
-    """Period (s) with which all outputs of all records are sampled; None if there is none."""
-    found = [channel.sampling for record in records for channel in record.outputs]
-    periods = [one.period for one in found]
-    if not all(one.is_regular for one in found) or np.ptp(periods) > _PERIOD_TOLERANCE * min(
+    """Find the sampling period (s) that all outputs of all records share; None without one."""
+    samplings = [channel.sampling for record in records for channel in record.outputs]
+    periods = [sampling.period for sampling in samplings]
+    if not all(sampling.is_regular for sampling in samplings) or np.ptp(
         periods
-    ):
+    ) > _PERIOD_TOLERANCE * min(periods):
         return None
     return periods[0]

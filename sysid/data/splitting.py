@@ -1,4 +1,4 @@
-"""A record cut in two: the part a model is fitted to, and the last part, kept for validation."""
+"""Splitting of a record in time: estimation first, then validation."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from sysid.data.records import Record
 def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
     """Split a record in time: first the part for estimation, then `fraction` for validation.
 
-    The cut lies at a sample of the longest output, which begins the validation part. What the
-    inputs were before it is that part's history.
+    The validation part begins at a sample of the longest output. Earlier samples of the inputs
+    become its history.
 
     Raises
     ------
@@ -27,8 +27,10 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
             parts.append(
                 replace(
                     record,
-                    inputs=tuple(one.slice_with_history(start, stop) for one in record.inputs),
-                    outputs=tuple(one.slice_time(start, stop) for one in record.outputs),
+                    inputs=tuple(
+                        channel.slice_with_history(start, stop) for channel in record.inputs
+                    ),
+                    outputs=tuple(channel.slice_time(start, stop) for channel in record.outputs),
                 )
             )
         except InvalidRecord as error:
@@ -37,20 +39,20 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
 
 
 def find_validation_start(record: Record, fraction: float) -> float:
-    """Time (s) at which the last `fraction` of a record begins, a sample of the longest output.
+    """Find the time (s) at which the last `fraction` of a record's longest output begins.
 
     Raises
     ------
     InvalidSettings
         If the fraction is not between 0 and 1, or one part would be empty.
     """
-    return find_cut_time(max((one.times for one in record.outputs), key=len), fraction)
+    return find_cut_time(max((output.times for output in record.outputs), key=len), fraction)
 
 
 def find_cut_time(
     times: FloatArray, fraction: float, pointer: str = "/validation/fraction"
 ) -> float:
-    """Time (s) of the sample at which the last `fraction` of the samples begins.
+    """Find the time (s) of the sample at which the last `fraction` of the samples begins.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""`Model` → LLVM: vectorised simulation and loss of a population."""
+"""Kernels: LLVM code for the vectorised simulation and loss of a population."""

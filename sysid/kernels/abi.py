@@ -1,4 +1,4 @@
-"""How compiled code calls a kernel: its signature, once for all who emit, load or call one.
+"""Binary interface of kernels: one signature for emitting, loading and calling.
 
 A kernel is one C function of addresses and whole numbers::
 
@@ -6,9 +6,9 @@ A kernel is one C function of addresses and whole numbers::
                 double *predictions, i64 predictions_stride, double *loss)
 
 theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `NARROW_LANES`.
-ints, floats : one experiment as `sysid.simulation.packing` lays it out.
-work : scratch of the experiment's size; its contents on entry do not matter.
-predictions : null, or M_e rows of `predictions_stride`: the simulated value at each measured time.
+ints, floats : one experiment as packed by `sysid.simulation.packing`.
+work : scratch memory of the experiment's size; its initial contents do not matter.
+predictions : null, or M_e rows of `predictions_stride`: simulated value at each measured time.
 loss : P sums; the kernel *adds* the experiment's loss, Σ w²e² for squares or
     Σ 2s²(√(1 + (we/s)²) − 1) for soft-l1.
 
@@ -22,10 +22,10 @@ from numba.core import types
 from numba.extending import intrinsic
 
 LANES = 16
-"""W: individuals that run side by side in one vector of doubles."""
+"""W: individuals that are simulated together in one vector of doubles."""
 
 NARROW_LANES = 8
-"""The same where no more are left: a block of so many takes two thirds of the time."""
+"""W of the last block, if no more individuals are left; it takes two thirds of the time."""
 
 KERNEL_ARGUMENTS = (
     "P",
@@ -42,7 +42,7 @@ _INTEGER_ARGUMENTS = ("P", "stride", "predictions_stride")
 
 
 def build_kernel_type() -> ir.FunctionType:
-    """LLVM type of a kernel; every argument is 64 bits wide."""
+    """Build the LLVM type of a kernel; every argument is 64 bits wide."""
     number, address = ir.IntType(64), ir.PointerType()
     arguments = [number if name in _INTEGER_ARGUMENTS else address for name in KERNEL_ARGUMENTS]
     return ir.FunctionType(ir.VoidType(), arguments)
@@ -63,10 +63,11 @@ def _call_kernel(
 ) -> Any:
     """Call the kernel at `address` for one experiment, from Numba code.
 
-    The arrays themselves are handed over, not their addresses, so that they stay alive during
-    the call. `theta` (K, stride), `predictions` (M, stride) and the rest are contiguous; the
-    experiment's numbers begin at ``ints[ints_begin]`` and ``floats[floats_begin]``, its
-    predictions go to the rows from `first_row`. `predictions` without rows: none are stored.
+    The arguments are arrays, not addresses, so that the arrays stay alive during the call.
+    `theta` (K, stride), `predictions` (M, stride) and the other arrays are contiguous. The
+    experiment's numbers begin at ``ints[ints_begin]`` and ``floats[floats_begin]``. Its
+    predictions are stored in the rows from `first_row`. If `predictions` has no rows, none are
+    stored.
     """
     signature = types.void(
         types.int64,

@@ -1,4 +1,4 @@
-"""From a model to the address of its kernel; compiled once per machine, loaded once per process."""
+"""Building of kernels: compiled once on each machine, loaded once in each process."""
 
 import hashlib
 from dataclasses import replace
@@ -16,7 +16,7 @@ _kernel_addresses: dict[str, int] = {}
 
 
 def get_kernel_address(model: Model, variant: KernelVariant) -> int:
-    """Address of the model's kernel in this process, for `sysid.kernels.abi.call_kernel`."""
+    """Return the address of a model's kernel, for `sysid.kernels.abi.call_kernel`."""
     key = compute_kernel_key(model, variant)
     if key not in _kernel_addresses:
         code = load_code(key)
@@ -27,12 +27,11 @@ def get_kernel_address(model: Model, variant: KernelVariant) -> int:
     return _kernel_addresses[key]
 
 
-@cache_by_identity  # it is a long walk, and many runs have one model
+@cache_by_identity  # hashing a model is slow, and many runs share one
 def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
-    """Name of a kernel: what its code depends on, and nothing else.
+    """Compute the cache key of a kernel from everything that its code depends on.
 
-    Bounds, units, titles and the grid's step are data of the problem; changing them compiles
-    nothing.
+    Bounds, units, titles and the grid's step are data. Changing them does not recompile.
     """
     starts = tuple(
         "estimated" if isinstance(start, EstimatedInitial) else type(start).__name__
@@ -40,8 +39,8 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
     )
     parts = (
         model.form == "differential",
-        [quantity.name for quantity in model.inputs],
-        [quantity.name for quantity in model.states],
+        [signal.name for signal in model.inputs],
+        [signal.name for signal in model.states],
         [output.expression for output in model.outputs],
         [parameter.name for parameter in model.parameters],
         model.equations,
@@ -58,7 +57,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
 
 @cache
 def _digest_emitters() -> str:
-    """Digest of what writes kernels: a new version of it makes new kernels."""
+    """Digest of the code generator: a new version makes new kernels."""
     package = Path(__file__).parents[1]
     sources = (*package.glob("kernels/*.py"), package / "language" / "functions.py")
     return digest_files(sources, package)

@@ -1,7 +1,7 @@
-"""Readers of past values: how a signal with a lag is read between its samples, lane by lane.
+"""Readers of delayed signals: interpolation between samples, lane by lane.
 
-The lag ℓ, in integration steps, is the same in all steps, so its whole part and its fraction are
-computed once, and what one step has read the next need not read again.
+The delay ℓ, in integration steps, is constant in time. Its whole part and its fraction are
+computed once. A step reuses the values that the step before has read.
 """
 
 from dataclasses import dataclass
@@ -12,75 +12,82 @@ from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 
 @dataclass(frozen=True, slots=True)
 class StateHistory:
-    """One state's past in the work array: a row for each step m, in it a double for each lane."""
+    """History of one state in the work array: a row for each step, a double for each lane."""
 
     base: IrValue
 
 
 @dataclass(frozen=True, slots=True)
 class TimeStep:
-    """One step of the time loop: its number, and the history's row of the last finished one."""
+    """One step of the time loop: its number, and the history's row of the last finished step."""
 
     step: IrValue
     row: IrValue
 
 
 class DelayedReader(Protocol):
-    """Reads one signal at one lag.
+    """Reader of one signal at one delay.
 
-    Its life: made before the loop, opened in its head, and in every turn begun, read from and
-    ended.
+    It is created before the loop and opened in the loop's head. Every step begins it, reads from
+    it and ends it.
     """
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Make the values that one turn hands to the next."""
+        """Create the values that are carried from step to step."""
 
     def begin_step(self, turn: TimeStep) -> None:
-        """Read what the turn will need."""
+        """Read the values that the step needs."""
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
-        """Value at a place; a state is `now` at 0 and `stage` at the place itself."""
+        """Value at `halves` half steps; a state is `now` at 0 and `stage` at that place."""
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
-        """Hand over to the next turn; `following` is the state's next value."""
+        """Update the carried values; `following` is the state's next value."""
 
 
 def interpolate_inside_step(
-    lanes: VectorBuilder, lag: IrValue, halves: int, now: IrValue, stage: IrValue
+    lanes: VectorBuilder, delay: IrValue, halves: int, now: IrValue, stage: IrValue
 ) -> IrValue:
-    """Value inside the present step: x + (c - ℓ)/c (x_c - x), which tends to x_c as ℓ → 0."""
-    portion = lanes.sub(lanes.make_number(1.0), lanes.mul(lag, lanes.make_number(2.0 / halves)))
+    """Interpolate inside the present step: x + (c - ℓ)/c (x_c - x), which tends to x_c as ℓ → 0."""
+    portion = lanes.sub(lanes.make_number(1.0), lanes.mul(delay, lanes.make_number(2.0 / halves)))
     return lanes.interpolate(now, portion, stage)
 
 
 class LinearReader:
-    """A state between two samples, with one gather in a step.
+    """Linear interpolation of a state between two samples, with one gather in a step.
 
-    `places` is a chain of whole steps (see `demand.chains`). If it reaches into the present step,
-    half steps may be read too: their two neighbours are among the three samples at hand.
+    `places` is a chain of whole steps (see `reads.group_places`). If it reaches into the present
+    step, half steps can be read too. Their two neighbours are among the three loaded samples.
     """
 
     def __init__(
         self,
         lanes: VectorBuilder,
         history: StateHistory,
-        lag: IrValue,
+        delay: IrValue,
         places: list[int],
         row: IrValue,
     ) -> None:
-        self._lanes, self._lag = lanes, lag
+        self._lanes, self._delay = lanes, delay
         self._forward = places[0] > 0
         self._top = min(places[0], 0) // 2
         self._length = self._top - places[-1] // 2
-        whole, self._fraction = lanes.split_fraction(lag)
+        whole, self._fraction = lanes.split_fraction(delay)
         b = lanes.builder
-        wide, own = lanes.splat(lanes.make_integer(lanes.width)), lanes.make_lane_numbers()
-        one = lanes.splat(lanes.make_integer(1))
+        lane_count, lane_numbers = (
+            lanes.splat(lanes.make_integer(lanes.width)),
+            lanes.make_lane_numbers(),
+        )
+        unit = lanes.splat(lanes.make_integer(1))
         self._within = b.icmp_signed("==", whole, lanes.splat(lanes.make_integer(0)))
-        back = b.select(self._within, one, whole)
-        self._addresses = lanes.compute_addresses(history.base, b.sub(own, b.mul(whole, wide)))
-        # a lag below one step has no finished sample ahead: it reads the last one instead
-        self._ahead_addresses = lanes.compute_addresses(history.base, b.sub(own, b.mul(back, wide)))
+        back = b.select(self._within, unit, whole)
+        self._addresses = lanes.compute_addresses(
+            history.base, b.sub(lane_numbers, b.mul(whole, lane_count))
+        )
+        # a delay below one step has no finished sample ahead: it reads the last one instead
+        self._ahead_addresses = lanes.compute_addresses(
+            history.base, b.sub(lane_numbers, b.mul(back, lane_count))
+        )
         samples = [self._load_sample(row, self._top - j) for j in range(self._length + 2)]
         self._initial = [samples[0], samples[1]] + [
             lanes.interpolate(samples[j], self._fraction, samples[j + 1])
@@ -93,13 +100,13 @@ class LinearReader:
         return lanes.gather(self._addresses, index)
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Make the values that one turn hands to the next."""
+        """Create the values that are carried from step to step."""
         newest, *rest = self._initial
         self._newest = loop.carry(newest) if self._forward else None
         self._older, *self._chain = [loop.carry(value) for value in rest]
 
     def begin_step(self, turn: TimeStep) -> None:
-        """Read what the turn will need."""
+        """Read the values that the step needs."""
         lanes = self._lanes
         if self._forward:
             b = lanes.builder
@@ -114,13 +121,13 @@ class LinearReader:
         ]
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
-        """Value at a place."""
+        """Value at `halves` half steps."""
         if halves <= 0:
             return self._values[self._top - halves // 2]
         finished = self._read_ahead_whole() if halves == 2 else self._read_ahead_half()
-        inside = interpolate_inside_step(self._lanes, self._lag, halves, now, stage)
+        inside = interpolate_inside_step(self._lanes, self._delay, halves, now, stage)
         limit = self._lanes.make_number(halves / 2)
-        is_inside = self._lanes.compare("<", self._lag, limit)
+        is_inside = self._lanes.compare("<", self._delay, limit)
         return self._lanes.select(is_inside, inside, finished)
 
     def _read_ahead_whole(self) -> IrValue:
@@ -133,7 +140,7 @@ class LinearReader:
         return lanes.select(lanes.compare("<", self._fraction, half), later, earlier)
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
-        """Hand over to the next turn."""
+        """Update the carried values."""
         if self._newest is not None:
             newest = self._lanes.builder.select(
                 self._within, self._lanes.splat(following), self._ahead
@@ -145,42 +152,42 @@ class LinearReader:
 
 
 class DirectReader:
-    """A state between its samples, read anew in every step.
+    """Interpolation of a state that is read again in every step.
 
-    For cubic interpolation (Lagrange through four samples; through three, or on a line inside the
-    present step, where the later ones do not exist yet), and for one-step prediction, where
-    samples change after they were read.
+    It serves one-step prediction, which changes samples after they were read, and cubic
+    interpolation. Cubic means Lagrange through four samples. Where later samples do not exist
+    yet, it uses three samples, or a line inside the present step.
     """
 
     def __init__(
-        self, lanes: VectorBuilder, history: StateHistory, lag: IrValue, cubic: bool
+        self, lanes: VectorBuilder, history: StateHistory, delay: IrValue, cubic: bool
     ) -> None:
-        self._lanes, self._history, self._lag, self._cubic = lanes, history, lag, cubic
+        self._lanes, self._history, self._delay, self._cubic = lanes, history, delay, cubic
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Make the values that one turn hands to the next."""
+        """Create the values that are carried from step to step."""
 
     def begin_step(self, turn: TimeStep) -> None:
-        """Read what the turn will need."""
+        """Read the values that the step needs."""
         self._turn = turn
         self._finished: dict[int, IrValue] = {}
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
-        """Value at a place."""
+        """Value at `halves` half steps."""
         if halves not in self._finished:
             self._finished[halves] = self._interpolate(halves)
         if halves <= 0:
             return self._finished[halves]
-        inside = interpolate_inside_step(self._lanes, self._lag, halves, now, stage)
-        is_inside = self._lanes.compare("<", self._lag, self._lanes.make_number(halves / 2))
+        inside = interpolate_inside_step(self._lanes, self._delay, halves, now, stage)
+        is_inside = self._lanes.compare("<", self._delay, self._lanes.make_number(halves / 2))
         return self._lanes.select(is_inside, inside, self._finished[halves])
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
-        """Hand over to the next turn."""
+        """Update the carried values."""
 
     def _interpolate(self, halves: int) -> IrValue:
         lanes = self._lanes
-        place = lanes.sub(lanes.make_number(halves / 2), self._lag)
+        place = lanes.sub(lanes.make_number(halves / 2), self._delay)
         whole, fraction = lanes.split_fraction(place)
         if not self._cubic:
             return lanes.interpolate(
@@ -193,7 +200,7 @@ class DirectReader:
         return lanes.select(lanes.builder.icmp_signed("<=", whole, limit), four, three)
 
     def _load_sample(self, whole: IrValue, steps: int) -> IrValue:
-        """Sample `whole` + `steps` after the last finished one, or that one if it is later."""
+        """Load the sample `whole` + `steps` after the last finished one, at most that one."""
         lanes, b = self._lanes, self._lanes.builder
         zero = lanes.splat(lanes.make_integer(0))
         place = b.add(whole, lanes.splat(lanes.make_integer(steps)))
@@ -206,9 +213,9 @@ class DirectReader:
 
 
 def _interpolate_lagrange(
-    lanes: VectorBuilder, at: IrValue, nodes: tuple[int, ...], samples: list[IrValue]
+    lanes: VectorBuilder, position: IrValue, nodes: tuple[int, ...], samples: list[IrValue]
 ) -> IrValue:
-    """Polynomial through samples at whole nodes, at a fraction between 0 and 1."""
+    """Interpolate samples at whole nodes by a polynomial, at a fraction from 0 to 1."""
     total = None
     for node, sample in zip(nodes, samples, strict=True):
         scale = 1.0
@@ -216,7 +223,7 @@ def _interpolate_lagrange(
         for other in nodes:
             if other != node:
                 scale *= node - other
-                factor = lanes.sub(at, lanes.make_number(other))
+                factor = lanes.sub(position, lanes.make_number(other))
                 weight = factor if weight is None else lanes.mul(weight, factor)
         term = lanes.mul(lanes.mul(weight, lanes.make_number(1.0 / scale)), sample)
         total = term if total is None else lanes.add(total, term)
@@ -224,9 +231,10 @@ def _interpolate_lagrange(
 
 
 class InputReader:
-    """An input with a lag, between the points of its fine grid.
+    """Linear interpolation of a delayed input between the points of its fine grid.
 
-    `places` is a chain of whole or of half steps: one is read, the others are its earlier values.
+    `places` is a chain of whole or of half steps. The first is read; the others are its earlier
+    values.
     """
 
     def __init__(
@@ -235,12 +243,12 @@ class InputReader:
         floats: IrValue,
         zero: IrValue,
         points: IrValue,
-        lag: IrValue,
+        delay: IrValue,
         places: list[int],
     ) -> None:
         b = lanes.builder
         self._lanes, self._floats, self._points, self._places = lanes, floats, points, places
-        whole, self._fraction = lanes.split_fraction(lag)
+        whole, self._fraction = lanes.split_fraction(delay)
         self._addresses = lanes.compute_addresses(floats, b.sub(lanes.splat(zero), whole))
         self._initial = [self._load_value(lanes.make_integer(0), halves) for halves in places[1:]]
 
@@ -253,18 +261,18 @@ class InputReader:
         return lanes.interpolate(newest, self._fraction, older)
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Make the values that one turn hands to the next."""
+        """Create the values that are carried from step to step."""
         self._chain = [loop.carry(value) for value in self._initial]
 
     def begin_step(self, turn: TimeStep) -> None:
-        """Read what the turn will need."""
+        """Read the values that the step needs."""
         self._values = [self._load_value(turn.step, self._places[0]), *self._chain]
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
-        """Value at a place."""
+        """Value at `halves` half steps."""
         return self._values[self._places.index(halves)]
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
-        """Hand over to the next turn."""
+        """Update the carried values."""
         for carried, value in zip(self._chain, self._values, strict=False):
             loop.update(carried, value)

@@ -1,4 +1,4 @@
-"""From expression trees to vector instructions."""
+"""Code generation from expression trees to vector instructions."""
 
 from typing import Protocol
 
@@ -7,23 +7,23 @@ from sysid.language.functions import FUNCTIONS, OPERATORS, Level
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 LARGEST_POWER = 64
-"""Whole exponents up to this one are written as multiplications."""
+"""Largest whole exponent that is expanded to multiplications."""
 
 _ARITHMETIC = {"+": "add", "-": "sub", "*": "mul", "/": "div"}
 
 
 class Environment(Protocol):
-    """What names stand for at one place of the simulation."""
+    """Meaning of names at one point of the simulation."""
 
     def emit_symbol(self, symbol: Symbol) -> IrValue:
-        """Value of a parameter or of a reserved name."""
+        """Emit the value of a parameter or of a reserved name."""
 
     def emit_past_value(self, past: PastValue) -> IrValue:
-        """Value of a state or an input, now or in the past."""
+        """Emit the value of a state or an input, now or in the past."""
 
 
 def emit_expression(lanes: VectorBuilder, expression: Expression, scope: Environment) -> IrValue:
-    """Instructions that compute an expression; the result is a scalar or a vector."""
+    """Emit the instructions of an expression; the result is a scalar or a vector."""
     match expression:
         case Number(value):
             return lanes.make_number(value)
@@ -45,7 +45,7 @@ def emit_expression(lanes: VectorBuilder, expression: Expression, scope: Environ
 
 
 def evaluate_constant(expression: Expression) -> float | None:
-    """Value of an expression of numbers only, for exponents; None for any other."""
+    """Evaluate an expression of numbers only, for exponents; None for any other."""
     match expression:
         case Number(value):
             return value
@@ -86,7 +86,7 @@ def _emit_power(
 
 
 def _emit_whole_power(lanes: VectorBuilder, base: IrValue, exponent: int) -> IrValue:
-    """Base to a whole power by squaring; 0 ** 0 = 1."""
+    """Emit a whole power by repeated squaring; 0 ** 0 = 1."""
     result, square = None, base
     while exponent:
         if exponent & 1:
@@ -106,7 +106,7 @@ def _emit_call(lanes: VectorBuilder, function: str, arguments: list[IrValue]) ->
 
 
 def _emit_sign(lanes: VectorBuilder, value: IrValue) -> IrValue:
-    """-1, 0 or 1; nan stays nan."""
+    """Emit -1, 0 or 1; nan stays nan."""
     zero = lanes.make_number(0.0)
     negative = lanes.select(lanes.compare("<", value, zero), lanes.make_number(-1.0), value)
     return lanes.select(lanes.compare(">", value, zero), lanes.make_number(1.0), negative)

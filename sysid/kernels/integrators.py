@@ -1,4 +1,4 @@
-"""One step of the simulation: recursions, Euler, semi-implicit Euler and Runge-Kutta."""
+"""One integration step: recursion, Euler, semi-implicit Euler or Runge-Kutta."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,10 +14,10 @@ from sysid.models.model import Model
 
 @dataclass(frozen=True, slots=True)
 class StepEnvironment(Environment):
-    """What names stand for at `halves` half steps after the last finished step.
+    """Meaning of names at `half_steps` half steps after the last finished step.
 
-    `values` are the states there; `equation` is the number of the equation that asks, as the
-    semi-implicit method reads some states at the end of the step.
+    `values` are the states there. `equation` is the number of the equation being emitted, because
+    the semi-implicit method reads some states at the end of the step. It is -1 for outputs.
     """
 
     lanes: VectorBuilder
@@ -31,7 +31,7 @@ class StepEnvironment(Environment):
     equation: int = 0
 
     def emit_symbol(self, symbol: Symbol) -> IrValue:
-        """A parameter, the sampling period, the sample number or the time."""
+        """Emit a parameter, the sampling period, the sample number or the time."""
         if symbol.kind in ("parameter", "period"):
             return self.parameters.emit_symbol(symbol)
         steps = self.lanes.builder.sitofp(self.turn.step, DOUBLE)
@@ -42,7 +42,7 @@ class StepEnvironment(Environment):
         return self.lanes.mul(steps, self.parameters.period)
 
     def emit_past_value(self, past: PastValue) -> IrValue:
-        """A state or an input, now or in the past."""
+        """Emit a state or an input, now or in the past."""
         if past.kind == "input":
             return self._emit_input(past)
         if past.delay is None and past.offset == 0:
@@ -60,7 +60,7 @@ class StepEnvironment(Environment):
 
     @property
     def is_in_equation(self) -> bool:
-        """Whether an equation asks; an output is evaluated at a finished step."""
+        """Whether an equation is emitted; an output is evaluated at a finished step."""
         return self.equation >= 0
 
     def _emit_sample(self, name: str, back: int) -> IrValue:
@@ -77,44 +77,52 @@ class StepEnvironment(Environment):
 
 
 class EnvironmentBuilder(Protocol):
-    """Makes the scope at a place, for an equation, given the states' values there."""
+    """Function that builds the environment at a place, from the states' values there."""
 
     def __call__(
         self, halves: int, values: dict[str, IrValue], equation: int = 0
     ) -> StepEnvironment:
-        """The scope."""
+        """Build the environment."""
 
 
 def emit_next_states(
-    lanes: VectorBuilder, model: Model, step: IrValue, states: States, at: EnvironmentBuilder
+    lanes: VectorBuilder,
+    model: Model,
+    step: IrValue,
+    states: States,
+    build_environment: EnvironmentBuilder,
 ) -> dict[str, IrValue]:
-    """The states one step later."""
+    """Emit the states one step later."""
     if demand.is_difference(model):
-        return _emit_recursion(lanes, model, at)
+        return _emit_recursion(lanes, model, build_environment)
     if model.solver.method == "rk4":
-        return _emit_runge_kutta(lanes, model, step, states, at)
-    return _emit_euler(lanes, model, step, states, at)
+        return _emit_runge_kutta(lanes, model, step, states, build_environment)
+    return _emit_euler(lanes, model, step, states, build_environment)
 
 
 def _emit_recursion(
-    lanes: VectorBuilder, model: Model, at: EnvironmentBuilder
+    lanes: VectorBuilder, model: Model, build_environment: EnvironmentBuilder
 ) -> dict[str, IrValue]:
-    """x(k) = f(x(k-1), …), in the order in which the equations need one another."""
+    """Emit x(k) = f(x(k-1), …), in the order of the equations' dependencies."""
     values: dict[str, IrValue] = {}
     for i in model.order:
-        result = emit_expression(lanes, model.equations[i], at(2, values, i))
+        result = emit_expression(lanes, model.equations[i], build_environment(2, values, i))
         values[model.states[i].name] = lanes.splat(result)
     return values
 
 
 def _emit_euler(
-    lanes: VectorBuilder, model: Model, step: IrValue, states: States, at: EnvironmentBuilder
+    lanes: VectorBuilder,
+    model: Model,
+    step: IrValue,
+    states: States,
+    build_environment: EnvironmentBuilder,
 ) -> dict[str, IrValue]:
-    """Euler: x + h f(x); in the semi-implicit method, each f with the states already updated."""
+    """Emit Euler's x + h f(x); semi-implicit: each f uses the states already updated."""
     semi_implicit = model.solver.method == "semi-implicit"
     values, updated = dict(states.now), {}
     for i, (state, equation) in enumerate(zip(model.states, model.equations, strict=True)):
-        slope = emit_expression(lanes, equation, at(0, values, i))
+        slope = emit_expression(lanes, equation, build_environment(0, values, i))
         updated[state.name] = lanes.add(states.now[state.name], lanes.mul(step, slope))
         if semi_implicit:
             values[state.name] = updated[state.name]
@@ -122,27 +130,31 @@ def _emit_euler(
 
 
 def _emit_runge_kutta(
-    lanes: VectorBuilder, model: Model, step: IrValue, states: States, at: EnvironmentBuilder
+    lanes: VectorBuilder,
+    model: Model,
+    step: IrValue,
+    states: States,
+    build_environment: EnvironmentBuilder,
 ) -> dict[str, IrValue]:
-    """The classical method of order four."""
+    """Emit the classical Runge-Kutta method of order four."""
     half = lanes.mul(step, lanes.make_number(0.5))
 
-    def slopes(halves: int, values: dict[str, IrValue]) -> dict[str, IrValue]:
+    def emit_slopes(halves: int, values: dict[str, IrValue]) -> dict[str, IrValue]:
         return {
-            state.name: emit_expression(lanes, equation, at(halves, values, i))
+            state.name: emit_expression(lanes, equation, build_environment(halves, values, i))
             for i, (state, equation) in enumerate(zip(model.states, model.equations, strict=True))
         }
 
-    def moved(width: IrValue, slope: dict[str, IrValue]) -> dict[str, IrValue]:
+    def shift_states(width: IrValue, slope: dict[str, IrValue]) -> dict[str, IrValue]:
         return {n: lanes.add(x, lanes.mul(width, slope[n])) for n, x in states.now.items()}
 
-    first = slopes(0, dict(states.now))
-    second = slopes(1, moved(half, first))
-    third = slopes(1, moved(half, second))
-    fourth = slopes(2, moved(step, third))
+    first = emit_slopes(0, dict(states.now))
+    second = emit_slopes(1, shift_states(half, first))
+    third = emit_slopes(1, shift_states(half, second))
+    fourth = emit_slopes(2, shift_states(step, third))
     two = lanes.make_number(2.0)
     mean = {
         n: lanes.add(lanes.add(first[n], fourth[n]), lanes.mul(two, lanes.add(second[n], third[n])))
         for n in states.names
     }
-    return moved(lanes.mul(step, lanes.make_number(1.0 / 6.0)), mean)
+    return shift_states(lanes.mul(step, lanes.make_number(1.0 / 6.0)), mean)

@@ -1,4 +1,4 @@
-"""The code of a kernel: blocks of individuals, the time loop in each, the loss at the end."""
+"""Code generation of a kernel: blocks of individuals, a time loop in each, and the loss."""
 
 from dataclasses import dataclass
 
@@ -21,11 +21,11 @@ from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
 
 KERNEL_NAME = "kernel"
-"""Name of the function in its module."""
+"""Name of the kernel's function in its module."""
 
 
 def emit_kernel(model: Model, variant: KernelVariant) -> str:
-    """LLVM assembly of a model's kernel."""
+    """Emit the LLVM assembly of a model's kernel."""
     module = ir.Module("lagid")
     function = ir.Function(module, build_kernel_type(), KERNEL_NAME)
     for argument, name in zip(function.args, KERNEL_ARGUMENTS, strict=True):
@@ -39,24 +39,26 @@ def emit_kernel(model: Model, variant: KernelVariant) -> str:
     )
     blocks = KernelLoop(lanes)
     first = blocks.carry(lanes.make_integer(0))
-    left = lanes.builder.sub(arguments["P"], first)
-    blocks.leave_if(lanes.builder.icmp_signed("<=", left, lanes.make_integer(NARROW_LANES)))
+    remaining = lanes.builder.sub(arguments["P"], first)
+    blocks.leave_if(lanes.builder.icmp_signed("<=", remaining, lanes.make_integer(NARROW_LANES)))
     _add_loss(lanes, _Block(lanes, model, variant, experiment, arguments, first))
     blocks.update(first, lanes.builder.add(first, lanes.make_integer(LANES)))
     blocks.repeat()
 
-    def few() -> list[IrValue]:
+    def emit_narrow_block() -> list[IrValue]:
         _add_loss(narrow, _Block(narrow, model, variant, experiment, arguments, first))
         return []
 
     narrow = lanes.copy_with_width(NARROW_LANES)
-    lanes.branch(lanes.builder.icmp_signed(">", left, lanes.make_integer(0)), few, [])
+    lanes.branch(
+        lanes.builder.icmp_signed(">", remaining, lanes.make_integer(0)), emit_narrow_block, []
+    )
     lanes.builder.ret_void()
     return str(module)
 
 
 def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:
-    """Simulate a block and add its losses to those that are there."""
+    """Simulate a block and add its losses to the stored ones."""
     loss, target = block.emit_simulation(), block.arguments["loss"]
     so_far = lanes.load_row(target, block.first)
     lanes.store_row(lanes.add(so_far, loss), target, block.first)
@@ -64,7 +66,7 @@ def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """As many individuals as lanes, from the start of the experiment to its end."""
+    """Simulation of as many individuals as lanes, over the whole experiment."""
 
     lanes: VectorBuilder
     model: Model
@@ -74,7 +76,7 @@ class _Block:
     first: IrValue
 
     def emit_simulation(self) -> IrValue:
-        """Write the simulation; gives the sum of the losses."""
+        """Emit the simulation; return the sum of the losses."""
         lanes, model, experiment = self.lanes, self.model, self.experiment
         step = experiment.get_number("step")
         scope = ParameterEnvironment(
@@ -87,8 +89,8 @@ class _Block:
         start = [self._load_initial_state(i) for i in range(len(model.states))]
         states = States(lanes, model, experiment, self.arguments["work"], start)
         row = states.fill_history()
-        lags = Delays(lanes, model, scope, step)
-        signals = SignalReaders(lanes, model, experiment, states, lags, self.variant.one_step)
+        delays = Delays(lanes, model, scope, step)
+        signals = SignalReaders(lanes, model, experiment, states, delays, self.variant.one_step)
         comparison = LossAccumulator(
             lanes, model, self.variant, experiment, self.arguments, self.first
         )
@@ -99,13 +101,13 @@ class _Block:
         signals.open_loop(loop)
         comparison.open_loop(loop)
         signals.begin_step(turn)
-        at = _bind_environment(lanes, model, scope, states, signals, turn)
-        comparison.compare_step(turn, states, at)
+        build_environment = _bind_environment(lanes, model, scope, states, signals, turn)
+        comparison.compare_step(turn, states, build_environment)
         loop.leave_if(lanes.builder.icmp_signed(">=", turn.step, experiment.get_head("last")))
         if self.variant.one_step:
             states.store_states(turn.row)
             signals.begin_step(turn)
-        following = self._emit_following_states(turn, states, at)
+        following = self._emit_following_states(turn, states, build_environment)
         signals.end_step(loop, following)
         states.end_step(loop, following)
         comparison.end_step(loop)
@@ -115,7 +117,7 @@ class _Block:
         return self._mark_divergence(comparison.loss, states)
 
     def _mark_divergence(self, loss: IrValue, states: States) -> IrValue:
-        """The loss, or nan where a state is not finite even if the outputs hide it."""
+        """Turn the loss into nan if a state is not finite, even if the outputs hide it."""
         for name in states.names:
             last = states.line[name][0]
             loss = self.lanes.add(loss, self.lanes.sub(last, last))
@@ -127,31 +129,35 @@ class _Block:
         return self.lanes.load_row(self.arguments["theta"], index)
 
     def _load_initial_state(self, i: int) -> IrValue:
-        """Where a state starts: a number of the experiment, or a row of theta."""
-        known = self.experiment.initial[i]
+        """Load a state's initial value: a number of the experiment, or a row of theta."""
+        initial = self.experiment.initial[i]
         if not isinstance(self.model.initial[i], EstimatedInitial):
-            return known
+            return initial
         return self._load_parameter(self.experiment.get_state_field(i, "row"))
 
     def _emit_following_states(
-        self, turn: TimeStep, states: States, at: EnvironmentBuilder
+        self, turn: TimeStep, states: States, build_environment: EnvironmentBuilder
     ) -> dict[str, IrValue]:
-        """The next states: computed, or, in the first samples of a recursion, given."""
+        """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
         if not demand.is_difference(model) or model.memory <= 1:
-            return emit_next_states(lanes, model, self.experiment.get_number("step"), states, at)
+            return emit_next_states(
+                lanes, model, self.experiment.get_number("step"), states, build_environment
+            )
         following = lanes.builder.add(turn.step, lanes.make_integer(1))
-        given = [
+        measured = [
             lanes.splat(self._load_measured_state(i, following)) for i in range(len(states.names))
         ]
 
-        def computed() -> list[IrValue]:
-            values = emit_next_states(lanes, model, self.experiment.get_number("step"), states, at)
+        def emit_computed() -> list[IrValue]:
+            values = emit_next_states(
+                lanes, model, self.experiment.get_number("step"), states, build_environment
+            )
             return [lanes.splat(values[name]) for name in states.names]
 
         is_computed = lanes.builder.icmp_signed(">=", following, lanes.make_integer(model.memory))
-        made = lanes.branch(is_computed, computed, given)
-        return dict(zip(states.names, made, strict=True))
+        merged = lanes.branch(is_computed, emit_computed, measured)
+        return dict(zip(states.names, merged, strict=True))
 
     def _load_measured_state(self, i: int, sample: IrValue) -> IrValue:
         if not isinstance(self.model.initial[i], MeasuredInitial):
@@ -171,9 +177,11 @@ def _bind_environment(
     signals: SignalReaders,
     turn: TimeStep,
 ) -> EnvironmentBuilder:
-    """What names mean at a place of this turn, given the states' values there."""
+    """Bind the environment of this step; its places and the states' values stay open."""
 
-    def at(halves: int, values: dict[str, IrValue], equation: int = 0) -> StepEnvironment:
+    def build_environment(
+        halves: int, values: dict[str, IrValue], equation: int = 0
+    ) -> StepEnvironment:
         return StepEnvironment(lanes, model, scope, states, signals, turn, halves, values, equation)
 
-    return at
+    return build_environment

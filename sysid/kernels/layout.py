@@ -1,7 +1,7 @@
-"""How an experiment's numbers lie in `ints` and `floats`, for those who write and who read them.
+"""Layout of an experiment's numbers in the arrays `ints` and `floats`.
 
-Both begin with a head of fixed places; the arrays follow, and the head says where. All places
-count from the experiment's own beginning.
+Both arrays begin with a head of fixed places, which locates the data that follow. All places count
+from the beginning of the experiment.
 """
 
 from dataclasses import dataclass
@@ -9,28 +9,36 @@ from dataclasses import dataclass
 from sysid.models.model import Model
 
 HEAD_FIELDS = ("last", "reach", "rows")
-"""Last integration step; rows of history that lags reach back; rows of the history's buffer."""
+"""Last integration step; rows of history that delays reach back; rows of the buffer."""
 
 STATE_FIELDS = ("row", "given")
-"""Row of theta that holds the initial value, or -1; place of the given first samples, or -1."""
+"""Row of theta with the initial value, or -1; place of the measured first samples, or -1."""
 
 INPUT_FIELDS = ("zero", "points", "begin", "end", "cap")
-"""Place of the value at step 0; fine points in a step; where a step begins and ends, in fine
-points (they differ from 0 and `points` where a held input jumps); largest lag in fine points."""
+"""Fields of an input.
+
+Place of the value at step 0; fine points in a step; begin and end of a step in fine points (a held
+input jumps, so they differ from 0 and `points`); largest delay in fine points.
+"""
 
 OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid")
-"""Places of measured values and weights; place (in ints) of each grid point's row or of the
-bounds of its interval's samples; place of the samples' positions inside their interval; first row
-of the predictions; place of the measurement interpolated to the grid."""
+"""Fields of an output.
+
+Places of measured values and weights; place (in ints) of each grid point's row, or of the bounds of
+its interval's samples; place of the samples' positions in their interval; first row of the
+predictions; place of the measurement interpolated to the grid.
+"""
 
 FLOAT_FIELDS = ("step", "cap", "scale")
-"""Integration step in s (difference form: h); largest lag in steps; scale of soft-l1. The
-states' initial values follow."""
+"""Integration step in s (difference form: h); largest delay in steps; scale of soft-l1.
+
+The states' initial values follow.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class KernelVariant:
-    """What is compiled into a kernel besides the model.
+    """Options that are compiled into a kernel, besides the model.
 
     Attributes
     ----------
@@ -41,7 +49,7 @@ class KernelVariant:
     on_grid : bool
         Every measured sample lies on a grid point of its own.
     weighted : bool
-        Some weight is not 1.
+        At least one weight is not 1.
     """
 
     one_step: bool = False
@@ -52,7 +60,7 @@ class KernelVariant:
 
 @dataclass(frozen=True, slots=True)
 class ExperimentLayout:
-    """Places of the head, in ints, for a model of these sizes."""
+    """Places of the head, for a model with these numbers of signals."""
 
     states: int
     inputs: int
@@ -60,15 +68,15 @@ class ExperimentLayout:
 
     @classmethod
     def from_model(cls, model: Model) -> "ExperimentLayout":
-        """Layout for a model's experiments."""
+        """Build the layout of a model's experiments."""
         return cls(len(model.states), len(model.inputs), len(model.outputs))
 
     def locate_state(self, number: int, field: str) -> int:
-        """Place of a state's entry."""
+        """Return the place (in ints) of a state's field."""
         return len(HEAD_FIELDS) + number * len(STATE_FIELDS) + STATE_FIELDS.index(field)
 
     def locate_input(self, number: int, field: str) -> int:
-        """Place of an input's entry."""
+        """Return the place (in ints) of an input's field."""
         return (
             self.locate_state(self.states, STATE_FIELDS[0])
             + number * len(INPUT_FIELDS)
@@ -76,7 +84,7 @@ class ExperimentLayout:
         )
 
     def locate_output(self, number: int, field: str) -> int:
-        """Place of an output's entry."""
+        """Return the place (in ints) of an output's field."""
         return (
             self.locate_input(self.inputs, INPUT_FIELDS[0])
             + number * len(OUTPUT_FIELDS)
@@ -94,5 +102,5 @@ class ExperimentLayout:
         return len(FLOAT_FIELDS) + self.states
 
     def locate_initial(self, number: int) -> int:
-        """Place (in floats) of a state's initial value."""
+        """Return the place (in floats) of a state's initial value."""
         return len(FLOAT_FIELDS) + number

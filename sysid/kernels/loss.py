@@ -1,4 +1,4 @@
-"""Comparison of the simulated outputs with the measured ones, inside the time loop."""
+"""Loss: comparison of simulated and measured outputs, inside the time loop."""
 
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.expressions import emit_expression
@@ -11,7 +11,7 @@ from sysid.models.model import Model
 
 
 class LossAccumulator:
-    """Sums the loss at each grid point and stores predictions where they are asked for."""
+    """Sum of the loss over the grid points; predictions are stored on request."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class LossAccumulator:
         self._earlier: list[IrValue] = []
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Carry the sum, and the outputs at the last grid point where samples lie between."""
+        """Carry the sum, and the last outputs if samples lie between grid points."""
         self._carried_loss = loop.carry(self.loss)
         self.loss = self._carried_loss
         if not self._variant.on_grid:
@@ -39,19 +39,21 @@ class LossAccumulator:
             self._earlier = [loop.carry(zero) for _ in self._model.outputs]
         self._carried_earlier = list(self._earlier)
 
-    def compare_step(self, turn: TimeStep, states: States, at: EnvironmentBuilder) -> None:
-        """Compare if the step is a grid point; for one-step prediction replace the states."""
+    def compare_step(
+        self, turn: TimeStep, states: States, build_environment: EnvironmentBuilder
+    ) -> None:
+        """Compare if the step is a grid point; one-step prediction then replaces the states."""
         lanes, b = self._lanes, self._lanes.builder
         substeps = self._substeps
         if substeps == 1:
-            self._compare_grid_point(turn.step, states, at)
+            self._compare_grid_point(turn.step, states, build_environment)
             return
         number = lanes.make_integer(substeps)
         grid = b.sdiv(turn.step, number)
         before = [self.loss, *self._earlier, *states.now.values()]
 
         def body() -> list[IrValue]:
-            self._compare_grid_point(grid, states, at)
+            self._compare_grid_point(grid, states, build_environment)
             return [self.loss, *self._earlier, *states.now.values()]
 
         is_grid = b.icmp_signed("==", b.mul(grid, number), turn.step)
@@ -61,7 +63,7 @@ class LossAccumulator:
         states.now = dict(zip(states.names, rest[count:], strict=True))
 
     def end_step(self, loop: KernelLoop) -> None:
-        """Hand over to the next turn; after the loop, `loss` is what the last turn had."""
+        """Update the carried values; after the loop, `loss` is that of the last step."""
         loop.update(self._carried_loss, self.loss)
         for carried, value in zip(self._carried_earlier, self._earlier, strict=True):
             loop.update(carried, value)
@@ -70,9 +72,11 @@ class LossAccumulator:
     def _substeps(self) -> int:
         return self._model.solver.substeps
 
-    def _compare_grid_point(self, grid: IrValue, states: States, at: EnvironmentBuilder) -> None:
+    def _compare_grid_point(
+        self, grid: IrValue, states: States, build_environment: EnvironmentBuilder
+    ) -> None:
         lanes = self._lanes
-        scope = at(0, dict(states.now), -1)
+        scope = build_environment(0, dict(states.now), -1)
         outputs = [
             lanes.splat(emit_expression(lanes, output.expression, scope))
             for output in self._model.outputs
@@ -86,7 +90,7 @@ class LossAccumulator:
             self._replace_states(grid, states)
 
     def _compare_sample(self, i: int, grid: IrValue, value: IrValue) -> None:
-        """The output has at most one sample here, and it lies on the grid point."""
+        """Compare the one sample that an output may have on this grid point."""
         lanes, b = self._lanes, self._lanes.builder
         self.loss = lanes.add(self.loss, self._emit_cost(i, grid, value))
 
@@ -100,7 +104,7 @@ class LossAccumulator:
         lanes.branch(self._stores, store, [])
 
     def _compare_interval(self, i: int, grid: IrValue, value: IrValue) -> None:
-        """Samples lie anywhere between the last grid point and this one."""
+        """Compare the samples between the last grid point and this one."""
         lanes, b, experiment = self._lanes, self._lanes.builder, self._experiment
         bounds = b.add(experiment.get_output_field(i, "samples"), grid)
         start = lanes.load_integer(experiment.ints, bounds)
@@ -127,7 +131,7 @@ class LossAccumulator:
         self._earlier[i] = value
 
     def _emit_cost(self, i: int, sample: IrValue, value: IrValue) -> IrValue:
-        """Loss of one sample: w²e², or 2s²(√(1 + (we/s)²) - 1) without its cancellation."""
+        """Emit the loss of one sample: w²e², or 2s²(√(1 + (we/s)²) - 1) without cancellation."""
         lanes, b, experiment = self._lanes, self._lanes.builder, self._experiment
         measured = lanes.load_double(
             experiment.floats, b.add(experiment.get_output_field(i, "measured"), sample)
@@ -139,10 +143,10 @@ class LossAccumulator:
         square = lanes.mul(error, error)
         if not self._variant.soft:
             return square
-        scale, one = experiment.get_number("scale"), lanes.make_number(1.0)
+        scale, unit = experiment.get_number("scale"), lanes.make_number(1.0)
         ratio = lanes.div(square, lanes.mul(scale, scale))
-        root = lanes.call_intrinsic("sqrt", lanes.add(one, ratio))
-        return lanes.div(lanes.mul(lanes.make_number(2.0), square), lanes.add(one, root))
+        root = lanes.call_intrinsic("sqrt", lanes.add(unit, ratio))
+        return lanes.div(lanes.mul(lanes.make_number(2.0), square), lanes.add(unit, root))
 
     def _store_prediction(self, row: IrValue, value: IrValue) -> list[IrValue]:
         b = self._lanes.builder
@@ -151,7 +155,7 @@ class LossAccumulator:
         return []
 
     def _replace_states(self, grid: IrValue, states: States) -> None:
-        """One-step prediction goes on from the measurement."""
+        """Replace states by measurements, for one-step prediction."""
         for i, output in enumerate(self._model.outputs):
             name = match_plain_state(output.expression)
             if name is not None:

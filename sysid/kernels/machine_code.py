@@ -1,9 +1,8 @@
-"""From LLVM assembly to object code for this machine, and from that to an address.
+"""Compiling of LLVM assembly to object code, and loading of object code.
 
-Compiling in processes of their own, from the time a process has compiled many kernels itself.
-
-What LLVM's passes leave behind of each module, about 0.3 MB, nothing frees before the process ends.
-A service that is sent new models for weeks would grow by it; machine code itself is small.
+LLVM's passes leave about 0.3 MB of each module in memory until the process ends. A service that
+receives new models for weeks would grow by it. So a process that has compiled many kernels uses
+subprocesses. Machine code itself is small.
 """
 
 import logging
@@ -41,7 +40,7 @@ def _list_cpu_features() -> str:
 
 @cache
 def describe_machine() -> str:
-    """What object code depends on besides its source: compiler, processor, vector library."""
+    """Describe what object code depends on: compiler, processor, vector library."""
     words = (llvmlite.__version__, str(llvm.llvm_version_info), llvm.get_host_cpu_name())
     return "\n".join((*words, _list_cpu_features(), *load_vector_functions().symbols.values()))
 
@@ -58,7 +57,7 @@ def compile_assembly(assembly: str) -> bytes:
 
 
 def load_object_code(code: bytes, function: str) -> int:
-    """Address of a function of some object code, which stays loaded."""
+    """Load object code, which stays loaded; return the address of a function."""
     _create_target_machine()
     load_vector_functions()  # the code may call them
     empty = llvm.parse_assembly("")
@@ -72,17 +71,13 @@ def load_object_code(code: bytes, function: str) -> int:
 
 
 MAX_OWN_COMPILATIONS = 64
-"""Kernels that a process compiles itself: it takes half a second less than to start another."""
+"""Kernels that a process compiles itself, which saves half a second for each."""
 
 _TIMEOUT_SECONDS = 300.0
-_INHERITED_VARIABLES = (
-    "PATH",
-    "LD_LIBRARY_PATH",
-    "DYLD_LIBRARY_PATH",
-)  # what an interpreter may need to start
-_own_compilations: list[
-    None
-] = []  # one entry for each, since += on a number is two steps of two threads
+# Variables that an interpreter may need to start.
+_INHERITED_VARIABLES = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")
+# One entry for each compilation: unlike += on a number, append is safe with threads.
+_own_compilations: list[None] = []
 _log = logging.getLogger(__name__)
 
 
@@ -100,15 +95,15 @@ def compile_bounded(assembly: str) -> bytes:
 
 
 def _compile_in_subprocess(assembly: str) -> bytes:
-    # What this process imports and no more: `-m` alone would put the folder it stands in first.
+    # Same import path as this process: `-m` alone would put the working folder first.
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    kept = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
+    inherited = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
     return subprocess.run(
         [sys.executable, "-P", "-m", "sysid.kernels.machine_code"],
         input=assembly.encode(),
         stdout=subprocess.PIPE,
         timeout=_TIMEOUT_SECONDS,
-        env={**kept, "PYTHONPATH": path},
+        env={**inherited, "PYTHONPATH": path},
         check=True,
     ).stdout
 

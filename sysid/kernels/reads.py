@@ -1,7 +1,7 @@
-"""Which past values a model reads, and where on the time axis, before any code is written.
+"""Reads of a model: its past values and their places on the time axis.
 
-Places are counted in half integration steps from the last finished step: the stages of a
-Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation computes at 2.
+Places are counted in half integration steps from the last finished step. The stages of a
+Runge-Kutta step are at 0, 1 and 2. The sample that a difference equation computes is at 2.
 """
 
 from typing import NamedTuple
@@ -12,13 +12,13 @@ from sysid.language.tree import PastValue
 from sysid.models.model import Model
 
 MAX_REGISTER_OFFSET = 8
-"""Fixed offsets up to this many samples are kept in registers, further ones in the history."""
+"""Largest fixed offset (samples) that is held in registers; others are in the history."""
 
 _MAX_GAP = 4  # half steps: two values at most this far apart share one read
 
 
 class SignalRead(NamedTuple):
-    """A past value and its place without its lag."""
+    """A past value and its place without its delay."""
 
     past: PastValue
     half_steps: int
@@ -30,48 +30,48 @@ def is_difference(model: Model) -> bool:
 
 
 def list_stages(model: Model) -> tuple[int, ...]:
-    """Places at which the equations are evaluated in one step."""
+    """List the places at which the equations are evaluated in one step."""
     if is_difference(model):
         return (2,)
     return (0, 1, 2) if model.solver.method == "rk4" else (0,)
 
 
 def find_state_place(model: Model, stage: int, equation: int, state: int) -> int:
-    """Place of a state's value without lag, in an equation at a stage.
+    """Find the place of a state's undelayed value, in an equation at a stage.
 
-    The semi-implicit method uses states already updated as they are at the end of the step.
+    The semi-implicit method reads updated states at the end of the step.
     """
     semi_implicit = not is_difference(model) and model.solver.method == "semi-implicit"
     return 2 if semi_implicit and state < equation else stage
 
 
-@cache_by_identity  # every run asks
+@cache_by_identity  # called by every run
 def collect_reads(model: Model) -> tuple[SignalRead, ...]:
-    """Every past value that the equations and the outputs read."""
+    """Collect every past value that the equations and the outputs read."""
     numbers = {state.name: i for i, state in enumerate(model.states)}
-    found: list[SignalRead] = []
+    signal_reads: list[SignalRead] = []
     for i, equation in enumerate(model.equations):
         for stage in list_stages(model):
             for past in collect_past_values(equation):
                 state = past.kind == "state"
-                at = find_state_place(model, stage, i, numbers[past.name]) if state else stage
-                found.append(SignalRead(past, at - 2 * past.offset))
+                place = find_state_place(model, stage, i, numbers[past.name]) if state else stage
+                signal_reads.append(SignalRead(past, place - 2 * past.offset))
     for output in model.outputs:
-        found += [
+        signal_reads += [
             SignalRead(past, -2 * past.offset) for past in collect_past_values(output.expression)
         ]
-    return tuple(found)
+    return tuple(signal_reads)
 
 
 def list_delayed_values(model: Model, kind: str) -> list[PastValue]:
-    """The lagged values of that kind of signal, each once."""
+    """List the delayed values of one kind of signal, each once."""
     return [
         *dict.fromkeys(r.past for r in collect_reads(model) if r.past.kind == kind and r.past.delay)
     ]
 
 
 def find_averaged_inputs(model: Model) -> frozenset[str]:
-    """Inputs that are read with unknown lags only: held ones are given as means over a step."""
+    """Find inputs with unknown delays only; if held, they are averaged over a step."""
     inputs = [r.past for r in collect_reads(model) if r.past.kind == "input"]
     unknown = {past.name for past in inputs if _has_unknown_delay(past)}
     return frozenset(unknown - {past.name for past in inputs if not _has_unknown_delay(past)})
@@ -82,7 +82,7 @@ def _has_unknown_delay(past: PastValue) -> bool:
 
 
 def list_states_with_history(model: Model) -> list[str]:
-    """States whose past must be kept in memory, in the model's order."""
+    """List the states whose history must be stored in memory, in the model's order."""
     needed = {
         r.past.name
         for r in collect_reads(model)
@@ -93,7 +93,7 @@ def list_states_with_history(model: Model) -> list[str]:
 
 
 def count_register_samples(model: Model, state: str) -> int:
-    """How many finished samples of a state are kept in registers besides the last."""
+    """Count the finished samples of a state in registers, besides the last."""
     fixed = [
         -r.half_steps // 2
         for r in collect_reads(model)
@@ -103,14 +103,14 @@ def count_register_samples(model: Model, state: str) -> int:
 
 
 def find_furthest_offset(model: Model) -> int:
-    """Whole steps that the furthest read lies back, without its lag."""
+    """Find the largest offset of any read, in whole steps, without delays."""
     return max([0, *(-(r.half_steps // 2) for r in collect_reads(model))])
 
 
 def group_places(places: set[int]) -> list[list[int]]:
-    """Places grouped so that a group needs one read: the rest are its values of earlier steps.
+    """Group places so that each group needs one read; the others are earlier values of it.
 
-    Each group holds the place that is read and then, step by step, those behind it.
+    Each group holds the place that is read, followed step by step by the earlier places.
     """
     groups: list[list[int]] = []
     for parity in (0, 1):

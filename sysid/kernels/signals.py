@@ -1,7 +1,4 @@
-"""The signals of one block of individuals: states in registers and history, inputs, lags.
-
-What a kernel knows of the experiment it simulates: the numbers of its head, once loaded.
-"""
+"""Signals of one block of individuals: experiment head, states, inputs and delays."""
 
 from dataclasses import dataclass
 
@@ -29,7 +26,7 @@ from sysid.models.model import Model
 
 
 class ExperimentHead:
-    """The head of an experiment's numbers, loaded where it is made: at the kernel's entry."""
+    """Head of an experiment's numbers, loaded at the kernel's entry."""
 
     def __init__(
         self, lanes: VectorBuilder, layout: ExperimentLayout, ints: IrValue, floats: IrValue
@@ -70,66 +67,66 @@ class ExperimentHead:
         ]
 
     def get_head(self, field: str) -> IrValue:
-        """A number of the experiment as a whole."""
+        """Return a whole number of the experiment."""
         return self._head[field]
 
     def get_number(self, field: str) -> IrValue:
-        """A real number of the experiment as a whole."""
+        """Return a real number of the experiment."""
         return self._numbers[field]
 
     def get_state_field(self, i: int, field: str) -> IrValue:
-        """A number of the i-th state."""
+        """Return a field of the i-th state."""
         return self._states[i][field]
 
     def get_input_field(self, i: int, field: str) -> IrValue:
-        """A number of the i-th input."""
+        """Return a field of the i-th input."""
         return self._inputs[i][field]
 
     def get_output_field(self, i: int, field: str) -> IrValue:
-        """A number of the i-th output."""
+        """Return a field of the i-th output."""
         return self._outputs[i][field]
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterEnvironment(Environment):
-    """The scope of a lag: parameters and the sampling period."""
+    """Environment of a delay: parameters and the sampling period."""
 
     values: dict[str, IrValue]
     period: IrValue
 
     def emit_symbol(self, symbol: Symbol) -> IrValue:
-        """Value of a parameter, or h."""
+        """Emit the value of a parameter, or h."""
         return self.values[symbol.name] if symbol.kind == "parameter" else self.period
 
     def emit_past_value(self, past: PastValue) -> IrValue:
-        """Never asked: the language allows no signals in a lag."""
+        """Raise: the language allows no signals in a delay."""
         raise AssertionError(f"a delay contains no signal such as {past.name}")
 
 
 class Delays:
-    """Lags in integration steps, each expression written once."""
+    """Delays in integration steps; each expression is emitted once."""
 
     def __init__(
         self, lanes: VectorBuilder, model: Model, scope: ParameterEnvironment, step: IrValue
     ) -> None:
         self._lanes, self._model, self._scope, self._step = lanes, model, scope, step
-        self._known: dict[Expression, IrValue] = {}
+        self._steps: dict[Expression, IrValue] = {}
 
-    def to_steps(self, lag: Expression) -> IrValue:
-        """The lag in steps; to the nearest whole one where the model asks for that."""
-        if lag not in self._known:
+    def to_steps(self, delay: Expression) -> IrValue:
+        """Convert a delay to steps, rounded if the model interpolates by ``nearest``."""
+        if delay not in self._steps:
             lanes = self._lanes
-            value = lanes.splat(emit_expression(lanes, lag, self._scope))
+            value = lanes.splat(emit_expression(lanes, delay, self._scope))
             if not demand.is_difference(self._model):
                 value = lanes.div(value, self._step)
             if self._model.solver.interpolation == "nearest":
                 value = lanes.call_intrinsic("floor", lanes.add(value, lanes.make_number(0.5)))
-            self._known[lag] = value
-        return self._known[lag]
+            self._steps[delay] = value
+        return self._steps[delay]
 
 
 class States:
-    """The states: their last samples in registers, and in the history where lags need it."""
+    """States: their last samples in registers, and the history if delays need it."""
 
     def __init__(
         self,
@@ -159,11 +156,11 @@ class States:
         self.line: dict[str, list[IrValue]] = {}
 
     def get_history(self, name: str) -> StateHistory:
-        """Where the past of a state is kept."""
+        """Return the history of a state."""
         return self._histories[name]
 
     def fill_history(self) -> IrValue:
-        """Write what was before the start and the start itself; gives the row of the start."""
+        """Store the history before the start and the start itself; return the start's row."""
         lanes, b = self._lanes, self._lanes.builder
         if self._histories:
             loop = KernelLoop(lanes)
@@ -180,13 +177,13 @@ class States:
         return self._reach
 
     def store_states(self, row: IrValue) -> None:
-        """Write the present states into a row of the history."""
+        """Store the present states in a row of the history."""
         index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
         for name, history in self._histories.items():
             self._lanes.store_row(self.now[name], history.base, index)
 
     def load_far_sample(self, name: str, back: int, row: IrValue) -> IrValue:
-        """A sample a fixed number of steps before the last finished one."""
+        """Load the sample a fixed number of steps before the last finished one."""
         b = self._lanes.builder
         index = b.mul(
             b.sub(row, self._lanes.make_integer(back)), self._lanes.make_integer(self._lanes.width)
@@ -194,7 +191,7 @@ class States:
         return self._lanes.load_row(self._histories[name].base, index)
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Carry the states, and those before them, through the time loop."""
+        """Carry the states and their earlier samples through the time loop."""
         for name in self.names:
             first = loop.carry(self.now[name])
             before = self._before[name]
@@ -205,7 +202,7 @@ class States:
             self.now[name] = first
 
     def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
-        """Hand the next states over; `now` may have been replaced by measurements."""
+        """Update the carried states; measurements may have replaced `now`."""
         for name in self.names:
             carried = self.line[name]
             values = [following[name], self.now[name], *carried[1:]]
@@ -214,14 +211,14 @@ class States:
         self.now = following
 
     def advance_row(self, row: IrValue) -> IrValue:
-        """Row of the next step: one further, or, at the end of the buffer, back at its front."""
+        """Advance the row of the history; at the buffer's end, move its last rows to the front."""
         lanes, b = self._lanes, self._lanes.builder
         following = b.add(row, lanes.make_integer(1))
         if not self._histories:
             return following
         self.store_states(following)
 
-        def slide() -> list[IrValue]:
+        def emit_slide() -> list[IrValue]:
             first = b.sub(following, self._reach)
             size = b.mul(b.add(self._reach, lanes.make_integer(1)), lanes.make_integer(lanes.width))
             source = b.mul(first, lanes.make_integer(lanes.width))
@@ -230,11 +227,11 @@ class States:
             return [self._reach]
 
         is_last = b.icmp_signed("==", following, b.sub(self._rows, lanes.make_integer(1)))
-        return lanes.branch(is_last, slide, [following])[0]
+        return lanes.branch(is_last, emit_slide, [following])[0]
 
 
 class SignalReaders:
-    """Readers of all lagged signals of a model, and the inputs without lag."""
+    """Readers of all delayed signals of a model, and the inputs without delay."""
 
     def __init__(
         self,
@@ -242,28 +239,30 @@ class SignalReaders:
         model: Model,
         experiment: ExperimentHead,
         states: States,
-        lags: Delays,
-        fresh: bool,
+        delays: Delays,
+        one_step: bool,
     ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
-        self._inputs = {quantity.name: i for i, quantity in enumerate(model.inputs)}
+        self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
         self._owners: list[tuple[str, DelayedReader]] = []
         cubic = model.solver.interpolation == "cubic"
         for past, places in _group_delayed_reads(model, "state").items():
-            lag = lanes.clamp(lags.to_steps(past[1]), experiment.get_number("cap"))
+            delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
             history = states.get_history(past[0])
-            if fresh or cubic:
-                self._add_reader(past, places, DirectReader(lanes, history, lag, cubic))
+            if one_step or cubic:
+                self._add_reader(past, places, DirectReader(lanes, history, delay, cubic))
                 continue
             for chain in _group_state_places(places):
-                reader = LinearReader(lanes, history, lag, chain, experiment.get_head("reach"))
+                reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
                 served = places if chain[0] > 0 else set()
                 self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
         for past, places in _group_delayed_reads(model, "input").items():
             for chain in demand.group_places(places):
                 self._add_reader(
-                    past, {*chain}, self._build_input_reader(past[0], lags.to_steps(past[1]), chain)
+                    past,
+                    {*chain},
+                    self._build_input_reader(past[0], delays.to_steps(past[1]), chain),
                 )
 
     def _add_reader(
@@ -273,29 +272,29 @@ class SignalReaders:
             self._readers[*past, place] = reader
         self._owners.append((past[0], reader))
 
-    def _build_input_reader(self, name: str, lag: IrValue, chain: list[int]) -> InputReader:
+    def _build_input_reader(self, name: str, delay: IrValue, chain: list[int]) -> InputReader:
         lanes, number, experiment = self._lanes, self._inputs[name], self._experiment
         points = experiment.get_input_field(number, "points")
-        fine = lanes.mul(lag, lanes.builder.sitofp(points, DOUBLE))
+        fine = lanes.mul(delay, lanes.builder.sitofp(points, DOUBLE))
         cap = lanes.builder.sitofp(experiment.get_input_field(number, "cap"), DOUBLE)
         zero = self._find_input_start(number)
         return InputReader(lanes, experiment.floats, zero, points, lanes.clamp(fine, cap), chain)
 
     def _find_input_start(self, number: int) -> IrValue:
-        """Place of the input at step 0; difference equations read just behind a jump."""
+        """Find the place of an input at step 0; difference equations read just after a jump."""
         zero = self._experiment.get_input_field(number, "zero")
         if not demand.is_difference(self._model):
             return zero
         return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
 
     def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
-        """Who reads that lagged signal at that place."""
+        """Return the reader of a delayed signal at a place."""
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
 
     def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
-        """An input without lag: the same for all individuals."""
+        """Load an input without delay: the same for all individuals."""
         b, lanes, number = self._lanes.builder, self._lanes, self._inputs[name]
         points = self._experiment.get_input_field(number, "points")
         start = b.add(self._find_input_start(number), b.mul(step, points))
@@ -308,17 +307,17 @@ class SignalReaders:
         return lanes.load_double(self._experiment.floats, b.add(start, shift))
 
     def open_loop(self, loop: KernelLoop) -> None:
-        """Begin the time loop."""
+        """Open the readers at the head of the time loop."""
         for _, reader in self._owners:
             reader.open_loop(loop)
 
     def begin_step(self, turn: TimeStep) -> None:
-        """Begin one turn of it."""
+        """Begin a step of all readers."""
         for _, reader in self._owners:
             reader.begin_step(turn)
 
     def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
-        """End one turn of it."""
+        """End a step of all readers."""
         for name, reader in self._owners:
             reader.end_step(loop, following.get(name, self._lanes.make_number(0.0)))
 
@@ -332,6 +331,6 @@ def _group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression]
 
 
 def _group_state_places(places: set[int]) -> list[list[int]]:
-    """Chains of whole steps; a reader that looks into the present step holds its start too."""
+    """Group whole steps into chains; one that reaches the present step has its start too."""
     forward = {0, 2} if any(place > 0 for place in places) else set()
     return demand.group_places({place for place in places if place % 2 == 0} | forward)

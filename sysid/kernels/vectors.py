@@ -1,15 +1,13 @@
-"""Writes vector instructions of LLVM: arithmetic on several individuals at once, and memory.
+"""Builder of LLVM vector instructions: arithmetic on several individuals at once, and memory.
 
-A value is either the same for all individuals (a scalar: time, inputs, numbers) or one per
-individual (a vector). Scalars stay scalars until they meet a vector.
+A scalar value (time, inputs, numbers) is the same for all individuals. A vector has one value for
+each individual. Scalars stay scalars until they are combined with a vector.
 
-Vector versions of exp, log, pow, sin …, where the machine's C library has them.
-
-LLVM has no instructions for these functions and would call the scalar one for each lane. GNU's
-libmvec computes 8 (AVX-512), 4 (AVX2) or 2 lanes in one call, within 4 units in the last place;
-lanes do not influence one another. Its symbols are named by the x86-64 vector function ABI:
-``_ZGV`` instruction set ``N`` lanes, one ``v`` for each argument, ``_`` name. Elsewhere, and for
-functions an older libmvec lacks, the scalar calls stay.
+LLVM has no instructions for exp, log, pow, sin … and would call the scalar function for each lane.
+GNU's libmvec computes 8 (AVX-512), 4 (AVX2) or 2 lanes in one call, within 4 units in the last
+place. Lanes do not influence one another. Its symbols follow the x86-64 vector function ABI:
+``_ZGV`` instruction set ``N`` lanes, one ``v`` for each argument, ``_`` name. Scalar calls remain
+on other machines, and for functions that an older libmvec lacks.
 """
 
 import ctypes
@@ -28,7 +26,7 @@ _VECTOR_LIBRARY = "libmvec.so.1"
 
 
 class VectorFunctions(NamedTuple):
-    """What the machine offers: lanes a call, and the symbol of each function that is there."""
+    """Vector library of the machine: lanes in a call, and the symbol of each function."""
 
     lanes: int
     symbols: dict[str, str]
@@ -36,7 +34,7 @@ class VectorFunctions(NamedTuple):
 
 @cache
 def load_vector_functions() -> VectorFunctions:
-    """The vector functions of this machine, loaded so that compiled code finds them."""
+    """Load the vector functions of this machine, for use by compiled code."""
     none = VectorFunctions(1, {})
     if platform.machine() != "x86_64":
         return none
@@ -48,7 +46,7 @@ def load_vector_functions() -> VectorFunctions:
     features = llvm.get_host_cpu_features()
     wide = (("avx512f", "e", 8), ("avx2", "d", 4), ("sse2", "b", 2))
     letter, lanes = next((isa, n) for feature, isa, n in wide if features.get(feature))
-    counts = {one.llvm: one.fewest for one in FUNCTIONS.values()} | {"pow": 2}
+    counts = {function.llvm: function.fewest for function in FUNCTIONS.values()} | {"pow": 2}
     names = {name: f"_ZGV{letter}N{lanes}{'v' * count}_{name}" for name, count in counts.items()}
     return VectorFunctions(lanes, {n: s for n, s in names.items() if hasattr(library, s)})
 
@@ -59,10 +57,10 @@ _INT32 = ir.IntType(32)
 FAST_MATH_FLAGS = ("nsz", "arcp")
 """Fast-math flags in use: any sign of zero, reciprocal for a division.
 
-Never ``nnan`` or ``ninf``: with them the compiler may drop the very ``nan`` or ``inf`` by which a
-diverged simulation is known. Nor ``reassoc``: sums stay in the order written, so that a lane's
-bits do not depend on how the compiler arranges its neighbours. Nor ``contract``: which products
-are fused with a sum is said here, else the compiler decides, for 8 lanes otherwise than for 16.
+Never ``nnan`` or ``ninf``: the compiler could then remove the ``nan`` or ``inf`` that marks a
+diverged simulation. Never ``reassoc``: sums stay in the order written, so that a lane's bits do
+not depend on its neighbours. Never ``contract``: this module decides which products are fused with
+a sum. The compiler would decide differently for 8 and for 16 lanes.
 """
 
 # llvmlite is untyped
@@ -71,7 +69,7 @@ IrFunction: TypeAlias = Any
 
 
 class VectorBuilder:
-    """An instruction builder that knows vectors of `width` individuals."""
+    """Instruction builder for vectors of `width` individuals."""
 
     def __init__(self, function: IrFunction, width: int) -> None:
         self.function, self.width = function, width
@@ -79,7 +77,7 @@ class VectorBuilder:
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
 
     def copy_with_width(self, width: int) -> "VectorBuilder":
-        """A builder of other vectors that goes on where this one writes."""
+        """Return a builder with another width that continues at the same position."""
         other = copy(self)
         other.width = width
         other.vector, other._ints = ir.VectorType(DOUBLE, width), ir.VectorType(INT, width)
@@ -88,33 +86,33 @@ class VectorBuilder:
     # ---- constants and shapes -------------------------------------------------------------
     @staticmethod
     def make_number(value: float) -> IrValue:
-        """A scalar constant."""
+        """Make a scalar constant."""
         return ir.Constant(DOUBLE, float(value))
 
     @staticmethod
     def make_integer(value: int) -> IrValue:
-        """A whole number."""
+        """Make a whole-number constant."""
         return ir.Constant(INT, value)
 
     def make_lane_numbers(self) -> IrValue:
-        """0, 1, …, width - 1."""
+        """Make the vector 0, 1, …, width - 1."""
         return ir.Constant(self._ints, list(range(self.width)))
 
     def splat(self, value: IrValue) -> IrValue:
-        """The scalar in every lane; a vector as it is."""
+        """Copy a scalar to every lane; a vector stays unchanged."""
         if isinstance(value.type, ir.VectorType):
             return value
         kind = ir.VectorType(value.type, self.width)
         if isinstance(value, ir.Constant):
             return ir.Constant(kind, [value.constant] * self.width)
-        one = self.builder.insert_element(
+        first_lane = self.builder.insert_element(
             ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0)
         )
         zeros = ir.Constant(ir.VectorType(_INT32, self.width), [0] * self.width)
-        return self.builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), zeros)
+        return self.builder.shuffle_vector(first_lane, ir.Constant(kind, ir.Undefined), zeros)
 
     def match_shapes(self, *values: IrValue) -> list[IrValue]:
-        """All as vectors if one of them is."""
+        """Convert all values to vectors if one of them is a vector."""
         if any(isinstance(v.type, ir.VectorType) for v in values):
             return [self.splat(v) for v in values]
         return list(values)
@@ -125,14 +123,14 @@ class VectorBuilder:
         return getattr(self.builder, operation)(left, right, flags=FAST_MATH_FLAGS)
 
     def add(self, a: IrValue, b: IrValue) -> IrValue:
-        """Sum of a and b; a product is fused with it, in one rounding where the machine can."""
+        """Emit a + b; a product is fused with the sum, in one rounding if the machine can."""
         for product, other in ((b, a), (a, b)):
             if _is_product(product):
                 return self.call_intrinsic("fmuladd", *product.operands, other)
         return self._emit_arithmetic("fadd", a, b)
 
     def sub(self, a: IrValue, b: IrValue) -> IrValue:
-        """Difference of a and b; a product is fused with it as in a sum."""
+        """Emit a - b; a product is fused with it as in a sum."""
         if _is_product(b):
             first, second = b.operands
             return self.call_intrinsic("fmuladd", self.builder.fneg(first), second, a)
@@ -141,51 +139,51 @@ class VectorBuilder:
         return self._emit_arithmetic("fsub", a, b)
 
     def mul(self, a: IrValue, b: IrValue) -> IrValue:
-        """Product of a and b."""
+        """Emit a · b."""
         return self._emit_arithmetic("fmul", a, b)
 
     def div(self, a: IrValue, b: IrValue) -> IrValue:
-        """Quotient of a and b."""
+        """Emit a / b."""
         return self._emit_arithmetic("fdiv", a, b)
 
     def compare(self, operator: str, a: IrValue, b: IrValue) -> IrValue:
-        """A comparison; false where either is ``nan``, except ``!=``."""
+        """Emit a comparison; false if either value is ``nan``, except ``!=``."""
         left, right = self.match_shapes(a, b)
         if operator == "!=":
             return self.builder.fcmp_unordered(operator, left, right)
         return self.builder.fcmp_ordered(operator, left, right)
 
     def select(self, condition: IrValue, a: IrValue, b: IrValue) -> IrValue:
-        """A where the condition holds, b elsewhere."""
+        """Select a if the condition holds, else b."""
         if isinstance(condition.type, ir.VectorType):
             return self.builder.select(condition, self.splat(a), self.splat(b))
         left, right = self.match_shapes(a, b)
         return self.builder.select(condition, left, right)
 
     def interpolate(self, start: IrValue, fraction: IrValue, stop: IrValue) -> IrValue:
-        """Start + fraction · (stop - start)."""
+        """Emit start + fraction · (stop - start)."""
         return self.add(start, self.mul(fraction, self.sub(stop, start)))
 
     def call_intrinsic(self, name: str, *arguments: IrValue) -> IrValue:
-        """A function LLVM knows, lane by lane; vectors may go to the machine's vector library."""
+        """Call an LLVM intrinsic lane by lane; vectors may use the machine's vector library."""
         values = self.match_shapes(*arguments)
         kind = values[0].type
-        offered = load_vector_functions()
-        if name in offered.symbols and isinstance(kind, ir.VectorType):
-            return self._call_vector_function(offered.symbols[name], offered.lanes, values)
+        library = load_vector_functions()
+        if name in library.symbols and isinstance(kind, ir.VectorType):
+            return self._call_vector_function(library.symbols[name], library.lanes, values)
         suffix = f"v{self.width}f64" if isinstance(kind, ir.VectorType) else "f64"
         signature = ir.FunctionType(kind, [v.type for v in values])
         return self.builder.call(self._declare_function(f"llvm.{name}.{suffix}", signature), values)
 
     def _call_vector_function(self, symbol: str, width: int, values: list[IrValue]) -> IrValue:
-        """A vector function of `width` lanes, called on the parts of wider vectors."""
+        """Call a vector function of `width` lanes on the parts of wider vectors."""
         part = ir.VectorType(DOUBLE, width)
         function = self._declare_function(symbol, ir.FunctionType(part, [part] * len(values)))
         nothing = ir.Constant(self.vector, ir.Undefined)
         parts = []
         for first in range(0, self.width, width):
             chosen = _make_shuffle_mask(range(first, first + width))
-            pieces = [self.builder.shuffle_vector(one, nothing, chosen) for one in values]
+            pieces = [self.builder.shuffle_vector(value, nothing, chosen) for value in values]
             parts.append(self.builder.call(function, pieces))
         while len(parts) > 1:  # neighbours join until one vector is left
             width = parts[0].type.count
@@ -197,12 +195,12 @@ class VectorBuilder:
         return parts[0]
 
     def split_fraction(self, value: IrValue) -> tuple[IrValue, IrValue]:
-        """Floor as whole numbers, and what remains."""
+        """Split into floor, as whole numbers, and fraction."""
         floor = self.call_intrinsic("floor", value)
         return self.builder.fptosi(floor, self._ints), self.sub(value, floor)
 
     def clamp(self, value: IrValue, upper: IrValue) -> IrValue:
-        """Inside [0, upper]; 0 where the value is ``nan``, so that it may address memory."""
+        """Clamp to [0, upper]; ``nan`` becomes 0, so that the value may address memory."""
         zero = self.make_number(0.0)
         positive = self.select(self.compare(">", value, zero), value, zero)
         return self.select(self.compare("<", positive, upper), positive, upper)
@@ -212,44 +210,44 @@ class VectorBuilder:
         return self.builder.gep(base, [index], inbounds=True, source_etype=DOUBLE)
 
     def load_double(self, base: IrValue, index: IrValue) -> IrValue:
-        """The double at ``base[index]``."""
+        """Load the double at ``base[index]``."""
         return self.builder.load(self._compute_address(base, index), typ=DOUBLE)
 
     def load_integer(self, base: IrValue, index: IrValue) -> IrValue:
-        """The whole number at ``base[index]``."""
+        """Load the whole number at ``base[index]``."""
         return self.builder.load(self._compute_address(base, index), typ=INT)
 
     def load_row(self, base: IrValue, index: IrValue) -> IrValue:
-        """The vector of doubles that begins at ``base[index]``."""
+        """Load the vector of doubles that begins at ``base[index]``."""
         return self.builder.load(self._compute_address(base, index), typ=self.vector, align=8)
 
     def store_row(self, value: IrValue, base: IrValue, index: IrValue) -> None:
-        """Store a vector of doubles from ``base[index]`` on."""
+        """Store a vector of doubles at ``base[index]``."""
         self.builder.store(self.splat(value), self._compute_address(base, index), align=8)
 
     def compute_addresses(self, base: IrValue, index: IrValue) -> IrValue:
-        """Addresses of ``base[index]`` for a vector of indices, to add a common shift to."""
+        """Compute the addresses of ``base[index]`` for a vector of indices."""
         start = self.splat(self.builder.ptrtoint(base, INT))
         return self.builder.add(start, self.builder.shl(index, self.splat(self.make_integer(3))))
 
     def gather(self, addresses: IrValue, shift: IrValue) -> IrValue:
-        """The doubles at `addresses`, each `shift` doubles further.
+        """Load the doubles at `addresses`, each shifted by `shift` doubles.
 
-        One load for each lane, not the processor's gather: that is slower where its microcode
-        guards against leaks of data (docs/performance.md), and nowhere faster by much.
+        Each lane has its own load. The processor's gather is slower if its microcode guards
+        against data leaks (docs/performance.md), and nowhere much faster.
         """
         b = self.builder
         step = b.shl(shift, self.make_integer(3))
-        found = ir.Constant(self.vector, ir.Undefined)
+        gathered = ir.Constant(self.vector, ir.Undefined)
         for number in range(self.width):
             lane = ir.Constant(_INT32, number)
             start = b.inttoptr(b.extract_element(addresses, lane), ir.PointerType())
             place = b.gep(start, [step], source_etype=ir.IntType(8))
-            found = b.insert_element(found, b.load(place, typ=DOUBLE, align=8), lane)
-        return found
+            gathered = b.insert_element(gathered, b.load(place, typ=DOUBLE, align=8), lane)
+        return gathered
 
     def copy_rows(self, base: IrValue, target: IrValue, source: IrValue, doubles: IrValue) -> None:
-        """Copy doubles inside one array; the two parts do not overlap."""
+        """Copy doubles inside one array; the two parts must not overlap."""
         pointer = ir.PointerType()
         signature = ir.FunctionType(ir.VoidType(), [pointer, pointer, INT, BOOL])
         copy = self._declare_function("llvm.memcpy.p0.p0.i64", signature)
@@ -264,18 +262,18 @@ class VectorBuilder:
         body: Callable[[], Sequence[IrValue]],
         otherwise: Sequence[IrValue],
     ) -> list[IrValue]:
-        """Values of `body` where the scalar condition holds, else `otherwise`."""
+        """Return the values of `body` if the scalar condition holds, else `otherwise`."""
         before = self.builder.block
         inside = self.function.append_basic_block("then")
         after = self.function.append_basic_block("join")
         self.builder.cbranch(condition, inside, after)
         self.builder.position_at_end(inside)
-        made = body()
+        values = body()
         last = self.builder.block
         self.builder.branch(after)
         self.builder.position_at_end(after)
         merged = []
-        for new, old in zip(made, otherwise, strict=True):
+        for new, old in zip(values, otherwise, strict=True):
             phi = self.builder.phi(new.type)
             phi.add_incoming(new, last)
             phi.add_incoming(old, before)
@@ -284,8 +282,8 @@ class VectorBuilder:
 
     def _declare_function(self, name: str, signature: ir.FunctionType) -> IrFunction:
         module = self.function.module
-        known = module.globals.get(name)
-        return known if known is not None else ir.Function(module, signature, name)
+        declared = module.globals.get(name)
+        return declared if declared is not None else ir.Function(module, signature, name)
 
 
 def _is_product(value: IrValue) -> bool:
@@ -293,12 +291,12 @@ def _is_product(value: IrValue) -> bool:
 
 
 def _make_shuffle_mask(places: Sequence[int]) -> IrValue:
-    """Which lanes a shuffle takes."""
+    """Make the mask of the lanes that a shuffle takes."""
     return ir.Constant(ir.VectorType(_INT32, len(places)), list(places))
 
 
 class KernelLoop:
-    """A loop whose carried values are vectors or scalars in registers."""
+    """Loop that carries vectors or scalars in registers."""
 
     def __init__(self, lanes: VectorBuilder) -> None:
         self.lanes = lanes
@@ -310,23 +308,23 @@ class KernelLoop:
         lanes.builder.position_at_end(self._head)
 
     def carry(self, initial: IrValue) -> IrValue:
-        """A value that each turn hands to the next; call before any other instruction."""
+        """Create a carried value; call this before any other instruction of the loop."""
         phi = self.lanes.builder.phi(initial.type)
         phi.add_incoming(initial, self._before)
         return phi
 
     def update(self, carried: IrValue, value: IrValue) -> None:
-        """Say what the next turn gets."""
+        """Set the carried value of the next iteration."""
         self._carried.append((carried, value))
 
     def leave_if(self, condition: IrValue) -> None:
-        """Leave the loop here, in the middle of a turn."""
+        """Leave the loop here if the condition holds."""
         stay = self.lanes.function.append_basic_block("stay")
         self.lanes.builder.cbranch(condition, self._after, stay)
         self.lanes.builder.position_at_end(stay)
 
     def repeat(self) -> None:
-        """End of a turn; what follows is written behind the loop."""
+        """End the iteration; later instructions follow the loop."""
         for carried, value in self._carried:
             carried.add_incoming(value, self.lanes.builder.block)
         self.lanes.builder.branch(self._head)

@@ -1,1 +1,1 @@
-"""Equation text → checked tree: grammar, scopes, delays, intervals, printing."""
+"""Model language: parser, checker, scopes, delays, intervals, printer."""

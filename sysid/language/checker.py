@@ -1,4 +1,4 @@
-"""Syntax to a checked tree: names resolved, past values taken apart, every fault named."""
+"""Checker: from syntax to an expression tree with resolved names and past values."""
 
 from typing import NamedTuple
 
@@ -25,14 +25,14 @@ _ZERO = Number(0.0)
 
 
 class SignalUse(NamedTuple):
-    """A signal value in a text, and the column where it stands."""
+    """A signal value in a text, and its column."""
 
     value: PastValue
     column: int
 
 
 class CheckedExpression(NamedTuple):
-    """What a text is: its tree, or None and the faults."""
+    """Checked tree of a text, or None and its faults."""
 
     tree: Expression | None
     faults: tuple[TextFault, ...]
@@ -40,7 +40,7 @@ class CheckedExpression(NamedTuple):
 
 
 def check_expression(text: str, scope: Scope) -> CheckedExpression:
-    """The checked tree of a text, or everything that is wrong with it.
+    """Check a text: return its tree, or all its faults.
 
     Examples
     --------
@@ -58,12 +58,12 @@ def check_expression(text: str, scope: Scope) -> CheckedExpression:
         tree = checker.check_value(syntax, 1)
     except SyntaxFault as error:
         return CheckedExpression(None, (error.fault,), ())
-    found = tuple(sorted(faults))
-    return CheckedExpression(None if found else tree, found, tuple(checker.uses))
+    ordered = tuple(sorted(faults))
+    return CheckedExpression(None if ordered else tree, ordered, tuple(checker.uses))
 
 
 class _ExpressionChecker:
-    """One pass over the syntax of one text; a fault stands in the tree as a zero."""
+    """Checker of one text; a faulty node becomes a zero in the tree."""
 
     def __init__(self, scope: Scope, faults: list[TextFault]) -> None:
         self._scope = scope
@@ -71,7 +71,7 @@ class _ExpressionChecker:
         self.uses: list[SignalUse] = []
 
     def check_value(self, node: SyntaxNode, depth: int) -> Expression:
-        """The tree of a node that stands for a number."""
+        """Build the tree of a node whose value is a number."""
         if depth > MAX_EXPRESSION_DEPTH:
             raise SyntaxFault(
                 node.column, f"the expression is deeper than {MAX_EXPRESSION_DEPTH} levels"
@@ -92,7 +92,7 @@ class _ExpressionChecker:
                 return self._add_fault(node.column, detail)
 
     def _check_condition(self, node: SyntaxNode, depth: int) -> Expression:
-        """The tree of a node that is true or false."""
+        """Build the tree of a node that is true or false."""
         if depth > MAX_EXPRESSION_DEPTH:
             raise SyntaxFault(
                 node.column, f"the expression is deeper than {MAX_EXPRESSION_DEPTH} levels"
@@ -166,12 +166,12 @@ class _ExpressionChecker:
             return self._add_fault(node.column, detail)
         if node.name == "where":
             condition = self._check_condition(node.arguments[0], depth + 1)
-            branches = [self.check_value(one, depth + 1) for one in node.arguments[1:]]
+            branches = [self.check_value(branch, depth + 1) for branch in node.arguments[1:]]
             return FunctionCall("where", (condition, *branches))
-        first, *others = (self.check_value(one, depth + 1) for one in node.arguments)
+        first, *others = (self.check_value(argument, depth + 1) for argument in node.arguments)
         if not others:
             return FunctionCall(node.name, (first,))
-        for other in others:  # min and max of several, two by two
+        for other in others:  # min and max of several arguments, pairwise
             first = FunctionCall(node.name, (first, other))
         return first
 
@@ -180,7 +180,7 @@ class _ExpressionChecker:
             detail = f"{node.name} takes one index, such as {node.name}({self._scope.clock} - 1)"
             return self._add_fault(node.column, detail)
         argument = node.arguments[0]
-        outside, known = self.uses, len(self._faults)
+        outside, faults_before = self.uses, len(self._faults)
         self.uses = []
         index = self.check_value(argument, depth + 1)
         inside, self.uses = self.uses, outside
@@ -190,15 +190,15 @@ class _ExpressionChecker:
                 f"the delay depends on {name!r}; a delay consists of parameters and constants only"
             )
             return self._add_fault(inside[0].column, detail)
-        if len(self._faults) > known:
+        if len(self._faults) > faults_before:
             return _ZERO
-        found = split_index(index, self._scope)
-        if isinstance(found, str):
-            return self._add_fault(node.column, found)
-        return self._add_use(node.name, *found, node.column)
+        past_index = split_index(index, self._scope)
+        if isinstance(past_index, str):
+            return self._add_fault(node.column, past_index)
+        return self._add_use(node.name, *past_index, node.column)
 
-    def _add_use(self, name: str, offset: int, lag: Expression | None, column: int) -> PastValue:
-        value = PastValue(name, "state" if name in self._scope.states else "input", offset, lag)
+    def _add_use(self, name: str, offset: int, delay: Expression | None, column: int) -> PastValue:
+        value = PastValue(name, "state" if name in self._scope.states else "input", offset, delay)
         self.uses.append(SignalUse(value, column))
         return value
 

@@ -1,4 +1,4 @@
-"""Past values: an index such as ``k - 1 - L/h`` into its whole samples and its unknown lag."""
+"""Past values: an index such as ``k - 1 - L/h`` is split into whole samples and a delay."""
 
 from math import floor, isinf
 from typing import NamedTuple
@@ -22,17 +22,17 @@ _MAX_DELAY = 1e6
 
 
 class PastIndex(NamedTuple):
-    """How far back a value lies: whole samples, and what comes on top."""
+    """Distance of a past value: whole samples, and an unknown delay in addition."""
 
     offset: int
     delay: Expression | None
 
 
 def split_index(index: Expression, scope: Scope) -> PastIndex | str:
-    """The delay that an index stands for, or what is wrong with it.
+    """Split an index into offset and delay, or return the message of a fault.
 
-    In the difference form the offset is as large as the bounds allow to be fixed: ``y(k - d)``
-    with d from 1 to 20 is one sample back and d - 1 more.
+    In the difference form the offset is as large as the bounds allow. ``y(k - d)`` with d from 1
+    to 20 has an offset of 1 and a delay of d - 1.
     """
     clock = Symbol(scope.clock, "index" if scope.form == "difference" else "time")
     terms = collect_terms(index)
@@ -51,7 +51,7 @@ def split_index(index: Expression, scope: Scope) -> PastIndex | str:
         return _describe_negative(back, low, scope)
     if not back:
         return PastIndex(0, None)
-    # Any period tells a lag without limit; back[CONSTANT] counts samples or seconds.
+    # Any period shows an unlimited delay; back[CONSTANT] counts samples or seconds.
     if max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _MAX_DELAY:
         written = format_expression(rest, scope.clock)
         return f"the delay {written} has no upper limit inside the bounds of its parameters"
@@ -59,13 +59,13 @@ def split_index(index: Expression, scope: Scope) -> PastIndex | str:
 
 
 def mentions_time(expression: Expression, *kinds: str) -> bool:
-    """Whether an expression depends on t or k; or on one of the given kinds of symbol."""
+    """Whether an expression depends on t or k, or on one of some kinds of symbol."""
     wanted = kinds or ("time", "index")
     return any(isinstance(node, Symbol) and node.kind in wanted for node in walk(expression))
 
 
 def collect_past_values(expression: Expression) -> tuple[PastValue, ...]:
-    """Every signal value in an expression, in the order of the text."""
+    """Collect every signal value in an expression, in the order of the text."""
     return tuple(node for node in walk(expression) if isinstance(node, PastValue))
 
 
@@ -75,13 +75,13 @@ def _split_offset(back: LaurentPolynomial, low: float, scope: Scope) -> PastInde
     offset = 1 if low >= 1 else 0
     if bound_expression(to_expression(unknown), scope.parameters)[0] >= 0:
         offset = max(offset, floor(constant))
-    lag = add_polynomials(back, {CONSTANT: -float(offset)})
-    return PastIndex(offset, to_expression(lag) if lag else None)
+    delay = add_polynomials(back, {CONSTANT: -float(offset)})
+    return PastIndex(offset, to_expression(delay) if delay else None)
 
 
 def _describe_negative(back: LaurentPolynomial, low: float, scope: Scope) -> str:
     unit = "samples" if scope.form == "difference" else "s"
-    if isinf(low):  # h may be as small as it likes: say it in seconds
+    if isinf(low):  # h has no lower bound: express the delay in seconds
         low, unit = (
             bound_expression(to_expression(multiply_factor(back, _PERIOD)), scope.parameters)[0],
             "s",

@@ -1,6 +1,6 @@
-"""The value of an expression that has no signals in it: a tie between parameters, a wave of t.
+"""Evaluation of expressions without signals: ties between parameters, waveforms of t.
 
-By NumPy as it stands: what is worth a number or a few samples is not worth a kernel.
+NumPy computes them directly, because a kernel does not pay for a few values.
 """
 
 from collections.abc import Mapping
@@ -15,18 +15,18 @@ from sysid.language.tree import Binary, Expression, FunctionCall, Number, Symbol
 
 
 def evaluate_expression(expression: Expression, parameters: Mapping[str, float]) -> float:
-    """What an expression of parameters and numbers is worth; ``nan`` or ``inf`` where undefined.
+    """Evaluate an expression of parameters and numbers; ``nan`` or ``inf`` where undefined.
 
-    Past values, time and the sampling period have no place in it.
+    It must not contain past values, time or the sampling period.
     """
     with np.errstate(all="ignore"):
         return float(_evaluate_node(expression, {k: np.float64(v) for k, v in parameters.items()}))
 
 
 def evaluate_signal(expression: Expression, times: FloatArray) -> FloatArray:
-    """Values (N,) of an expression of ``t``, ``k`` and ``h`` at regular times (N,) in s.
+    """Evaluate an expression of ``t``, ``k`` and ``h`` at regular times (N,) in s.
 
-    Past values and parameters have no place in it.
+    It must not contain past values or parameters.
     """
     period = times[1] - times[0]
     named = {"t": times, "k": np.arange(float(times.size)), "h": period}
@@ -50,7 +50,7 @@ def _evaluate_node(expression: Expression, named: Mapping[str, Any]) -> Any:
             return getattr(np, OPERATORS[operator].numpy)(*operands)
         case FunctionCall(function, arguments):
             return getattr(np, FUNCTIONS[function].numpy)(
-                *(_evaluate_node(one, named) for one in arguments)
+                *(_evaluate_node(argument, named) for argument in arguments)
             )
         case _:
             return np.float64(nan)

@@ -1,7 +1,7 @@
-"""Operators and functions of the language: one table, from which every layer takes its part.
+"""Operators and functions of the language, in one table for all layers.
 
-To add a function, add its entry here; where LLVM has no intrinsic for it, write its instructions
-in `sysid.kernels.expressions`; where C99 has no function for it, write one in `sysid.export.c`.
+To add a function, add its entry here. If LLVM has no intrinsic for it, write its instructions in
+`sysid.kernels.expressions`. If C99 has no function for it, write one in `sysid.export.c`.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ REAL_LINE: Interval = (-inf, inf)
 
 
 class Level(IntEnum):
-    """How tightly an operator binds, from loose to tight; a name binds as an atom."""
+    """Precedence of an operator, from loose to tight; a name is an atom."""
 
     OR = 1
     AND = 2
@@ -38,7 +38,7 @@ class Operator:
     numpy : str
         Its name in NumPy.
     interval : function or None
-        The interval of its values, given those of its operands; None: false or true, 0 or 1.
+        Interval of its values from those of its operands; None: false or true, 0 or 1.
     """
 
     level: Level
@@ -55,11 +55,11 @@ class Function:
     name : str
         In the language.
     interval : function
-        The interval of its values, given those of its arguments.
+        Interval of its values from those of its arguments.
     fewest, most : int
-        Number of arguments; most None: any number, taken two by two.
+        Number of arguments; `most` None: any number, taken pairwise.
     numpy, llvm, c : str
-        Its names in NumPy, as intrinsic of LLVM and in math.h, where they are not `name`.
+        Names in NumPy, as LLVM intrinsic and in math.h, if they differ from `name`.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Interval arithmetic: between which values an expression lies, whatever its parameters.
+"""Interval arithmetic: bounds of an expression for all values of its parameters.
 
-The bounds hold, but need not be the tightest: a parameter that occurs twice counts as two. They
-are computed in ordinary rounding, so an exact end may be off by the last bit.
+The bounds hold but may not be tight, because a parameter that occurs twice counts as two. They
+are computed with ordinary rounding, so an exact end may be off by the last bit.
 """
 
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastVa
 def bound_expression(
     expression: Expression, parameters: Mapping[str, Interval], period: float | None = None
 ) -> Interval:
-    """Interval that holds every value of an expression.
+    """Compute an interval that contains every value of an expression.
 
     Parameters
     ----------
     expression : Expression
     parameters : mapping of str to (lower, upper)
     period : float or None
-        Sampling period h in s; None stands for any positive one.
+        Sampling period h in s; None: any positive value.
     """
     match expression:
         case Number(value):
@@ -34,10 +34,10 @@ def bound_expression(
         case Unary("-", operand):
             return _negate(bound_expression(operand, parameters, period))
         case Binary(operator, left, right) if (rule := OPERATORS[operator].interval) is not None:
-            ends = (bound_expression(one, parameters, period) for one in (left, right))
+            ends = (bound_expression(operand, parameters, period) for operand in (left, right))
             return _widen_if_nan(rule(*ends))
         case FunctionCall(function, arguments):
-            ends = (bound_expression(one, parameters, period) for one in arguments)
+            ends = (bound_expression(argument, parameters, period) for argument in arguments)
             return _widen_if_nan(FUNCTIONS[function].interval(*ends))
         case _:  # a condition: false or true
             return (0.0, 1.0)

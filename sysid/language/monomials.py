@@ -1,8 +1,8 @@
-"""Sums of products of powers, collected: how ``k - (1 + L/h)`` is told apart into k, 1 and L/h.
+"""Laurent polynomials: ``k - (1 + L/h)`` is collected into the terms k, 1 and L/h.
 
 A polynomial maps each monomial to its coefficient. A monomial is a tuple of (factor, whole
-exponent), negative exponents included; the empty one stands for the constant. What is neither a
-sum nor a product, such as ``sqrt(L)``, is a factor of its own.
+exponent), with negative exponents. The empty monomial is the constant. An expression that is
+neither a sum nor a product, such as ``sqrt(L)``, is a factor.
 """
 
 from functools import reduce
@@ -16,11 +16,11 @@ LaurentPolynomial: TypeAlias = dict[Monomial, float]
 CONSTANT: Monomial = ()
 
 _MAX_TERMS = 64
-"""A product that would have more terms is kept as one factor."""
+"""A product with more terms stays one factor."""
 
 
 def collect_terms(expression: Expression) -> LaurentPolynomial:
-    """The expression as a polynomial; equal terms are added, ``h/h`` is 1."""
+    """Collect an expression as a polynomial; equal terms are added, ``h/h`` is 1."""
     match expression:
         case Number(value):
             return {CONSTANT: value} if value else {}
@@ -43,7 +43,7 @@ def collect_terms(expression: Expression) -> LaurentPolynomial:
 
 
 def add_polynomials(a: LaurentPolynomial, b: LaurentPolynomial) -> LaurentPolynomial:
-    """Sum, without the terms that cancel."""
+    """Add two polynomials; terms that cancel are removed."""
     total = dict(a)
     for monomial, coefficient in b.items():
         total[monomial] = total.get(monomial, 0.0) + coefficient
@@ -51,17 +51,17 @@ def add_polynomials(a: LaurentPolynomial, b: LaurentPolynomial) -> LaurentPolyno
 
 
 def scale_polynomial(a: LaurentPolynomial, factor: float) -> LaurentPolynomial:
-    """Product with a number."""
+    """Multiply a polynomial by a number."""
     return {monomial: value * factor for monomial, value in a.items()}
 
 
 def multiply_factor(a: LaurentPolynomial, factor: Expression) -> LaurentPolynomial:
-    """Product with one factor."""
+    """Multiply a polynomial by one factor."""
     return {_merge_monomials(monomial, ((factor, 1),)): value for monomial, value in a.items()}
 
 
 def to_expression(a: LaurentPolynomial) -> Expression:
-    """The polynomial as a tree; the constant comes last."""
+    """Build the tree of a polynomial; the constant comes last."""
     ordered = sorted(a.items(), key=lambda term: term[0] == CONSTANT)
     if not ordered:
         return Number(0.0)

@@ -1,10 +1,8 @@
-"""Tokens to syntax, by operator precedence. No text ever reaches Python's own parser.
+"""Tokenizer and parser of the model language. No text ever reaches Python's own parser.
 
-From loose to tight: ``or``, ``and``, ``not``, comparison, ``+ -``, ``* /``, unary ``-``, ``**``.
-
-What the parser makes of a text: nodes that still carry names, and the column each came from.
-
-Text to tokens. What is not in the grammar is told apart, so that the message can say why.
+Precedence from loose to tight: ``or``, ``and``, ``not``, comparison, ``+ -``, ``* /``, unary
+``-``, ``**``. The nodes hold unresolved names and their columns. Foreign tokens are classified,
+so that the message can say why they are refused.
 """
 
 import re
@@ -16,19 +14,19 @@ from typing import Literal, NamedTuple, TypeAlias
 from sysid.language.functions import OPERATORS, Level
 
 MAX_EXPRESSION_LENGTH = 4000
-"""Characters of one equation."""
+"""Most characters of one equation."""
 
 MAX_EXPRESSION_DEPTH = 64
-"""Nesting of one equation; long sums and products are folded, so they do not count as deep."""
+"""Deepest nesting of one equation; long sums and products are folded, so they are shallow."""
 
 
 class TextFault(NamedTuple):
-    """One thing wrong with a text.
+    """A fault of a text.
 
     Attributes
     ----------
     column : int
-        From 1.
+        Counted from 1.
     detail : str
         What was wrong, and what would be right.
     """
@@ -38,7 +36,7 @@ class TextFault(NamedTuple):
 
 
 class SyntaxFault(Exception):
-    """A text cannot be parsed further. Does not leave this package."""
+    """A text cannot be parsed further; this error does not leave the package."""
 
     def __init__(self, column: int, detail: str) -> None:
         super().__init__(detail)
@@ -128,25 +126,25 @@ class Token(NamedTuple):
 
 
 def tokenize_expression(text: str) -> tuple[list[Token], list[TextFault]]:
-    """Tokens of a text, the last being its end, and what in it is no token of the language."""
-    found: list[Token] = []
+    """Split a text into tokens, with an end token; foreign tokens become faults."""
+    tokens: list[Token] = []
     faults: list[TextFault] = []
     for match in _TOKEN.finditer(text):
         kind, word, column = match.lastgroup, match.group(), match.start() + 1
         if kind == "name":
-            found.append(Token("name", word, column))
+            tokens.append(Token("name", word, column))
         elif kind == "operator":
-            found.append(Token("operator", word, column))
+            tokens.append(Token("operator", word, column))
         elif kind == "number":
-            found.append(Token("number", word, column))
+            tokens.append(Token("number", word, column))
             if isinf(float(word)):
                 faults.append(TextFault(column, f"the number {word[:20]} is too large"))
         elif kind != "space":
             faults.append(TextFault(column, _describe_foreign(kind, word)))
-            if kind == "string":  # stands for a number, so that the rest can be checked as well
-                found.append(Token("number", "0", column))
-    found.append(Token("end", "", len(text) + 1))
-    return found, faults
+            if kind == "string":  # replaced by a number, so that the rest can be checked as well
+                tokens.append(Token("number", "0", column))
+    tokens.append(Token("end", "", len(text) + 1))
+    return tokens, faults
 
 
 def _describe_foreign(kind: str | None, word: str) -> str:
@@ -161,11 +159,11 @@ def _describe_foreign(kind: str | None, word: str) -> str:
 _OPPOSITE = {"+": "-", "-": "+", "*": "/", "/": "*"}
 
 _MIN_FOLDED_LINKS = 8
-"""Chains up to this length are computed as written, left to right; longer ones in halves."""
+"""Shorter chains are computed from left to right; longer ones are folded in halves."""
 
 
 def parse_expression(text: str) -> tuple[SyntaxNode | None, list[TextFault]]:
-    """Syntax of a text, or None, and what is wrong with it."""
+    """Parse a text: its syntax, or None, and its faults."""
     if len(text) > MAX_EXPRESSION_LENGTH:
         detail = f"the text has {len(text)} characters; at most {MAX_EXPRESSION_LENGTH} are allowed"
         return None, [TextFault(1, detail)]
@@ -173,12 +171,12 @@ def parse_expression(text: str) -> tuple[SyntaxNode | None, list[TextFault]]:
     try:
         return _ExpressionParser(words).parse_whole(), faults
     except SyntaxFault as error:
-        # After a foreign token, what follows is a consequence and would only confuse.
+        # A fault after a foreign token is a consequence and would only confuse.
         return None, faults or [error.fault]
 
 
 class _ExpressionParser:
-    """One pass over the tokens of one text."""
+    """Parser of the tokens of one text."""
 
     def __init__(self, words: Sequence[Token]) -> None:
         self._words = words
@@ -186,17 +184,17 @@ class _ExpressionParser:
         self._depth = 0
 
     def parse_whole(self) -> SyntaxNode:
-        """The syntax of the whole text."""
+        """Parse the whole text."""
         if self._peek().kind == "end":
             raise SyntaxFault(1, "the expression is empty")
-        found = self._parse_operators(Level.OR)
+        syntax = self._parse_operators(Level.OR)
         word = self._peek()
         if word.kind != "end":
             raise SyntaxFault(word.column, _describe_unexpected(word))
-        return found
+        return syntax
 
     def _parse_operators(self, floor: int) -> SyntaxNode:
-        """An expression of operators that bind at least as tightly as `floor`."""
+        """Parse operators that bind at least as tightly as `floor`."""
         self._depth += 1
         if self._depth > MAX_EXPRESSION_DEPTH:
             detail = f"the expression is nested deeper than {MAX_EXPRESSION_DEPTH} levels"
@@ -208,7 +206,7 @@ class _ExpressionParser:
         return left
 
     def _parse_chain(self, first: SyntaxNode, level: int) -> SyntaxNode:
-        """What follows `first` at one level of precedence: ``a - b + c``."""
+        """Parse a chain of operators of one precedence after `first`: ``a - b + c``."""
         links: list[tuple[Token, SyntaxNode]] = []
         while self._next_level() == level:
             operator = self._advance()
@@ -264,7 +262,7 @@ class _ExpressionParser:
         return self._words[self._next]
 
     def _next_level(self) -> int:
-        """How tightly the next token binds; 0 where it is no operator."""
+        """Precedence of the next token; 0 if it is not an operator."""
         word = self._peek().text
         return OPERATORS[word].level if word in OPERATORS else 0
 
@@ -276,19 +274,19 @@ class _ExpressionParser:
 
 
 def _fold_chain(first: SyntaxNode, links: Sequence[tuple[Token, SyntaxNode]]) -> SyntaxNode:
-    """``first op a op b …`` as a tree whose depth grows with the logarithm of a long chain."""
+    """Fold ``first op a op b …`` to a tree; a long chain has logarithmic depth."""
     if len(links) < _MIN_FOLDED_LINKS or links[0][0].text not in _OPPOSITE:
         tree = first
         for operator, operand in links:
             tree = Infix(operator.text, tree, operand, operator.column)
         return tree
-    middle = len(links) // 2
-    joint, head = links[middle]
-    tail = links[middle + 1 :]
+    half = len(links) // 2
+    joint, head = links[half]
+    tail = links[half + 1 :]
     if joint.text in "-/":  # a - b + c = a - (b - c)
         tail = [(word._replace(text=_OPPOSITE[word.text]), operand) for word, operand in tail]
     return Infix(
-        joint.text, _fold_chain(first, links[:middle]), _fold_chain(head, tail), joint.column
+        joint.text, _fold_chain(first, links[:half]), _fold_chain(head, tail), joint.column
     )
 
 

@@ -1,4 +1,4 @@
-"""Checked trees back to text, with no more parentheses than needed."""
+"""Printer: from checked trees to text, with as few parentheses as possible."""
 
 from sysid.language.functions import OPERATORS, Level
 from sysid.language.monomials import CONSTANT, add_polynomials, collect_terms, to_expression
@@ -6,13 +6,13 @@ from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastVa
 
 
 def format_expression(expression: Expression, clock: str = "k") -> str:
-    """Text of the expression, which parses to the same tree if that came from a text.
+    """Format an expression; the text of a parsed tree parses to the same tree.
 
     Parameters
     ----------
     expression : Expression
     clock : {"k", "t"}
-        What past values are counted from: ``k`` in the difference form, ``t`` in the differential.
+        Origin of past values: ``k`` in the difference form, ``t`` in the differential form.
     """
     return _format_nested(expression, clock, 0)
 
@@ -37,7 +37,7 @@ def _format_with_level(expression: Expression, clock: str) -> tuple[str, int]:
         case Binary(operator, left, right):
             return _format_infix(operator, left, right, clock), OPERATORS[operator].level
         case FunctionCall(function, arguments):
-            inside = ", ".join(_format_nested(one, clock, 0) for one in arguments)
+            inside = ", ".join(_format_nested(argument, clock, 0) for argument in arguments)
             return f"{function}({inside})", Level.ATOM
 
 
@@ -58,11 +58,11 @@ def _format_past_value(value: PastValue, clock: str) -> str:
         back = add_polynomials(back, collect_terms(value.delay))
     constant = back.pop(CONSTANT, 0.0)
     whole = f"-{format_number(constant)}" if constant else ""
-    lag = _format_nested(to_expression(back), clock, Level.PRODUCT)
-    index = f"{clock}{whole} - {lag}" if back else f"{clock}{whole}"
+    delay = _format_nested(to_expression(back), clock, Level.PRODUCT)
+    index = f"{clock}{whole} - {delay}" if back else f"{clock}{whole}"
     return value.name if index == clock else f"{value.name}({index})"
 
 
 def format_number(value: float) -> str:
-    """Shortest text that gives the number back; without a decimal point where it is whole."""
+    """Format a number as the shortest exact text; whole numbers without a decimal point."""
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)

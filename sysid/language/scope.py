@@ -1,4 +1,4 @@
-"""The names an expression may use, and what each of them stands for."""
+"""Scope: the names that an expression may use, and their meanings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,14 +12,14 @@ EquationForm = Literal["difference", "differential"]
 
 
 def list_reserved_names(form: EquationForm) -> tuple[str, ...]:
-    """Names that a model of this form cannot give to something of its own."""
-    own = ("k", "h") if form == "difference" else ()
-    return ("t", "pi", *own, *FUNCTIONS, *OPERATOR_WORDS)
+    """List the names that a model of this form must not declare."""
+    clock_names = ("k", "h") if form == "difference" else ()
+    return ("t", "pi", *clock_names, *FUNCTIONS, *OPERATOR_WORDS)
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """Names that are declared where an expression stands.
+    """Declared names of an expression's context.
 
     Attributes
     ----------
@@ -43,11 +43,11 @@ class Scope:
 
     @property
     def clock(self) -> str:
-        """The name from which past values are counted: ``k`` or ``t``."""
+        """Name of the time index: ``k`` or ``t``."""
         return "k" if self.form == "difference" else "t"
 
     @property
     def names(self) -> tuple[str, ...]:
         """Every name that is not a function."""
-        own = ("k", "h") if self.form == "difference" else ()
-        return (*self.signals, *self.parameters, *self.constants, "t", "pi", *own)
+        clock_names = ("k", "h") if self.form == "difference" else ()
+        return (*self.signals, *self.parameters, *self.constants, "t", "pi", *clock_names)

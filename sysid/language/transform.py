@@ -1,6 +1,6 @@
-"""Trees as they were some time ago: what a signal made of others is worth in the past.
+"""Transformations of trees: substitution of nodes, and shifts in time.
 
-Trees with parts replaced: how a parameter is tied to others, or an input fed back.
+Substitution serves ties and feedback. A shift gives the past value of an expression of signals.
 """
 
 from collections.abc import Callable
@@ -12,23 +12,25 @@ from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastVa
 def substitute(
     tree: Expression, replacement: Callable[[Expression], Expression | None]
 ) -> Expression:
-    """The tree with each node for which `replacement` gives another one replaced by it.
+    """Replace each node for which `replacement` returns another one.
 
-    Nodes are asked from the root on; below one that was replaced nothing is asked. A past value
-    that stays is searched too: its lag may name what is replaced.
+    The search starts at the root and does not enter replaced nodes. It enters the delays of past
+    values that stay.
     """
-    found = replacement(tree)
-    if found is not None:
-        return found
+    replaced = replacement(tree)
+    if replaced is not None:
+        return replaced
     match tree:
-        case PastValue(delay=lag) if lag is not None:
-            return replace(tree, delay=substitute(lag, replacement))
+        case PastValue(delay=delay) if delay is not None:
+            return replace(tree, delay=substitute(delay, replacement))
         case Unary(operator, operand):
             return Unary(operator, substitute(operand, replacement))
         case Binary(operator, left, right):
             return Binary(operator, substitute(left, replacement), substitute(right, replacement))
         case FunctionCall(function, arguments):
-            return FunctionCall(function, tuple(substitute(one, replacement) for one in arguments))
+            return FunctionCall(
+                function, tuple(substitute(argument, replacement) for argument in arguments)
+            )
         case _:
             return tree
 
@@ -39,12 +41,12 @@ _PERIOD = Symbol("h", "period")
 def shift_expression(
     tree: Expression, steps: int, lag: Expression | None, *, counts: bool
 ) -> Expression:
-    """An expression as it was some whole steps and a lag ago; `counts`: lags are in samples."""
+    """Shift an expression back by whole steps and a delay; `counts`: delays are in samples."""
 
-    def earlier(node: Expression) -> Expression | None:
+    def shift_node(node: Expression) -> Expression | None:
         match node:
-            case PastValue(name, kind, offset, own):
-                return PastValue(name, kind, offset + steps, add_delays(own, lag))
+            case PastValue(name, kind, offset, delay):
+                return PastValue(name, kind, offset + steps, add_delays(delay, lag))
             case Symbol(_, "index"):
                 return Binary("-", node, back)
             case Symbol(_, "time"):
@@ -53,11 +55,11 @@ def shift_expression(
                 return None
 
     back = Binary("+", Number(float(steps)), lag or Number(0.0))
-    return tree if steps == 0 and lag is None else substitute(tree, earlier)
+    return tree if steps == 0 and lag is None else substitute(tree, shift_node)
 
 
-def add_delays(lag: Expression | None, other: Expression | None) -> Expression | None:
-    """Two lags, one after the other."""
-    if lag is None or other is None:
-        return other if lag is None else lag
-    return Binary("+", lag, other)
+def add_delays(delay: Expression | None, other: Expression | None) -> Expression | None:
+    """Add two delays; None is no delay."""
+    if delay is None or other is None:
+        return other if delay is None else delay
+    return Binary("+", delay, other)

@@ -1,7 +1,7 @@
-"""The checked expression tree of the model language: what the grammar makes and the kernels read.
+"""Expression tree of the model language, from the checker to the kernels.
 
-After checking, every name is resolved and every past value is a `PastValue` with its fixed offset
-and its unknown lag apart, so that code generation never looks at text.
+Every name is resolved. Every past value is a `PastValue` with a fixed offset and an unknown
+delay, so that code generation never reads text.
 """
 
 from collections.abc import Iterator
@@ -39,10 +39,10 @@ class PastValue:
     kind : {"state", "input"}
     offset : int
         Whole samples back (difference form); 0 in the differential form.
-    lag : Expression or None
-        What is subtracted besides `offset`: in samples in the difference form (``L/h``), in
-        seconds in the differential form. Made of parameters, numbers and ``h`` only, never
-        negative inside the bounds. None: no unknown lag.
+    delay : Expression or None
+        Delay in addition to `offset`: in samples in the difference form (``L/h``), in seconds in
+        the differential form. It contains only parameters, numbers and ``h``, and is never
+        negative inside the bounds. None: no unknown delay.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Unary:
 class Binary:
     """An operator of the table (`sysid.language.functions`) between two operands.
 
-    Comparison and logic stand only in the condition of `where`.
+    Comparison and logic occur only in the condition of `where`.
     """
 
     operator: str
@@ -83,10 +83,10 @@ Expression: TypeAlias = Number | Symbol | PastValue | Unary | Binary | FunctionC
 
 
 def find_children(tree: Expression) -> tuple[Expression, ...]:
-    """The nodes right below the root of a tree, in the order of the text; of `PastValue`, its lag."""
+    """Return the children of a node, in the order of the text; of a `PastValue`, its delay."""
     match tree:
-        case PastValue(delay=lag):
-            return () if lag is None else (lag,)
+        case PastValue(delay=delay):
+            return () if delay is None else (delay,)
         case Unary(_, operand):
             return (operand,)
         case Binary(_, left, right):
@@ -98,14 +98,14 @@ def find_children(tree: Expression) -> tuple[Expression, ...]:
 
 
 def walk(tree: Expression) -> Iterator[Expression]:
-    """Every node of a tree, the root first, then its children in the order of the text."""
+    """Iterate over the nodes of a tree: the root first, then its children in order."""
     yield tree
     for child in find_children(tree):
         yield from walk(child)
 
 
 def match_plain_state(tree: Expression) -> str | None:
-    """Name of the state that an expression is; None where it is anything else."""
+    """Return the name of the state that an expression is; None for any other expression."""
     match tree:
         case PastValue(name, "state", 0, None):
             return name

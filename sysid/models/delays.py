@@ -162,8 +162,8 @@ def find_unused_settings(
     outputs = [output.name for output in model.outputs]
     if len(outputs) == 1 and outputs[0] in (weights or {}):
         detail = (
-            f"{outputs[0]!r} is the model's only output, so a weight would change nothing; leave it "
-            "out"
+            f"{outputs[0]!r} is the model's only output, so a weight would change nothing; "
+            "leave it out"
         )
         faults.append(Fault(f"/weights/{outputs[0]}", detail))
     return faults

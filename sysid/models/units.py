@@ -174,8 +174,8 @@ class SignalUnits:
             cure = f'convert the data with the derivation {{"unit": {{"{channel}": "{expected}"}}}}'
         role = "" if channel == signal else f" (signal {signal!r})"
         return (
-            f"channel {channel!r}{role} is in {unit} in {where}, but in {owner} it is in {expected}: "
-            f"{difference}; {cure}"
+            f"channel {channel!r}{role} is in {unit} in {where}, but in {owner} it is in "
+            f"{expected}: {difference}; {cure}"
         )
 
 
@@ -199,8 +199,8 @@ def check_signal_units(model: Model, records: Sequence[Record]) -> None:
 def list_unknown_unit_warnings(channels: Iterable[Channel]) -> list[str]:
     """List warnings: channels with unknown units, such as ``bat`` for ``bar``."""
     return [
-        f"channel {channel.name!r}: {_quote_unit(channel.unit)} is no known unit, so it is not compared "
-        f"with other units{suggest_unit(channel.unit)}"
+        f"channel {channel.name!r}: {_quote_unit(channel.unit)} is no known unit, so it is not "
+        f"compared with other units{suggest_unit(channel.unit)}"
         for channel in channels
         if not (is_blank_unit(channel.unit) or is_known_unit(channel.unit))
     ]
@@ -219,8 +219,9 @@ def list_unread_unit_warnings(model: Model, records: Sequence[Record]) -> list[s
                 is_blank_unit(unit) or is_blank_unit(expected) or unit.strip() == expected.strip()
             ):
                 warnings[channel.name, unit] = (
-                    f"channel {channel.name!r} is in {unit}, but in {expected} in the model. The units were not "
-                    f"compared, because {' and '.join(unread)} could not be read as a unit."
+                    f"channel {channel.name!r} is in {unit}, but in {expected} in the model. The "
+                    f"units were not compared, because {' and '.join(unread)} could not be read as "
+                    "a unit."
                 )
     return list(warnings.values())
 
@@ -238,8 +239,8 @@ def list_mixed_unit_warnings(model: Model, records: Sequence[Record]) -> list[st
             if not is_blank_unit(channel.unit):
                 units.setdefault(channel.name, channel.unit)
     return [
-        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not declare "
-        "both units, so a gain between them is in these units "
+        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not "
+        "declare both units, so a gain between them is in these units "
         f"({describe_difference(units[a], units[b])}). "
         f'To convert, derive the data with {{"unit": {{"{a}": "{units[b]}"}}}}.'
         for a, b in combinations(units, 2)
