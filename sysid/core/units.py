@@ -248,7 +248,7 @@ def describe_difference(unit: str | None, other: str | None) -> str:
         return ""
     if _have_same_dimension(a, b) and _count_revolutions(a, b) is None:
         return f"between {unit} and {other} it is open whether cycles or radians are meant"
-    return f"{unit} and {other} are not units of the same quantity"
+    return f"{unit} is not {other}, and no factor converts one into the other"
 
 
 def multiply_units(unit: str, other: str) -> str:

@@ -1,1 +1,1 @@
-"""Reference plants that generate data (tube, actuator); optional."""
+"""Reference plants that generate data: pneumatic tube and actuator; optional."""

@@ -1,8 +1,8 @@
-"""The pneumatic vane actuator with stick-slip friction (Eq. 23-25), exact between its events.
+"""Pneumatic vane actuator with stick-slip friction (Eq. 23-25), exact between its events.
 
-While it sticks and while it slides one way the actuator is linear, so each stretch is advanced by
-a matrix exponential; the instants of breaking away, of stopping and of reaching an end stop are
-found by bisection. Nothing is shared with the catalogue's model, which steps through them.
+While it sticks, and while it slides in one direction, the actuator is linear. So a matrix
+exponential advances each stretch. The times of breaking away, stopping and reaching an end stop
+are found by bisection. The catalogue's model integrates over these events; it shares no code.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 
 MAX_SAMPLES = 200_000
-"""Samples of one simulation at most: about ten seconds of work."""
+"""Most samples of one simulation: about ten seconds of work."""
 
 MAX_WORK = 300_000
-"""Advances of the state in one simulation at most: about half a minute of one core."""
+"""Most advances of the state in one simulation: about half a minute of one core."""
 
-_MAX_PIECE = 1e-3  # s between looks for an event
+_MAX_PIECE = 1e-3  # s, longest time between checks for an event
 _HALVINGS = 50
 _THETA, _OMEGA, _P, _SUPPLY, _SLOPE, _ONE = range(6)
 
@@ -37,15 +37,15 @@ class Actuator:
     F_c, F_max : float
         Coulomb friction and break-away torque, N·m.
     k_a, k_b : float
-        1/s.
+        Pressure dynamics, 1/s.
     k_c : float
-        Pa/rad.
+        Pressure change per angle, Pa/rad.
     A_m : float
         Volume swept per radian, m³/rad (our choice; the paper gives none).
     B : float
         Viscous friction, N·m·s/rad (our choice).
     theta_s : float
-        End stop on either side, rad.
+        Angle of the end stops on both sides, rad.
     """
 
     J: float = 3.6e-4
@@ -72,13 +72,13 @@ class Actuator:
 
 
 def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
-    """Angle and chamber pressure from the supply pressure, at its samples; at rest before.
+    """Simulate angle and chamber pressure at the supply pressure's samples, from rest.
 
     Parameters
     ----------
     actuator : Actuator
     supply : Channel
-        Pressure difference P_a in Pa, held or on lines between its samples by its `hold`.
+        Pressure difference P_a in Pa; its `hold` says if it is held or linear between samples.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
     Raises
     ------
     InvalidRecord
-        If a sample is missing, times repeat, or there are more than `MAX_SAMPLES`.
+        If a sample is missing, times repeat, or there are more samples than `MAX_SAMPLES`.
     InvalidSettings
         If the simulation would take more than `MAX_WORK`, or diverges.
     """
@@ -100,19 +100,19 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
             "the supply pressure needs a finite value at every time, and increasing times"
         )
     _check_duration(float(times[-1]) - float(times[0]))
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
-        found = _simulate_samples(_ActuatorState(actuator), supply)
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
+        simulated = _simulate_samples(_ActuatorState(actuator), supply)
     return Recording(
         (
             Channel("P_a", times, values, "Pa", supply.hold),
-            Channel("theta", times, found[:, 0].copy(), "rad"),
-            Channel("P", times, found[:, 1].copy(), "Pa"),
+            Channel("theta", times, simulated[:, 0].copy(), "rad"),
+            Channel("P", times, simulated[:, 1].copy(), "Pa"),
         )
     )
 
 
 def _check_duration(duration: float) -> None:
-    """Refuse a record (s) whose pieces alone are more work than may be done."""
+    """Raise if the duration (s) alone takes more than `MAX_WORK` advances."""
     if not duration / _MAX_PIECE <= MAX_WORK:
         raise InvalidSettings(
             "/sample_time",
@@ -122,9 +122,9 @@ def _check_duration(duration: float) -> None:
 
 
 def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
-    """Angle and pressure, (samples, 2)."""
+    """Simulate angle and pressure; the result has shape (samples, 2)."""
     times, values = supply.times, supply.values
-    found = np.zeros((times.size, 2))
+    simulated = np.zeros((times.size, 2))
     for k in range(times.size - 1):
         step = float(times[k + 1] - times[k])
         slope = 0.0 if supply.hold == "zero" else float(values[k + 1] - values[k]) / step
@@ -135,34 +135,34 @@ def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
                 f"with these values the actuator's state is not finite at t = {times[k + 1]:g} s; "
                 "choose values nearer to the defaults, or a smaller supply pressure",
             )
-        found[k + 1] = plant.state[_THETA], plant.state[_P]
-    return found
+        simulated[k + 1] = plant.state[_THETA], plant.state[_P]
+    return simulated
 
 
 class _ActuatorState:
-    """State and mode of the actuator: the way it slides (1, -1), or 0 while it sticks."""
+    """State and mode of the actuator; the mode is its direction (1, -1), or 0 if it sticks."""
 
     def __init__(self, actuator: Actuator) -> None:
         self._a = actuator
         self.state = np.zeros(6)
         self.state[_ONE] = 1.0
-        self._way = 0
-        self._systems = {way: self._build_system(way) for way in (-1, 0, 1)}
-        self._known: dict[tuple[int, float], FloatArray] = {}
+        self._direction = 0
+        self._systems = {direction: self._build_system(direction) for direction in (-1, 0, 1)}
+        self._exponentials: dict[tuple[int, float], FloatArray] = {}
         self._work = 0
 
     def advance(self, supply: float, slope: float, time: float) -> None:
-        """Go on for a time (s) in which the supply begins with a value (Pa) and slope (Pa/s)."""
+        """Advance by a time (s); the supply starts at a value (Pa) with a slope (Pa/s)."""
         self.state[_SUPPLY], self.state[_SLOPE] = supply, slope
         pieces = max(1, round(time / _MAX_PIECE))
         for _ in range(pieces):
-            left = time / pieces
+            remaining = time / pieces
             self._start_sliding()
-            while left > 0:
-                left -= self._advance_until_event(left)
+            while remaining > 0:
+                remaining -= self._advance_until_event(remaining)
 
     def _advance_until_event(self, time: float) -> float:
-        """Go on until something changes, at most for a time; gives the time that passed."""
+        """Advance to the next event, at most by a time (s); return the elapsed time."""
         after = self._predict_state(time, keep=True)
         if not self._has_mode_ended(after):
             self.state = after
@@ -179,57 +179,60 @@ class _ActuatorState:
         return high
 
     def _has_mode_ended(self, state: FloatArray) -> bool:
-        """Whether the present mode has ended in a state that it would lead to."""
-        if self._way == 0:
+        """Whether the present mode has ended in a predicted state."""
+        if self._direction == 0:
             return self._find_slide_direction(state) != 0
-        return bool(state[_OMEGA] * self._way < 0 or state[_THETA] * self._way > self._a.theta_s)
+        return bool(
+            state[_OMEGA] * self._direction < 0 or state[_THETA] * self._direction > self._a.theta_s
+        )
 
     def _find_slide_direction(self, state: FloatArray) -> int:
-        """The way in which an arm at rest begins to slide; 0 if it stays."""
+        """Find the direction in which an arm at rest begins to slide; 0 if it stays."""
         torque = self._a.A_m * state[_P]
-        way = int(copysign(1, torque))
-        if abs(torque) <= self._a.F_max or state[_THETA] * way >= self._a.theta_s:
+        direction = int(copysign(1, torque))
+        if abs(torque) <= self._a.F_max or state[_THETA] * direction >= self._a.theta_s:
             return 0
-        return way
+        return direction
 
     def _change_mode(self) -> None:
-        """At an event: come to rest, or begin to slide."""
-        if self._way != 0:
+        """Change the mode at an event: come to rest, or begin to slide."""
+        if self._direction != 0:
             limit = self._a.theta_s
             self.state[_THETA] = min(max(self.state[_THETA], -limit), limit)
             self.state[_OMEGA] = 0.0
-        self._way = self._find_slide_direction(self.state)
+        self._direction = self._find_slide_direction(self.state)
 
     def _start_sliding(self) -> None:
-        if self._way == 0:
-            self._way = self._find_slide_direction(self.state)
+        if self._direction == 0:
+            self._direction = self._find_slide_direction(self.state)
 
     def _predict_state(self, time: float, keep: bool = False) -> FloatArray:
-        """The state after a time in the present mode."""
+        """Predict the state after a time (s) in the present mode."""
         self._work += 1
         if self._work > MAX_WORK:
             raise InvalidSettings(
                 "/samples",
                 f"the arm stops and breaks away so often that the simulation takes more than "
-                f"{MAX_WORK} steps. Request fewer samples, or choose parameters nearer to the defaults.",
+                f"{MAX_WORK} steps. Request fewer samples, or choose parameters nearer to the "
+                "defaults.",
             )
-        key = (self._way, time)
-        matrix = self._known.get(key)
+        key = (self._direction, time)
+        matrix = self._exponentials.get(key)
         if matrix is None:
-            matrix = expm(self._systems[self._way] * time)
-            if keep and len(self._known) < 64:
-                self._known[key] = matrix
-        found: FloatArray = matrix @ self.state
-        return found
+            matrix = expm(self._systems[self._direction] * time)
+            if keep and len(self._exponentials) < 64:
+                self._exponentials[key] = matrix
+        predicted: FloatArray = matrix @ self.state
+        return predicted
 
-    def _build_system(self, way: int) -> FloatArray:
-        """Matrix of d/dt (theta, omega, P, supply, its slope, 1) in a mode."""
+    def _build_system(self, direction: int) -> FloatArray:
+        """Build the matrix of d/dt (theta, omega, P, supply, its slope, 1) in a mode."""
         a = self._a
         system = np.zeros((6, 6))
         system[_P, [_P, _SUPPLY]] = -a.k_a, a.k_b
         system[_SUPPLY, _SLOPE] = 1.0
-        if way != 0:
+        if direction != 0:
             system[_THETA, _OMEGA] = 1.0
-            system[_OMEGA, [_OMEGA, _P, _ONE]] = -a.B / a.J, a.A_m / a.J, -a.F_c * way / a.J
+            system[_OMEGA, [_OMEGA, _P, _ONE]] = -a.B / a.J, a.A_m / a.J, -a.F_c * direction / a.J
             system[_P, _OMEGA] = -a.k_c
         return system

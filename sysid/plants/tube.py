@@ -1,12 +1,12 @@
-"""A long pneumatic tube that ends in a volume: one-dimensional gas dynamics with heat exchange.
+"""Long pneumatic tube with a volume at its end: 1-D gas dynamics with heat exchange.
 
 Staggered leapfrog: pressures and densities at nodes, mass flows on the faces between them. Wall
 friction is laminar (Hagen-Poiseuille) or turbulent (Blasius), and the gas exchanges heat with
 walls of constant temperature. Optional modes of the boundary layer make the laminar friction
-exact at all frequencies, for the check against the linear solution.
+exact at all frequencies, for comparison with the linear solution.
 
-Source: the equations are textbook ones (mass, momentum, energy; Blasius; Dittus-Boelter); the tube
-is that of Asakura and Guo, section 5.2: bore 8 mm, 40 m.
+Source: textbook equations (mass, momentum, energy; Blasius; Dittus-Boelter). The tube is that of
+Asakura and Guo, section 5.2: bore 8 mm, 40 m.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 
 ATMOSPHERE = 100_000.0
-"""Pa; pressures of the records are above it."""
+"""Atmospheric pressure in Pa; pressures of records are relative to it."""
 
 GAS_CONSTANT = 287.05  # J/kg/K, dry air
 HEAT_CAPACITY_RATIO = 1.4
@@ -29,12 +29,12 @@ VISCOSITY = 1.82e-5  # Pa·s
 PRANDTL = 0.71
 
 MAX_WORK = 2e8
-"""Cells times steps of one simulation at most: about half a minute of one core."""
+"""Most cells times steps of one simulation: about half a minute of one core."""
 
 MAX_SAMPLES = 5_000_000
-"""Samples of the command that a record's regulator follows, at most: about 400 MB."""
+"""Most samples of the command that a record's regulator follows: about 400 MB."""
 
-_MAX_CELL_LENGTH = 5.0  # m; coarser ones carry no wave of the patterns
+_MAX_CELL_LENGTH = 5.0  # m; longer cells do not carry the waves of the patterns
 
 _LAMINAR_REYNOLDS, _TURBULENT_REYNOLDS = 2000.0, 4000.0
 _COURANT = 0.8 / 1.15
@@ -51,15 +51,15 @@ class Tube:
     Attributes
     ----------
     length_m, bore_m : float
-        In m.
+        Length and bore, m.
     volume_m3 : float
         Volume at the end, m³.
     temperature : float
-        Of the walls and of the gas that flows in, K.
+        Temperature of the walls and of the inflowing gas, K.
     cells : int
-        0: cells of 0.5 m, of 0.25 m below 20 m.
+        Number of cells. 0: cells of 0.5 m, or of 0.25 m if the tube is shorter than 20 m.
     modes : int
-        Boundary-layer modes of laminar friction and heat exchange; 0: as in steady flow.
+        Boundary-layer modes of laminar friction and heat exchange; 0: steady-flow values.
     """
 
     length_m: float = 40.0
@@ -105,16 +105,16 @@ class Tube:
 
 
 def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Recording:
-    """Pressures at both ends of a tube, at the samples of its inlet; at rest before.
+    """Simulate the pressures at both ends of a tube at its inlet's samples, from rest.
 
     Parameters
     ----------
     tube : Tube
     inlet : Channel
-        Pressure above atmosphere in Pa at regular times: at the inlet, on lines between samples;
-        or, with `regulator`, the command of a pressure regulator there, held.
+        Pressure above atmosphere in Pa at regular times. It is the inlet pressure, linear between
+        samples. With `regulator` it is the held command of a pressure regulator at the inlet.
     regulator : bool
-        A pilot lag of 50 ms and a valve that saturates, filling 30 mL at the inlet.
+        Pilot time constant of 50 ms, and a saturating valve that fills 30 mL at the inlet.
 
     Returns
     -------
@@ -136,13 +136,15 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
     zeros = np.zeros((2, tube.modes))  # j² of the friction and of the heat exchange
     if tube.modes:
         zeros[0], zeros[1] = jn_zeros(2, tube.modes) ** 2, jn_zeros(0, tube.modes) ** 2
-    found = _simulate_flow(geometry, zeros, values + ATMOSPHERE, substeps, tube.n_cells, regulator)
-    if not np.all(np.isfinite(found)):
+    pressures = _simulate_flow(
+        geometry, zeros, values + ATMOSPHERE, substeps, tube.n_cells, regulator
+    )
+    if not np.all(np.isfinite(pressures)):
         raise InvalidRecord(
             "the flow in the tube becomes too fast for this scheme; give smaller or slower "
             "pressure changes"
         )
-    ends = found - ATMOSPHERE
+    ends = pressures - ATMOSPHERE
     return Recording(
         (
             Channel("P1", times, ends[:, 0].copy(), "Pa"),
@@ -152,7 +154,7 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
 
 
 def _count_substeps(tube: Tube, samples: int, period: float) -> int:
-    """Steps in a period, if they are not too many in all."""
+    """Count the steps in a period; raise if the simulation takes too many."""
     substeps = period / tube.max_step  # not finite for the longest periods
     work = float(samples) * max(substeps, 1.0) * tube.n_cells * (1 + tube.modes / 4)
     if not work <= MAX_WORK:
@@ -186,44 +188,44 @@ def _simulate_flow(
     n: int,
     regulator: bool,
 ) -> FloatArray:
-    """Pressures (samples, 2) in Pa at both ends."""
+    """Simulate the pressures (samples, 2) in Pa at both ends."""
     bore, wall, dt = geometry[1], geometry[3], geometry[4]
     gas = np.empty((3, n + 1))  # pressure, density, temperature at the nodes
     gas[0], gas[2] = command[0], wall
     gas[1] = command[0] / (GAS_CONSTANT * wall)
     flow, lagged = np.zeros(n), np.zeros((zeros.shape[1], n))
     warmed = np.full((zeros.shape[1], n + 1), command[0])
-    found = np.empty((command.size, 2))
-    found[0, :] = command[0]
+    pressures = np.empty((command.size, 2))
+    pressures[0, :] = command[0]
     pilot = command[0]
-    filled = _VALVE_VOLUME + geometry[0] * pi * bore**2 / 8  # with half a cell of the tube
+    inlet_volume = _VALVE_VOLUME + geometry[0] * pi * bore**2 / 8  # with half a cell of the tube
     for k in range(command.size - 1):
         for j in range(substeps):
             if regulator:
                 pilot += dt / _PILOT_TIME_CONSTANT * (command[k] - pilot)
-                given = min(
+                inflow = min(
                     max(_VALVE_CONDUCTANCE * (pilot - gas[0, 0]), -_MAX_OUTFLOW), _MAX_INFLOW
                 )
-                gas[0, 0] += dt * GAS_CONSTANT * wall / filled * (given - flow[0])
+                gas[0, 0] += dt * GAS_CONSTANT * wall / inlet_volume * (inflow - flow[0])
             else:
                 part = (j + 0.5) / substeps
                 gas[0, 0] = command[k] + part * (command[k + 1] - command[k])
             gas[1, 0] = gas[0, 0] / (GAS_CONSTANT * wall)
             _step_momentum(geometry, zeros[0], gas, flow, lagged)
             _step_balances(geometry, zeros[1], gas, flow, warmed)
-        found[k + 1, 0] = gas[0, 0] if regulator else command[k + 1]
-        found[k + 1, 1] = gas[0, n]
-    return found
+        pressures[k + 1, 0] = gas[0, 0] if regulator else command[k + 1]
+        pressures[k + 1, 1] = gas[0, n]
+    return pressures
 
 
 @jit_compile
 def _step_momentum(
     geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, lagged: FloatArray
 ) -> None:
-    """One step of the mass flows; friction implicit, convection from the donor cell."""
+    """Step the mass flows; friction is implicit, convection is from the donor cell."""
     dx, bore, dt = geometry[0], geometry[1], geometry[4]
     area, n = pi * bore**2 / 4, flow.size
-    inertia = 1.0  # with the modes that are left out: the sum of 4/j² over all is 1/3
+    inertia = 1.0  # includes the omitted modes: the sum of 4/j² over all modes is 1/3
     if zeros.size:
         inertia += 1 / 3 - np.sum(4 / zeros)
     before = flow[0] ** 2 / (0.5 * (gas[1, 0] + gas[1, 1]) * area)
@@ -237,7 +239,7 @@ def _step_momentum(
         if i + 1 < n and flow[i] + flow[i + 1] < 0:
             passes = following
         elif i + 1 == n and flow[i] < 0:
-            passes = 0.0  # what leaves the volume was at rest
+            passes = 0.0  # gas that leaves the volume was at rest
         force = -area * (gas[0, i + 1] - gas[0, i]) / dx - (passes - carried) / dx
         friction = _compute_friction(abs(flow[i]) * bore / (area * VISCOSITY)) / (density * bore**2)
         rate = VISCOSITY / density / (bore / 2) ** 2
@@ -252,19 +254,19 @@ def _step_momentum(
 
 @jit_compile
 def _compute_friction(reynolds: float) -> float:
-    """Friction times density and bore², Pa·s: laminar, then Blasius."""
+    """Compute friction times density and bore², Pa·s: laminar, then Blasius."""
     return _blend_regimes(reynolds, 32 * VISCOSITY, 0.1582 * reynolds**0.75 * VISCOSITY)
 
 
 @jit_compile
 def _compute_nusselt(reynolds: float) -> float:
-    """Laminar, then Dittus-Boelter."""
+    """Compute the Nusselt number: laminar, then Dittus-Boelter."""
     return _blend_regimes(reynolds, 8.0, 0.023 * reynolds**0.8 * PRANDTL**0.4)
 
 
 @jit_compile
 def _blend_regimes(reynolds: float, laminar: float, turbulent: float) -> float:
-    """The laminar value, the turbulent one, and between them a line."""
+    """Interpolate linearly between the laminar and the turbulent value."""
     part = (reynolds - _LAMINAR_REYNOLDS) / (_TURBULENT_REYNOLDS - _LAMINAR_REYNOLDS)
     return laminar + min(max(part, 0.0), 1.0) * (turbulent - laminar)
 
@@ -273,7 +275,7 @@ def _blend_regimes(reynolds: float, laminar: float, turbulent: float) -> float:
 def _step_balances(
     geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, warmed: FloatArray
 ) -> None:
-    """One step of mass and energy in every cell, then of the heat exchanged with its walls."""
+    """Step mass and energy of every cell, and the heat exchange with its walls."""
     dx, bore, volume, wall, dt = geometry
     area, n = pi * bore**2 / 4, flow.size
     conductivity = (
@@ -317,7 +319,7 @@ def _apply_boundary_layer(
     warmed: FloatArray,
     part: float,
 ) -> float:
-    """Gain of pressure with the heat that a laminar boundary layer takes; part of a cell is tube.
+    """Reduce a pressure gain by the heat of a laminar boundary layer; `part` of the cell is tube.
 
     With ζ² = Pr·s·r²/ν, 2 I₁(ζ)/(ζ I₀(ζ)) is the sum of 4/(ζ² + j²) over the zeros j of J₀.
     """
@@ -336,10 +338,10 @@ def _apply_boundary_layer(
 
 
 def build_excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
-    """Command of the regulator in Pa above atmosphere, as in the paper's two patterns.
+    """Build the regulator's command (Pa above atmosphere) of one of the paper's patterns.
 
-    Pattern 1: ten holds of 3 s. Pattern 2: 0.25 ± 0.15 MPa, a pseudo-random binary sequence with
-    a clock of 0.6 s, from 18 s on a chirp from 0.05 to 0.8 Hz over 12 s. Above 40 m time is
+    Pattern 1 is ten holds of 3 s. Pattern 2 is 0.25 ± 0.15 MPa: a pseudo-random binary sequence
+    with a clock of 0.6 s, and from 18 s a chirp from 0.05 to 0.8 Hz over 12 s. Above 40 m time is
     stretched by length/40.
 
     Raises
@@ -362,7 +364,7 @@ def build_excitation(pattern: int, length_m: float, times: FloatArray) -> FloatA
 
 
 def simulate_tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Recording:
-    """Pressures at both ends of a tube whose regulator follows one of the paper's patterns.
+    """Simulate a tube whose regulator follows one of the paper's patterns.
 
     Parameters
     ----------
@@ -371,34 +373,38 @@ def simulate_tube_record(tube: Tube, pattern: int, samples: int, period: float) 
         See `build_excitation`.
     samples : int
     period : float
-        In s; the command is followed at a tenth of it, but no finer than 0.5 ms.
+        Sampling period, s. The command has a tenth of it, but at least 0.5 ms.
 
     Raises
     ------
     InvalidSettings, InvalidRecord
         As `simulate_tube` and `build_excitation`.
     """
-    finer = max(1, round(min(10.0, period / 5e-4)))
-    if samples * finer > MAX_SAMPLES:
+    refinement = max(1, round(min(10.0, period / 5e-4)))
+    if samples * refinement > MAX_SAMPLES:
         raise InvalidSettings(
             "/samples",
-            f"found {samples}, whose command has {finer} times as many; need at most "
-            f"{MAX_SAMPLES // finer} at a sample_time of {period:g} s",
+            f"found {samples}, whose command has {refinement} times as many; need at most "
+            f"{MAX_SAMPLES // refinement} at a sample_time of {period:g} s",
         )
-    _count_substeps(tube, samples * finer, period / finer)
-    times = np.arange((samples - 1) * finer + 1, dtype=np.float64) * (period / finer)
+    _count_substeps(tube, samples * refinement, period / refinement)
+    times = np.arange((samples - 1) * refinement + 1, dtype=np.float64) * (period / refinement)
     command = Channel("P1", times, build_excitation(pattern, tube.length_m, times), "Pa")
     whole = simulate_tube(tube, command, regulator=True)
     return Recording(
         tuple(
-            replace(one, times=one.times[::finer].copy(), values=one.values[::finer].copy())
-            for one in whole.channels
+            replace(
+                channel,
+                times=channel.times[::refinement].copy(),
+                values=channel.values[::refinement].copy(),
+            )
+            for channel in whole.channels
         )
     )
 
 
 def _generate_binary_sequence(count: int) -> FloatArray:
-    """Bits ±1 of x⁷ + x⁶ + 1, from the second stage of a register that begins with ones."""
+    """Generate bits ±1 of x⁷ + x⁶ + 1 from the second last stage of a register of ones."""
     register = [1] * 7
     bits = []
     for _ in range(count):
@@ -408,12 +414,12 @@ def _generate_binary_sequence(count: int) -> FloatArray:
 
 
 def add_gauge_errors(recording: Recording, seed: int) -> Recording:
-    """The pressures as gauges of 1 MPa with 12 bit and noise of 0.5 kPa tell them."""
+    """Add the errors of gauges: range 1 MPa, 12 bit, noise of 0.5 kPa."""
     draws = np.random.Generator(np.random.Philox(seed))
     digit = 1e6 / 4096
     channels = []
-    for one in recording.channels:
-        noisy = one.values + 500.0 * draws.standard_normal(one.values.size)
-        told = digit * np.round(np.clip(noisy, 0.0, 1e6) / digit)
-        channels.append(Channel(one.name, one.times, told, one.unit, one.hold))
+    for channel in recording.channels:
+        noisy = channel.values + 500.0 * draws.standard_normal(channel.values.size)
+        quantised = digit * np.round(np.clip(noisy, 0.0, 1e6) / digit)
+        channels.append(Channel(channel.name, channel.times, quantised, channel.unit, channel.hold))
     return Recording(tuple(channels))

@@ -1,1 +1,1 @@
-"""Weighted regression of estimates over a label (length, temperature)."""
+"""Trends: weighted regression of estimates over a label such as length or temperature."""

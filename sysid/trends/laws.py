@@ -1,8 +1,8 @@
 """Laws of a trend: a straight line and a power law, by weighted least squares.
 
 The weights are 1/s² with the stated standard errors s. C = (JᵀWJ)⁻¹ is the covariance of the
-coefficients where the stated errors are right. Where the points scatter more than these say,
-the Birge ratio R = √(χ²/ν) [1]_ is above 1 and every error is multiplied by it.
+coefficients if the stated errors are right. If the points scatter more, the Birge ratio
+R = √(χ²/ν) [1]_ is above 1, and every error is multiplied by it.
 
 .. [1] R. T. Birge, The calculation of errors by the method of least squares, Phys. Rev. 40 (1932)
    207-227.
@@ -38,15 +38,15 @@ class TrendLaw:
     theta : FloatArray, shape (2,)
         c and b.
     covariance : FloatArray, shape (2, 2)
-        Of these, as the stated errors say.
+        Covariance of c and b from the stated errors.
     chi_squared : float
         Weighted sum of the squared residuals.
     degrees : int
-        Points less two.
+        Degrees of freedom ν: number of points minus two.
     aic : float
-        n ln(χ²/n) + 2k with k = 3, the scale of the errors counted [1]_.
+        n ln(χ²/n) + 2k with k = 3: two coefficients and the scale of the errors [1]_.
     aicc : float
-        With the correction for few points, 2k(k + 1)/(n - k - 1); ``inf`` where n ≤ k + 1.
+        AIC corrected for few points by 2k(k + 1)/(n - k - 1); ``inf`` if n ≤ k + 1.
 
     .. [1] K. P. Burnham, D. R. Anderson, Model Selection and Multimodel Inference, 2nd ed.,
        Springer 2002, §2.2 and §2.4.
@@ -63,20 +63,20 @@ class TrendLaw:
 
     @property
     def birge_ratio(self) -> float:
-        """√(χ²/ν): 1 where the points scatter as their errors say."""
+        """√(χ²/ν); 1 if the points scatter according to their errors."""
         return sqrt(self.chi_squared / self.degrees)
 
     @property
     def error_factor(self) -> float:
-        """By what the stated errors are multiplied: the Birge ratio, never less than 1."""
+        """Factor of the stated errors: the Birge ratio, at least 1."""
         return max(1.0, self.birge_ratio)
 
     def evaluate_law(self, x: FloatArray) -> FloatArray:
-        """The law at x."""
+        """Evaluate the law at x."""
         return _evaluate_kind(self.kind, x, self.centre, self.theta)
 
     def evaluate_stderr(self, x: FloatArray) -> FloatArray:
-        """Standard errors of the law at x, as the stated errors say."""
+        """Compute the standard errors of the law at x from the stated errors."""
         slopes = _differentiate_kind(self.kind, x, self.centre, self.theta)
         variance = np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -84,11 +84,11 @@ class TrendLaw:
     @property
     def coefficients(self) -> tuple[tuple[str, float, float], ...]:
         """Names, values and standard errors (widened) of a and b of `FORMULAS`."""
-        c, b = (float(one) for one in self.theta)
+        c, b = (float(value) for value in self.theta)
         if self.kind == "line":
             a, share, slopes = c - b * self.centre, 1.0, np.array([1.0, -self.centre])
         else:
-            share = float(np.exp(-b * log(self.centre)))  # may be large: it is never squared
+            share = float(np.exp(-b * log(self.centre)))  # may be large, so it is never squared
             a, slopes = c * share, np.array([1.0, -c * log(self.centre)])
         variance = max(float(slopes @ self.covariance @ slopes), 0.0)
         error = self.error_factor * sqrt(variance) * share
@@ -96,25 +96,25 @@ class TrendLaw:
 
 
 def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> TrendLaw | None:
-    """The straight line through points (n ≥ 3, of three different x or more).
+    """Fit a straight line to points (n ≥ 3, with at least three different x).
 
-    None where it is not determined in doubles, as where squares of x overflow.
+    The result is None if doubles cannot determine it, for example if squares of x overflow.
     """
     weight = (np.min(stderr) / stderr) ** 2  # at most 1: no overflow where errors are tiny
     centre = float(weight @ x / np.sum(weight))
     slopes = _differentiate_kind("line", x, centre, np.zeros(2))
     mean = float(weight @ y / np.sum(weight))
-    # y less its mean: else the rounding of the centre of x would enter times that mean
+    # y minus its mean: otherwise that mean multiplies the rounding of the centre of x
     product = weight @ (slopes[:, 1] * (y - mean))
     theta = np.array([mean, float(product / (weight @ slopes[:, 1] ** 2))])
     return _build_law("line", x, y, stderr, centre, theta)
 
 
 def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> TrendLaw | None:
-    """The power law through points of x > 0; None where it does not exist or is not determined.
+    """Fit a power law to points with x > 0; None if it does not exist or is not determined.
 
-    The exponent is first scanned, since c follows from it linearly; then Gauss and Newton's
-    method goes to the minimum.
+    The exponent is first scanned, since c follows from it linearly. Then the Gauss-Newton method
+    finds the minimum.
     """
     if not np.all(x > 0):
         return None
@@ -130,7 +130,7 @@ def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> TrendLaw | No
 
 
 def _scan_exponents(x: FloatArray, y: FloatArray, weight: FloatArray, centre: float) -> FloatArray:
-    """The best of many exponents, each with its best c."""
+    """Find the best of many exponents, each with its best c."""
     powers = np.clip(np.outer(_EXPONENTS, np.log(x / centre)), -_MAX_LOG, _MAX_LOG)
     shapes = weight * np.exp(powers)
     factors = shapes @ (weight * y) / np.sum(shapes**2, axis=1)
@@ -142,7 +142,7 @@ def _scan_exponents(x: FloatArray, y: FloatArray, weight: FloatArray, centre: fl
 def _take_step(
     x: FloatArray, y: FloatArray, weight: FloatArray, centre: float, theta: FloatArray
 ) -> FloatArray | None:
-    """A step that lowers the loss, halved until it does; None at the minimum."""
+    """Take a step, halved until it lowers the loss; None at the minimum."""
     slopes = weight[:, None] * _differentiate_kind("power", x, centre, theta)
     residual = weight * (y - _evaluate_kind("power", x, centre, theta))
     if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(residual))):
@@ -174,7 +174,7 @@ def _evaluate_kind(kind: LawKind, x: FloatArray, centre: float, theta: FloatArra
 def _differentiate_kind(
     kind: LawKind, x: FloatArray, centre: float, theta: FloatArray
 ) -> FloatArray:
-    """Derivatives (n, 2) by c and b."""
+    """Differentiate a law by c and b; the result has shape (n, 2)."""
     if kind == "line":
         return np.column_stack([np.ones_like(x), x - centre])
     share = _evaluate_kind(kind, x, centre, np.array([1.0, float(theta[1])]))
@@ -199,21 +199,21 @@ def _build_law(
         return None
     covariance = np.linalg.inv(normal) / np.outer(size / least, size / least)
     residual = (y - _evaluate_kind(kind, x, centre, theta)) / stderr
-    # What rounding leaves of an exact law is no evidence for it.
+    # The rounding residual of an exact law is no evidence for it.
     chi_squared = max(float(residual @ residual), compute_rounding_floor(y, stderr))
     if not (np.isfinite(chi_squared) and np.all(np.isfinite(covariance))):
         return None
     aic, aicc = _compute_criteria(chi_squared, x.size)
     law = TrendLaw(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
-    return law if np.all(np.isfinite([one[1:] for one in law.coefficients])) else None
+    return law if np.all(np.isfinite([entry[1:] for entry in law.coefficients])) else None
 
 
 def compute_rounding_floor(y: FloatArray, stderr: FloatArray) -> float:
-    """χ² that rounding of the values alone may give."""
+    """Compute the χ² that rounding of the values alone may give."""
     return float(np.sum((_ROUNDING * np.max(np.abs(y)) / stderr) ** 2)) + 1e-300
 
 
 def _compute_criteria(chi_squared: float, n: int) -> tuple[float, float]:
     aic = n * log(chi_squared / n) + 2 * _N_FITTED
-    left = n - _N_FITTED - 1
-    return aic, aic + 2 * _N_FITTED * (_N_FITTED + 1) / left if left > 0 else inf
+    remaining = n - _N_FITTED - 1
+    return aic, aic + 2 * _N_FITTED * (_N_FITTED + 1) / remaining if remaining > 0 else inf
