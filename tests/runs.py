@@ -67,10 +67,10 @@ class ListedRuns:
     def __init__(self, runs: Iterable[QueuedRun | InvalidRun]) -> None:
         self._runs = list(runs)
 
-    def runs(self) -> Iterator[QueuedRun | InvalidRun]:
+    def iterate_runs(self) -> Iterator[QueuedRun | InvalidRun]:
         yield from self._runs
 
-    def records(self, key: str) -> Records:
+    def load_records(self, key: str) -> Records:
         return RECORDS[key]
 
 
@@ -85,22 +85,22 @@ class Notebook:
         self.kills: dict[str, list[int]] = {}
         self.is_stopped = False
 
-    def started(self, run: str) -> None:
+    def record_start(self, run: str) -> None:
         self.begun.append(run)
 
-    def blamed(self, run: str, kills: int) -> None:
+    def record_worker_death(self, run: str, kills: int) -> None:
         self.kills.setdefault(run, []).append(kills)
 
-    def progress(self, run: str, state: RunState, seconds: float) -> None:
+    def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         self.states.setdefault(run, []).append(state)
 
-    def result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
+    def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         self.results.setdefault(run, []).append(concluded.identification)
 
-    def failure(self, run: str, failure: RunFailure) -> None:
+    def record_failure(self, run: str, failure: RunFailure) -> None:
         self.failures.setdefault(run, []).append(failure)
 
-    def known(self, run: str, source: str) -> None:
+    def record_reuse(self, run: str, source: str) -> None:
         raise AssertionError("no run was computed before")
 
     def should_stop(self) -> bool:

@@ -92,7 +92,7 @@ def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded, admission)
 
 def test_a_look_at_the_queue_scans_no_table(crowded) -> None:
     def work() -> None:
-        with crowded.read() as session:
+        with crowded.read_session() as session:
             read_queue_status(session, "d1")
 
     plans = plans_of(crowded, work)
@@ -113,7 +113,7 @@ def test_a_claim_reads_each_running_job_once_and_not_for_every_waiting_one(crowd
         steps += 1
         return 0
 
-    with crowded.write() as session:
+    with crowded.write_session() as session:
         session.connection().connection.driver_connection.set_progress_handler(count, 100)
         assert LeaseQueue(session).claim_job("d2") is not None
         session.connection().connection.driver_connection.set_progress_handler(None, 0)
@@ -121,7 +121,7 @@ def test_a_claim_reads_each_running_job_once_and_not_for_every_waiting_one(crowd
 
 
 def test_a_project_that_has_nothing_running_comes_first_among_many(crowded) -> None:
-    with crowded.write() as session:
+    with crowded.write_session() as session:
         session.execute(text("UPDATE jobs SET project_id = 'p3' WHERE id = 'job_04399'"))
     first = claim(crowded)
     assert job_of_project(crowded, first) == "p3"

@@ -110,7 +110,7 @@ def test_another_dispatcher_goes_on_making_runs_where_the_first_one_stopped(plac
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     assert claim(place).job.id == whole
     first = claim(place, "first")
-    coming = source(place, first).runs()
+    coming = source(place, first).iterate_runs()
     seen = [next(coming).run for _ in range(AT_ONCE + 1)]
     made = [run.id for run in place.runs(job)]
     assert len(made) == AT_ONCE + 2  # one chunk more
@@ -137,7 +137,7 @@ def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(plac
     with monkeypatch.context() as patched:
         patched.setattr(RunWriter, "create_runs", broken)
         with pytest.raises(MemoryError):
-            list(runs.runs())
+            list(runs.iterate_runs())
     assert len(place.runs(job)) == AT_ONCE
     assert len(list(runs.runs())) == N_RUNS
     assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
@@ -146,7 +146,7 @@ def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(plac
 def test_two_sources_of_one_lease_make_each_run_once(place):
     job = place.submit(**SWEEP)
     got = claim(place)
-    both = [source(place, got).runs() for _ in range(2)]
+    both = [source(place, got).iterate_runs() for _ in range(2)]
     for _ in range(N_RUNS):
         assert len({next(coming).run for coming in both}) == 1
     assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
@@ -240,5 +240,5 @@ def test_a_lease_that_has_expired_makes_nothing(place):
     with place.database.write_session() as session:
         got = LeaseQueue(session).claim_job("late", timedelta(seconds=0))
     lose(place, got)
-    assert list(source(place, got).runs()) == []
+    assert list(source(place, got).iterate_runs()) == []
     assert len(place.runs(job)) == AT_ONCE

@@ -16,7 +16,7 @@ from service.storage.sessions import BUSY_SECONDS
 from service.storage.tables import Job
 from tests.dispatching import Place
 from tests.stored import Clock, claim, job_of, state_of, submit
-from tests.unit.workers.test_scheduler import ScriptedCrew, fails
+from tests.unit.workers.test_scheduler import ScriptedExecutor, fails
 
 SECONDS = 30.0
 
@@ -102,7 +102,7 @@ class Stand:
 
     def __init__(self, folder: Path, clock: Clock) -> None:
         self.place, self.clock = Place(folder), clock
-        self.crew = ScriptedCrew(fails)
+        self.crew = ScriptedExecutor(fails)
         self.crew.is_slow = True
         self.leases = leases_of(self.place.database, clock)
         self.dispatcher = Dispatcher(self.place.database, self.place.store, self.crew, self.leases)
@@ -171,11 +171,11 @@ class Unanswered:
 
     def __init__(self, database) -> None:
         self._database, self.is_deaf = database, True
-        self.read = database.read
+        self.read_session = database.read_session
 
     @contextmanager
-    def write(self, *given: float):
-        with self._database.write(*given) as session:
+    def write_session(self, *given: float):
+        with self._database.write_session(*given) as session:
             yield session
         if self.is_deaf:
             self.is_deaf = False

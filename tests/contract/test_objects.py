@@ -58,7 +58,7 @@ def sha256(data):
 def test_bytes_come_back_under_their_hash(store, data):
     stored = store.put_stream([data])
     assert (stored.sha256, stored.size) == (sha256(data), len(data))
-    assert store.get(stored.sha256) == data
+    assert store.get_bytes(stored.sha256) == data
     assert store.size(stored.sha256) == len(data)
     assert store.exists(stored.sha256)
 
@@ -69,13 +69,13 @@ def test_a_stream_and_a_file_give_what_their_bytes_give(store, tmp_path):
     (tmp_path / "file").write_bytes(whole)
     assert store.put_stream(iter(blocks)).sha256 == sha256(whole)
     assert store.put_file(tmp_path / "file").sha256 == sha256(whole)
-    assert store.get(sha256(whole)) == whole
+    assert store.get_bytes(sha256(whole)) == whole
     assert (tmp_path / "file").exists()
 
 
 def test_storing_again_changes_nothing(store):
     store.put_stream([b"same"])
-    (before,) = store.objects()
+    (before,) = store.list_objects()
     store.put_stream([b"same"])
     (after,) = store.objects()
     assert after == before
@@ -92,7 +92,7 @@ def test_many_writers_of_the_same_bytes_at_once_all_succeed(store):
     for thread in threads:
         thread.join()
     assert len(results) == 4
-    assert store.get(results[0].sha256) == b"y" * 100_000
+    assert store.get_bytes(results[0].sha256) == b"y" * 100_000
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
     monkeypatch.setattr(objects, "_BLOCK", 300)
     data = os.urandom(1000)
     name = store.put_stream([data]).sha256
-    blocks = list(store.stream(name))
+    blocks = list(store.get_stream(name))
     assert b"".join(blocks) == data
     assert max(map(len, blocks)) == 300
     assert b"".join(store.stream(name, 10, 500)) == data[10:510]
@@ -119,7 +119,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
 def test_what_is_not_there_is_missing(store, name):
     assert not store.exists(name)
     store.delete(name)
-    reads = (store.get, store.size, lambda one: store.get_range(one, 0, 1))
+    reads = (store.get_bytes, store.size, lambda one: store.get_range(one, 0, 1))
     for read in reads:
         with pytest.raises(ObjectMissing):
             read(name)
@@ -131,13 +131,13 @@ def test_a_deleted_object_is_gone_and_others_stay(store):
     one, two = store.put_stream([b"1"]).sha256, store.put_stream([b"2"]).sha256
     store.delete(one)
     assert not store.exists(one)
-    assert [left.sha256 for left in store.objects()] == [two]
+    assert [left.sha256 for left in store.list_objects()] == [two]
 
 
 def test_all_objects_are_listed_and_nothing_else(store):
     store.check_writable()
     wanted = {store.put_stream([str(i).encode()]).sha256: len(str(i)) for i in range(60)}
-    assert {one.sha256: one.size for one in store.objects()} == wanted
+    assert {one.sha256: one.size for one in store.list_objects()} == wanted
 
 
 def test_a_writer_that_fails_half_way_leaves_nothing(store):
@@ -147,7 +147,7 @@ def test_a_writer_that_fails_half_way_leaves_nothing(store):
 
     with pytest.raises(ZeroDivisionError):
         store.put_stream(blocks())
-    assert list(store.objects()) == []
+    assert list(store.list_objects()) == []
 
 
 def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):

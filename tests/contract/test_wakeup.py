@@ -14,7 +14,7 @@ LONG = 60.0  # far beyond what a wake-up takes; a test that waits that long has 
 
 
 def settle(waker):
-    while waker.wait(0.1):
+    while waker.wait_for_change(0.1):
         pass
 
 

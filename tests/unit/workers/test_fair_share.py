@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.simulated_crew import Theatre
+from tests.simulated_executor import Theatre
 from workers.fair_share import (
     HEADSTART_SECONDS,
     LONGEST_WAIT_INTERVAL,

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.runs import RECORDS, Notebook, spec
-from tests.unit.workers.test_scheduler import ScriptedCrew, jobs
+from tests.unit.workers.test_scheduler import ScriptedExecutor, jobs
 from workers import scheduler
 from workers.packing import PACK_SECONDS
 from workers.protocol import AdvanceRun, ItemResult, RunConclusion, RunProgress, WorkItem
@@ -50,7 +50,7 @@ def steps(feeder: Scheduler[str], most: int = 1000) -> Iterator[tuple[str, ...]]
 
 
 def test_every_result_is_told_once_before_the_job_ends(concluded: RunConclusion) -> None:
-    feeder = Scheduler(ScriptedCrew(lambda item: ItemResult(item.run, concluded, 0.01)))
+    feeder = Scheduler(ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01)))
     notebook = jobs(feeder, a=60)["a"]
     for ended in steps(feeder):
         assert bool(ended) == (len(told(notebook)) == 60)
@@ -70,7 +70,7 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
         outcome = concluded if slices == 8 else advanced
         return ItemResult(item.run, outcome, PACK_SECONDS)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, sweep=400)["sweep"]
     while len(notebook.begun) < 100:  # by then its packs have many runs each
         feeder.run_step(0.0)
@@ -84,7 +84,7 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
 
 
 def test_a_job_whose_results_are_not_told_yet_gets_no_more_packs(concluded: RunConclusion) -> None:
-    crew = ScriptedCrew(lambda item: ItemResult(item.run, concluded, 0.05))
+    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.05))
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=500)["a"]
     most = 0
@@ -98,7 +98,7 @@ def test_a_job_whose_results_are_not_told_yet_gets_no_more_packs(concluded: RunC
 
 
 def test_what_has_come_back_is_told_when_the_dispatcher_stops(concluded: RunConclusion) -> None:
-    crew = ScriptedCrew(lambda item: ItemResult(item.run, concluded, 0.01))
+    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=400)["a"]
     for _ in range(20):
@@ -111,7 +111,7 @@ def test_what_has_come_back_is_told_when_the_dispatcher_stops(concluded: RunConc
 def test_a_job_that_is_stopped_alone_still_tells_what_has_come_back(
     concluded: RunConclusion,
 ) -> None:
-    crew = ScriptedCrew(lambda item: ItemResult(item.run, concluded, 0.01))
+    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=400)["a"]
     for _ in range(20):

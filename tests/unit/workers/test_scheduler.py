@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("time_to_read")
 Answer = Callable[[WorkItem], ItemResult | PackLost]
 
 
-class ScriptedCrew:
+class ScriptedExecutor:
     """Answers a pack, when it is waited for, with what the script says of its items."""
 
     def __init__(self, answer: Answer, slots: int = 2) -> None:
@@ -42,28 +42,30 @@ class ScriptedCrew:
         self.cancelled: list[tuple[int, bool]] = []
         self.is_slow = False
 
-    def share(self, records: Records) -> Any:
+    def share_records(self, records: Records) -> Any:
         return records
 
-    def submit(self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]) -> int:
+    def submit_pack(
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+    ) -> int:
         self.packs[len(self.sent)] = tuple(pack)
         self.sent.append(tuple(item.run for item in pack))
         return len(self.sent) - 1
 
-    def finished(self, timeout: float) -> tuple[int, ...]:
+    def wait_for_packs(self, timeout: float) -> tuple[int, ...]:
         return () if self.is_slow else tuple(reversed(self.packs))
 
-    def fetch(self, handle: int) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: int) -> tuple[ItemResult, ...]:
         answers = [self.answer(item) for item in self.packs.pop(handle)]
         for one in answers:
             if isinstance(one, PackLost):
                 raise one
         return tuple(one for one in answers if isinstance(one, ItemResult))
 
-    def cancel(self, handle: int, *, force: bool) -> None:
+    def cancel_pack(self, handle: int, *, force: bool) -> None:
         self.cancelled.append((handle, force))
 
-    def check(self) -> None:
+    def check_cluster_alive(self) -> None:
         pass
 
     def close(self) -> None:
@@ -94,7 +96,7 @@ def finish(feeder: Scheduler) -> list[str]:
 
 
 def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
-    feeder = Scheduler(ScriptedCrew(fails))
+    feeder = Scheduler(ScriptedExecutor(fails))
     notebooks = jobs(feeder, a=150, b=1)
     assert sorted(finish(feeder)) == ["a", "b"]
     assert {run: len(told) for run, told in notebooks["a"].failures.items()} == {
@@ -104,7 +106,7 @@ def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
 
 
 def test_the_packs_in_flight_are_shared_between_jobs() -> None:
-    crew = ScriptedCrew(fails)
+    crew = ScriptedExecutor(fails)
     crew.is_slow = True
     feeder = Scheduler(crew)
     jobs(feeder, a=100, b=100)
@@ -115,7 +117,7 @@ def test_the_packs_in_flight_are_shared_between_jobs() -> None:
 
 
 def test_runs_of_known_cost_share_a_pack() -> None:
-    crew = ScriptedCrew(fails)
+    crew = ScriptedExecutor(fails)
     feeder = Scheduler(crew)
     jobs(feeder, a=100)
     finish(feeder)
@@ -132,7 +134,7 @@ def test_a_run_whose_worker_dies_once_is_sent_again() -> None:
             return WorkerDied("killed")
         return fails(item)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, a=4)["a"]
     finish(feeder)
     assert [failure.reason for failure in notebook.failures["a1"]] == ["as told"]
@@ -142,7 +144,7 @@ def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
     def answer(item: WorkItem) -> ItemResult | PackLost:
         return WorkerDied("out of memory") if item.run == "a1" else fails(item)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, a=4)["a"]
     finish(feeder)
     (failure,) = notebook.failures.pop("a1")
@@ -151,7 +153,7 @@ def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
 
 
 def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blamed() -> None:
-    crew = ScriptedCrew(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
+    crew = ScriptedExecutor(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=100)["a"]
     finish(feeder)
@@ -164,7 +166,7 @@ def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blame
 
 
 def test_a_death_counted_by_a_dispatcher_before_is_counted_on() -> None:
-    crew = ScriptedCrew(lambda item: WorkerDied("killed"))
+    crew = ScriptedExecutor(lambda item: WorkerDied("killed"))
     feeder, notebook = Scheduler(crew), Notebook()
     feeder.add_job("a", ListedRuns([QueuedRun("a0", spec(), kills=1)]), notebook)
     finish(feeder)
@@ -182,7 +184,7 @@ def test_a_run_that_went_on_between_two_deaths_is_not_given_up() -> None:
             return fails(item)
         return one if isinstance(one, PackLost) else ItemResult(item.run, one, 0.1)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, a=1)["a"]
     finish(feeder)
     assert notebook.kills == {"a0": [1, 0, 1, 0]}
@@ -193,7 +195,7 @@ def test_a_programming_error_fails_the_runs_of_its_pack_with_its_last_line() -> 
     def answer(item: WorkItem) -> ItemResult | PackLost:
         return PackFailed("Traceback\n  …\nKeyError: 'x'") if item.run == "a0" else fails(item)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, a=2)["a"]
     finish(feeder)
     assert notebook.failures["a0"][0].reason == "internal error: KeyError: 'x'"
@@ -209,14 +211,14 @@ def test_work_whose_turn_did_not_come_is_sent_again() -> None:
         late.append(item.run)
         return ItemResult(item.run, None, 0.0)
 
-    feeder = Scheduler(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedExecutor(answer))
     notebook = jobs(feeder, a=3)["a"]
     finish(feeder)
     assert sorted(notebook.failures) == ["a0", "a1", "a2"]
 
 
 def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
-    crew = ScriptedCrew(fails)
+    crew = ScriptedExecutor(fails)
     crew.is_slow = True
     feeder = Scheduler(crew, grace_seconds=60.0)
     notebook = jobs(feeder, a=100)["a"]
@@ -232,7 +234,7 @@ def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
 
 
 def test_a_pack_that_outlives_the_grace_period_is_killed() -> None:
-    crew = ScriptedCrew(fails)
+    crew = ScriptedExecutor(fails)
     crew.is_slow = True
     feeder = Scheduler(crew, grace_seconds=0.0)
     notebook = jobs(feeder, a=1)["a"]
@@ -248,14 +250,14 @@ def test_a_run_without_records_fails_with_the_reason() -> None:
         def records(self, key: str) -> Records:
             raise RecordsUnavailable("there is no dataset ds_1")
 
-    feeder, notebook = Scheduler(ScriptedCrew(fails)), Notebook()
+    feeder, notebook = Scheduler(ScriptedExecutor(fails)), Notebook()
     feeder.add_job("a", Empty([QueuedRun("a0", spec())]), notebook)
     assert finish(feeder) == ["a"]
     assert notebook.failures["a0"][0].reason == "there is no dataset ds_1"
 
 
 def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:
-    feeder, notebook = Scheduler(ScriptedCrew(fails)), Notebook()
+    feeder, notebook = Scheduler(ScriptedExecutor(fails)), Notebook()
     refused = InvalidRun("a0", RunFailure(str(InvalidSettings("/seed", "negative"))))
     feeder.add_job("a", ListedRuns([refused, QueuedRun("a1", spec())]), notebook)
     finish(feeder)
@@ -265,13 +267,13 @@ def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:
 
 @pytest.mark.parametrize("n_runs", [0, 1])
 def test_a_job_ends_when_nothing_of_it_is_left(n_runs: int) -> None:
-    feeder = Scheduler(ScriptedCrew(fails))
+    feeder = Scheduler(ScriptedExecutor(fails))
     jobs(feeder, a=n_runs)
     assert finish(feeder) == ["a"]
 
 
 def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
-    crew = ScriptedCrew(fails)
+    crew = ScriptedExecutor(fails)
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=1)["a"]
     crew.submit([AdvanceRun("stray", spec(), None, 1.0)], (), ())
@@ -284,7 +286,7 @@ def test_a_run_is_told_to_begin_once_also_when_it_goes_on_from_a_checkpoint() ->
     problem, _ = build_pack_problems(spec().problem, RECORDS)
     kept = begin_run(problem, spec().algorithm, 1)
     answers = iter([RunProgress(kept), RunProgress(kept), RunFailure("as told")])
-    feeder = Scheduler(ScriptedCrew(lambda item: ItemResult(item.run, next(answers), 0.01)))
+    feeder = Scheduler(ScriptedExecutor(lambda item: ItemResult(item.run, next(answers), 0.01)))
     notebook = Notebook()
     feeder.add_job("a", ListedRuns([QueuedRun("a0", spec(), kept)]), notebook)
     finish(feeder)
@@ -301,12 +303,12 @@ def test_islands_whose_turn_did_not_come_are_sent_again(monkeypatch: pytest.Monk
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
 
-def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedCrew, Notebook]:
+def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedExecutor, Notebook]:
     """A run of four islands, of which the first two are one pack and the others another."""
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     one = spec(islands=4)
     kept = begin_run(build_pack_problems(one.problem, RECORDS)[0], one.algorithm, 1)
-    crew, notebook = ScriptedCrew(fails), Notebook()
+    crew, notebook = ScriptedExecutor(fails), Notebook()
     work = JobQueue(ListedRuns([QueuedRun("a0", one, kept)]), notebook, crew)
     assert work.read_ahead(1, 0.0)
     work.send_next_pack(2)

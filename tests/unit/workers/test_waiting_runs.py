@@ -7,7 +7,7 @@ import pytest
 from service.dispatch.warm_starts import OpenChains
 from service.jobs.warm_start_order import ChainLayout
 from tests.runs import RECORDS, Notebook, spec
-from tests.unit.workers.test_scheduler import ScriptedCrew, fails, finish, jobs
+from tests.unit.workers.test_scheduler import ScriptedExecutor, fails, finish, jobs
 from workers.protocol import JobEntry, QueuedRun, Records, RunNotReady
 from workers.scheduler import Scheduler
 
@@ -20,18 +20,18 @@ class Chained:
     def __init__(self, notebook: Notebook, runs: int, *, is_stuck: bool = False) -> None:
         self._notebook, self._runs, self._is_stuck = notebook, runs, is_stuck
 
-    def runs(self) -> Iterator[JobEntry]:
+    def iterate_runs(self) -> Iterator[JobEntry]:
         for number in range(self._runs):
             while self._is_stuck or len(self._notebook.failures) < number:
                 yield RunNotReady()
             yield QueuedRun(f"chain{number}", spec())
 
-    def records(self, key: str) -> Records:
+    def load_records(self, key: str) -> Records:
         return RECORDS[key]
 
 
 def test_a_chain_is_sent_run_by_run() -> None:
-    crew, notebook = ScriptedCrew(fails), Notebook()
+    crew, notebook = ScriptedExecutor(fails), Notebook()
     feeder: Scheduler[str] = Scheduler(crew)
     feeder.add_job("chain", Chained(notebook, 5), notebook)
     assert finish(feeder) == ["chain"]
@@ -40,7 +40,7 @@ def test_a_chain_is_sent_run_by_run() -> None:
 
 def test_a_job_that_waits_does_not_keep_others_from_the_workers() -> None:
     notebook = Notebook()
-    feeder: Scheduler[str] = Scheduler(ScriptedCrew(fails))
+    feeder: Scheduler[str] = Scheduler(ScriptedExecutor(fails))
     feeder.add_job("chain", Chained(notebook, 1, is_stuck=True), notebook)
     other = jobs(feeder, a=20)["a"]
     for _ in range(200):
@@ -51,7 +51,7 @@ def test_a_job_that_waits_does_not_keep_others_from_the_workers() -> None:
 
 def test_a_job_that_waits_can_be_cancelled() -> None:
     notebook = Notebook()
-    feeder: Scheduler[str] = Scheduler(ScriptedCrew(fails))
+    feeder: Scheduler[str] = Scheduler(ScriptedExecutor(fails))
     feeder.add_job("chain", Chained(notebook, 1, is_stuck=True), notebook)
     feeder.run_step(0.0)
     notebook.is_stopped = True
@@ -65,7 +65,7 @@ class SeveralChains:
         self._notebook, self._chain, self._n_runs = notebook, chain, n_runs
         self._chains = OpenChains(chain, n_runs, lambda number: True)
 
-    def runs(self) -> Iterator[JobEntry]:
+    def iterate_runs(self) -> Iterator[JobEntry]:
         seen: set[str] = set()
         while not self._chains.is_exhausted:
             for run in set(self._notebook.failures) - seen:
@@ -75,13 +75,13 @@ class SeveralChains:
                 yield QueuedRun(f"{self._chain.find_chain(number)}-{number}", spec())
             yield RunNotReady()
 
-    def records(self, key: str) -> Records:
+    def load_records(self, key: str) -> Records:
         return RECORDS[key]
 
 
 @pytest.mark.parametrize("chain", [ChainLayout(1, 5), ChainLayout(4, 5)])
 def test_chains_go_side_by_side_and_each_run_by_run(chain: ChainLayout) -> None:
-    crew, notebook = ScriptedCrew(fails), Notebook()
+    crew, notebook = ScriptedExecutor(fails), Notebook()
     feeder: Scheduler[str] = Scheduler(crew)
     feeder.add_job("chains", SeveralChains(notebook, chain, 20), notebook)
     assert finish(feeder) == ["chains"]
@@ -95,7 +95,7 @@ def test_chains_go_side_by_side_and_each_run_by_run(chain: ChainLayout) -> None:
 
 
 def test_runs_that_nothing_follows_at_present_are_shared_by_all_cores() -> None:
-    crew, notebook = ScriptedCrew(fails), Notebook()
+    crew, notebook = ScriptedExecutor(fails), Notebook()
     feeder: Scheduler[str] = Scheduler(crew)
     feeder.add_job("chains", SeveralChains(notebook, ChainLayout(1, 5), 20), notebook)
     finish(feeder)

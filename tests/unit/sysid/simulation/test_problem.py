@@ -272,7 +272,8 @@ def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
         (
             0,
             "x(0)",
-            "an initial state is a parameter if the model's document gives it bounds, initial: {x: {",
+            "an initial state is a parameter if the model's document gives it bounds, "
+            "initial: {x: {",
         ),
         (
             {"lower": -1, "upper": 1},

@@ -22,7 +22,7 @@ from workers.scheduler import Scheduler
 from workers.tasks import build_pack_problems
 
 
-class SimulatedCrew:
+class SimulatedExecutor:
     """Workers that take packs in the order they were sent, and the time the runs say.
 
     A run is named ``job/number/seconds``; it goes on in slices until it has had its seconds.
@@ -37,10 +37,12 @@ class SimulatedCrew:
         self._packs: dict[int, tuple[WorkItem, ...]] = {}
         self._next = 0
 
-    def share(self, records: Records) -> Any:
+    def share_records(self, records: Records) -> Any:
         return records
 
-    def submit(self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]) -> int:
+    def submit_pack(
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+    ) -> int:
         self._next += 1
         self._packs[self._next] = tuple(pack)
         self._waiting.append(self._next)
@@ -48,7 +50,7 @@ class SimulatedCrew:
         self.most_waiting = max(self.most_waiting, len(self._waiting))
         return self._next
 
-    def finished(self, timeout: float) -> tuple[int, ...]:
+    def wait_for_packs(self, timeout: float) -> tuple[int, ...]:
         if not self._computing:
             return ()
         ends, handle = heapq.heappop(self._computing)
@@ -56,13 +58,13 @@ class SimulatedCrew:
         self._begin()
         return (handle,)
 
-    def fetch(self, handle: int) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: int) -> tuple[ItemResult, ...]:
         return tuple(self._done(item) for item in self._packs.pop(handle))
 
-    def cancel(self, handle: int, *, force: bool) -> None:
+    def cancel_pack(self, handle: int, *, force: bool) -> None:
         raise AssertionError("no job is cancelled here")
 
-    def check(self) -> None:
+    def check_cluster_alive(self) -> None:
         pass
 
     def close(self) -> None:
@@ -97,7 +99,7 @@ class Theatre:
     """A feeder with a simulated crew, and when each of its jobs ended."""
 
     def __init__(self, slots: int, **options: Any) -> None:
-        self.crew = SimulatedCrew(slots)
+        self.crew = SimulatedExecutor(slots)
         self.feeder: Scheduler[str] = Scheduler(self.crew, **options)
         self.ended: dict[str, float] = {}
 
