@@ -212,7 +212,7 @@ def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
     n = cast(ranked.c.n, Integer)
     lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES_PER_MILLE]
     return select(literal(which), ranked).where(
-        or_(*(ranked.c.place.in_((rank, rank + 1)) for rank in lower))
+        or_(*(ranked.c.place.in_((low, low + 1)) for low in lower))
     )
 
 
