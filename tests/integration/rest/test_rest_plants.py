@@ -135,4 +135,4 @@ def test_the_command_line_makes_a_tube_from_its_length(
     assert done.exit_code == 0, done.output
     assert "long: 100 samples" in done.output
     assert run(datasets.app, ["simulate"]).exit_code == 1
-    assert run(datasets.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code == 1
+    assert run(datasets.app, ["simulate", "--plant", "tube", "--set", "length_m"]).exit_code == 2
