@@ -1,7 +1,7 @@
 """Array types of the numerical core, and the dimension letters that docstrings use.
 
-N samples of a record; M measured output values that are compared; P individuals of a population;
-D free parameters; K all parameters (free and fixed); E experiments; W lanes of a kernel.
+N: samples of a record. M: measured output values that are compared. P: individuals of a population.
+D: free parameters. K: all parameters (free and fixed). E: experiments. W: lanes of a kernel.
 """
 
 from typing import Any, TypeAlias, get_type_hints

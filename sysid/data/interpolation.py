@@ -55,7 +55,7 @@ def interpolate_input(
     start: float,
     step: float,
     steps: int,
-    lag: float,
+    max_delay: float,
     mean: Literal["around", "after"] | None = None,
 ) -> FineInput:
     """Interpolate an input onto the fine grid.
@@ -72,30 +72,32 @@ def interpolate_input(
     ----------
     start, step, steps : float, float, int
         First time of the simulation (s), integration step (s), and number of steps.
-    lag : float
+    max_delay : float
         Largest delay of the input, in steps.
     mean : {"around", "after"} or None
         Averaging of a held input; None: none.
     """
     channel = _join_usable_history(channel)
     points_per_step = _count_points(channel, start, step)
-    cap = ceil(lag * points_per_step) + 2
-    count = cap + (steps + 2) * points_per_step + 2
-    times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (
+    points_before = ceil(max_delay * points_per_step) + 2
+    count = points_before + (steps + 2) * points_per_step + 2
+    times: FloatArray = start + (np.arange(count, dtype=np.float64) - points_before) * (
         step / points_per_step
     )
     if mean is not None and channel.hold == "zero" and channel.times.size > 1:
         advance = 0.5 * step if mean == "around" else 0.0
         values = average_held(channel, times - advance, step)
-        return FineInput(values, cap, points_per_step, 0, points_per_step, max(cap - 2, 0))
+        return FineInput(
+            values, points_before, points_per_step, 0, points_per_step, max(points_before - 2, 0)
+        )
     jump = 1 if channel.hold == "zero" else 0
     return FineInput(
         interpolate_channel(channel, times),
-        cap,
+        points_before,
         points_per_step,
         jump,
         points_per_step - jump,
-        max(cap - 2, 0),
+        max(points_before - 2, 0),
     )
 
 

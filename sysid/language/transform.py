@@ -39,14 +39,14 @@ _PERIOD = Symbol("h", "period")
 
 
 def shift_expression(
-    tree: Expression, steps: int, lag: Expression | None, *, counts: bool
+    tree: Expression, steps: int, extra_delay: Expression | None, *, counts: bool
 ) -> Expression:
     """Shift an expression back by whole steps and a delay; `counts`: delays are in samples."""
 
     def shift_node(node: Expression) -> Expression | None:
         match node:
             case PastValue(name, kind, offset, delay):
-                return PastValue(name, kind, offset + steps, add_delays(delay, lag))
+                return PastValue(name, kind, offset + steps, add_delays(delay, extra_delay))
             case Symbol(_, "index"):
                 return Binary("-", node, back)
             case Symbol(_, "time"):
@@ -54,8 +54,8 @@ def shift_expression(
             case _:
                 return None
 
-    back = Binary("+", Number(float(steps)), lag or Number(0.0))
-    return tree if steps == 0 and lag is None else substitute(tree, shift_node)
+    back = Binary("+", Number(float(steps)), extra_delay or Number(0.0))
+    return tree if steps == 0 and extra_delay is None else substitute(tree, shift_node)
 
 
 def add_delays(delay: Expression | None, other: Expression | None) -> Expression | None:

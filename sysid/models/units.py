@@ -240,7 +240,7 @@ def list_mixed_unit_warnings(model: Model, records: Sequence[Record]) -> list[st
                 units.setdefault(channel.name, channel.unit)
     return [
         f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not "
-        "declare both units, so a gain between them is in these units "
+        "declare both units. A gain between them is in these units "
         f"({describe_difference(units[a], units[b])}). "
         f'To convert, derive the data with {{"unit": {{"{a}": "{units[b]}"}}}}.'
         for a, b in combinations(units, 2)

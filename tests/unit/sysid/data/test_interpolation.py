@@ -60,7 +60,7 @@ def test_a_short_record_can_be_band_limited() -> None:
 
 @pytest.mark.parametrize("hold", ["first", "zero", "band-limited"])
 def test_half_steps_and_samples_are_points_of_the_fine_grid(hold: Hold) -> None:
-    fine = interpolate_input(channel(hold), 0.0, 0.1, 399, lag=7.0)
+    fine = interpolate_input(channel(hold), 0.0, 0.1, 399, max_delay=7.0)
     assert fine.points_per_step % 2 == 0
     samples = fine.values[fine.start_index + fine.begin :: fine.points_per_step][:400]
     np.testing.assert_allclose(samples, np.sin(3 * TIMES), atol=1e-3)
@@ -69,7 +69,7 @@ def test_half_steps_and_samples_are_points_of_the_fine_grid(hold: Hold) -> None:
 
 
 def test_an_input_sampled_faster_than_the_grid_keeps_its_samples() -> None:
-    fine = interpolate_input(channel("first"), 0.0, 0.3, 100, lag=0.0)
+    fine = interpolate_input(channel("first"), 0.0, 0.3, 100, max_delay=0.0)
     assert fine.points_per_step == 6
     np.testing.assert_allclose(
         fine.values[fine.start_index :: 2][:300], np.sin(3 * TIMES)[:300], atol=1e-12
