@@ -349,4 +349,4 @@ def test_a_lag_that_would_look_ahead_is_refused(served: Served) -> None:
             given = {**body, "model": "fopdt", "sample_time": 0.1, "parameters": values}
         [fault] = refused(served.server.post(path, json=given), 422, "invalid")
         assert fault["pointer"] == "/parameters/L"
-        assert "u(t - L) can be as small as -1 s" in fault["detail"]
+        assert "found -1; with it the delay of u(t - L) can be as small as -1 s" in fault["detail"]
