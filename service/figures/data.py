@@ -95,7 +95,7 @@ class RunFigureData:
     ----------
     unit : str
         Unit of the RMS.
-    fitness : str
+    fitness_label : str
         What the search minimised: the RMS, or a robust loss expressed as an RMS.
     history : sequence of sequence of Improvement
         One sequence per island, in the order of the generations.

@@ -150,7 +150,7 @@ def _add_panel(
     figure: Figure, number: int, panel: _Panel, domain: Place, unit: str, in_legend: set[str]
 ) -> None:
     small = {"size": 11}
-    at = add_axes(
+    axis_names = add_axes(
         figure,
         number,
         domain,
@@ -172,14 +172,19 @@ def _add_panel(
         in_legend.add(name)
         label = name if number == 0 else f"{panel.title}: {name}"
         figure["data"] += _band_traces(
-            band, label, name, _line_style(name, place_in_order), at, first
+            band, label, name, _line_style(name, place_in_order), axis_names, first
         )
-    figure["data"] += _floor_traces(panel, at, in_legend)
+    figure["data"] += _floor_traces(panel, axis_names, in_legend)
     add_caption(figure, panel.caption, domain)
 
 
 def _band_traces(
-    band: _Band, label: str, group: str, line: dict[str, Any], at: dict[str, str], first: bool
+    band: _Band,
+    label: str,
+    group: str,
+    line: dict[str, Any],
+    axis_names: dict[str, str],
+    first: bool,
 ) -> list[dict[str, Any]]:
     """Draw the band between its two edges, and the median over it."""
     order = sorted(range(len(band.x)), key=band.x.__getitem__)
@@ -187,7 +192,7 @@ def _band_traces(
     low, middle, high = (
         to_json_numbers(values[i] for i in order) for values in (band.low, band.middle, band.high)
     )
-    shared = {"type": "scatter", "x": x, "legendgroup": group, **at}
+    shared = {"type": "scatter", "x": x, "legendgroup": group, **axis_names}
     edge = {
         **shared,
         "mode": "lines",
@@ -217,7 +222,9 @@ def _band_traces(
     ]
 
 
-def _floor_traces(panel: _Panel, at: dict[str, str], in_legend: set[str]) -> list[dict[str, Any]]:
+def _floor_traces(
+    panel: _Panel, axis_names: dict[str, str], in_legend: set[str]
+) -> list[dict[str, Any]]:
     """Draw the Cramér–Rao bound: for parameters, the 5 and 95 % quantiles that it implies."""
     x = sorted(panel.floor)
     if not x:
@@ -236,7 +243,7 @@ def _floor_traces(panel: _Panel, at: dict[str, str], in_legend: set[str]) -> lis
                 "x": to_json_numbers(x),
                 "y": to_json_numbers(sign * panel.floor[sigma] for sigma in x),
                 "line": dict(_FLOOR_STYLE),
-                **at,
+                **axis_names,
                 "hovertemplate": "bound, σ %{x:.4g}: %{y:.4g}<extra></extra>",
             }
         )

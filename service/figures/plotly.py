@@ -314,7 +314,7 @@ def _final_fitness(island: tuple[float, float | None]) -> float:
 def _add_parameter_plot(
     figure: Figure, run: RunFigureData, number: int, parameter: FreeParameter, domain: Place
 ) -> None:
-    at = add_axes(
+    axis_names = add_axes(
         figure,
         number,
         domain,
@@ -337,14 +337,14 @@ def _add_parameter_plot(
                     "name": f"{parameter.name}, island {island + 1}",
                     "x": x,
                     "y": to_json_numbers(y),
-                    "xaxis": at["xaxis"],
-                    "yaxis": at["yaxis"],
+                    "xaxis": axis_names["xaxis"],
+                    "yaxis": axis_names["yaxis"],
                     "line": {**theme.series_style(island), "shape": "hv"},
                     "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
                 }
             )
     figure["layout"]["shapes"] += [
-        _bound_line(bound, at) for bound in (parameter.lower, parameter.upper)
+        _bound_line(bound, axis_names) for bound in (parameter.lower, parameter.upper)
     ]
     add_caption(figure, _parameter_caption(parameter), domain)
 
@@ -357,13 +357,13 @@ def _bounds_axis(parameter: FreeParameter) -> dict[str, Any]:
     return {"range": [lower - room, upper + room], "type": parameter.scale}
 
 
-def _bound_line(y: float, at: dict[str, str]) -> dict[str, Any]:
+def _bound_line(y: float, axis_names: dict[str, str]) -> dict[str, Any]:
     return {
         "type": "line",
-        "xref": f"{at['xaxis']} domain",
+        "xref": f"{axis_names['xaxis']} domain",
         "x0": 0,
         "x1": 1,
-        "yref": at["yaxis"],
+        "yref": axis_names["yaxis"],
         "y0": y,
         "y1": y,
         "layer": "below",

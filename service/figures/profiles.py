@@ -26,7 +26,7 @@ def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int
     }
     for number, profile in enumerate(profiles):
         is_first = number % grid.n_columns == 0
-        at = add_axes(
+        axis_names = add_axes(
             figure,
             number,
             grid.place(number),
@@ -37,19 +37,19 @@ def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int
                 **({"title": {"text": "likelihood ratio"}} if is_first else {}),
             },
         )
-        figure["data"].append(_profile_trace(profile, at))
-        figure["layout"]["shapes"] += _threshold_shapes(profile, at, threshold)
+        figure["data"].append(_profile_trace(profile, axis_names))
+        figure["layout"]["shapes"] += _threshold_shapes(profile, axis_names, threshold)
     return figure
 
 
-def _profile_trace(profile: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
+def _profile_trace(profile: ProfileOut, axis_names: dict[str, str]) -> dict[str, Any]:
     return {
         "type": "scatter",
         "mode": "lines+markers",
         "name": profile.name,
         "x": profile.values,
         "y": profile.ratio,
-        **at,
+        **axis_names,
         "line": {"color": theme.BLUE, "width": 1.5},
         "marker": {"color": theme.BLUE, "size": 4},
         "hovertemplate": f"{profile.name} = %{{x:.6g}}: %{{y:.3g}}<extra></extra>",
@@ -57,7 +57,7 @@ def _profile_trace(profile: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
 
 
 def _threshold_shapes(
-    profile: ProfileOut, at: dict[str, str], threshold: float
+    profile: ProfileOut, axis_names: dict[str, str], threshold: float
 ) -> list[dict[str, Any]]:
     """Draw the threshold, and a vertical line at each end of the interval that is not open."""
     style = {"color": theme.GREY, "width": 1, "dash": "dot"}
@@ -65,10 +65,10 @@ def _threshold_shapes(
         "type": "line",
         "x0": 0,
         "x1": 1,
-        "xref": f"{at['xaxis']} domain",
+        "xref": f"{axis_names['xaxis']} domain",
         "y0": threshold,
         "y1": threshold,
-        "yref": at["yaxis"],
+        "yref": axis_names["yaxis"],
         "line": style,
     }
     ends = [
@@ -76,10 +76,10 @@ def _threshold_shapes(
             "type": "line",
             "x0": end,
             "x1": end,
-            "xref": at["xaxis"],
+            "xref": axis_names["xaxis"],
             "y0": 0,
             "y1": threshold,
-            "yref": at["yaxis"],
+            "yref": axis_names["yaxis"],
             "line": style,
         }
         for end in profile.interval95

@@ -57,7 +57,7 @@ def _add_correlation(
     bands = correlation.band95[shown], correlation.band99[shown]
     reach = 1.2 * max(float(np.max(np.abs(values))), float(np.max(bands[1])), 1e-12)
     edge = 0.7
-    at = add_axes(
+    axis_names = add_axes(
         figure,
         number,
         domain,
@@ -70,8 +70,8 @@ def _add_correlation(
         },
         {"nticks": 5, "range": [-reach, reach]},
     )
-    figure["data"] += _band_traces(lags, bands, at, first=number == 0)
-    figure["data"].append(_correlation_bars(correlation, lags, values, bands[1], at))
+    figure["data"] += _band_traces(lags, bands, axis_names, first=number == 0)
+    figure["data"].append(_correlation_bars(correlation, lags, values, bands[1], axis_names))
     add_caption(figure, correlation.title, domain, shift=3)
 
 
@@ -82,12 +82,12 @@ def _lag_title(correlation: CorrelationTrace) -> str:
 
 
 def _band_traces(
-    lags: Floats, bands: tuple[Floats, Floats], at: dict[str, str], *, first: bool
+    lags: Floats, bands: tuple[Floats, Floats], axis_names: dict[str, str], *, first: bool
 ) -> list[dict[str, Any]]:
     """Draw the 95 % band as an area and the 99 % band as dashed lines."""
     # The band extends by half a lag at each end, so that it covers the first and the last bar.
     x = to_json_numbers(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
-    shared = {"type": "scatter", "mode": "lines", "x": x, **at, "hoverinfo": "skip"}
+    shared = {"type": "scatter", "mode": "lines", "x": x, **axis_names, "hoverinfo": "skip"}
     drawn = []
     for name, band, look in (
         ("95 % band", bands[0], {"line": {"width": 0}}),
@@ -118,7 +118,11 @@ def _band_traces(
 
 
 def _correlation_bars(
-    correlation: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, at: dict[str, str]
+    correlation: CorrelationTrace,
+    lags: Floats,
+    values: Floats,
+    band99: Floats,
+    axis_names: dict[str, str],
 ) -> dict[str, Any]:
     outside = np.abs(values) > band99
     return {
@@ -126,7 +130,7 @@ def _correlation_bars(
         "name": correlation.title.partition("<br>")[0],
         "x": to_json_numbers(lags),
         "y": to_json_numbers(values),
-        **at,
+        **axis_names,
         "showlegend": False,
         "marker": {"color": [theme.VERMILLION if out else theme.BLUE for out in outside]},
         "hovertemplate": "lag %{x}: %{y:.3f}<extra></extra>",

@@ -38,13 +38,13 @@ def plot_trend(trend: TrendOut, columns: int = 2) -> Figure:
     }
     in_legend: set[str] = set()
     for number, quantity in enumerate(shown):
-        at = _add_axes(figure, number, quantity, trend.x, grid.place(number))
+        axis_names = _add_axes(figure, number, quantity, trend.x, grid.place(number))
         for trace in _quantity_traces(quantity):
             name = trace["legendgroup"]
             first = name not in in_legend and trace.get("showlegend", True)
             label = name if first else f"{quantity.name}: {name}"
             in_legend.update({name} if first else ())
-            figure["data"].append({**trace, "name": label, "showlegend": first, **at})
+            figure["data"].append({**trace, "name": label, "showlegend": first, **axis_names})
     return figure
 
 
@@ -57,7 +57,7 @@ def _add_axes(
     figure: Figure, number: int, quantity: QuantityOut, x: str, domain: Place
 ) -> AxisNames:
     small = {"size": 11}
-    at = add_axes(
+    axis_names = add_axes(
         figure,
         number,
         domain,
@@ -70,7 +70,7 @@ def _add_axes(
         {"nticks": 6, "title": {"text": append_unit(quantity.name, quantity.unit), "font": small}},
     )
     add_caption(figure, _law_caption(quantity), domain)
-    return at
+    return axis_names
 
 
 def _law_caption(quantity: QuantityOut) -> str:

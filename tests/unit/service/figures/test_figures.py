@@ -280,6 +280,6 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
 @pytest.mark.parametrize("draw", [plotly.plot_history, plotly.plot_waterfall])
 def test_a_robust_loss_is_not_called_the_rms(draw):
     robust = fitness_label({"loss": {"kind": "soft-l1", "scale": 0.1}})
-    shown = draw(run(fitness=robust))["layout"]["yaxis"]["title"]["text"]
+    shown = draw(run(fitness_label=robust))["layout"]["yaxis"]["title"]["text"]
     assert shown == "soft-l1 loss, as RMS [kPa]"
-    assert draw(run(fitness=fitness_label({})))["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
+    assert draw(run(fitness_label=fitness_label({})))["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
