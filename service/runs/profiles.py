@@ -102,7 +102,9 @@ def _profile_parameters(
             name=name,
             interval95=profile.interval,
             others=dict(zip(others, profile.others.T.tolist(), strict=True)),
-            **{key: getattr(profile, key).tolist() for key in ("values", "ratio", "rms")},
+            values=profile.values.tolist(),
+            ratio=profile.likelihood_ratio.tolist(),
+            rms=profile.rms.tolist(),
         )
 
 

@@ -116,7 +116,7 @@ def test_another_dispatcher_goes_on_making_runs_where_the_first_one_stopped(plac
     assert len(made) == AT_ONCE + 2  # one chunk more
     lose(place, first)
     second = claim(place, "second")
-    again = [one.run for one in source(place, second).runs()]
+    again = [one.run for one in source(place, second).iterate_runs()]
     # The first one had read one more, and then learns that it has lost the lease.
     assert [one.run for one in coming] == made[len(seen) :]
     assert again[: len(made)] == made
@@ -139,7 +139,7 @@ def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(plac
         with pytest.raises(MemoryError):
             list(runs.iterate_runs())
     assert len(place.runs(job)) == AT_ONCE
-    assert len(list(runs.runs())) == N_RUNS
+    assert len(list(runs.iterate_runs())) == N_RUNS
     assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
 
 

@@ -77,7 +77,7 @@ def test_storing_again_changes_nothing(store):
     store.put_stream([b"same"])
     (before,) = store.list_objects()
     store.put_stream([b"same"])
-    (after,) = store.objects()
+    (after,) = store.list_objects()
     assert after == before
 
 
@@ -111,7 +111,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
     blocks = list(store.get_stream(name))
     assert b"".join(blocks) == data
     assert max(map(len, blocks)) == 300
-    assert b"".join(store.stream(name, 10, 500)) == data[10:510]
+    assert b"".join(store.get_stream(name, 10, 500)) == data[10:510]
     assert b"".join(store.stream(name, 900, 500)) == data[900:]
 
 

@@ -68,7 +68,7 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
         ledger.save_checkpoints([(runs[2], 200, pack_state(state))])
     again = recorder(place, claim_again(place, first.lease))
     again.record_failure(runs[3], RunFailure("otherwise"))
-    again.keep()
+    again.write_all()
     assert (place.job(job).evaluations, place.job(job).generation) == (930, 40)
     again.progress(runs[2], state, 1.0)
     again.keep()

@@ -26,7 +26,7 @@ def later(act):
 
 def elapsed(waker, seconds):
     start = time.monotonic()
-    return waker.wait(seconds), time.monotonic() - start
+    return waker.wait_for_change(seconds), time.monotonic() - start
 
 
 def test_a_new_job_wakes_the_waiting(database):

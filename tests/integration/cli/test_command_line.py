@@ -192,7 +192,7 @@ def test_what_identify_cannot_do_in_this_process_is_refused(
 def test_a_file_that_is_not_utf8_is_said_without_an_empty_place(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_bytes(b"model: \xff")
-    assert refused(lagid("submit", job)).startswith(f"lagid: {job}: not UTF-8")
+    assert refused(lagid("submit", job)).startswith(f"lagid: {job}: the document is not UTF-8")
 
 
 def test_no_server_is_said_with_what_to_do() -> None:
@@ -271,7 +271,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     )
     assert done.returncode == 0, done.stderr
     assert "±" in done.stdout
-    assert "if it was held, use --set hold.u=zero" in " ".join(done.stderr.split())
+    assert "If the input was held, use --set hold.u=zero" in " ".join(done.stderr.split())
     found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
     truth = {"K": 2.0, "T": 1.0, "L": 0.5}
     for name, value in truth.items():
@@ -299,7 +299,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         ),
         (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
-            "--noise-model: ar1 is for free runs",
+            "--noise-model: ar1 needs prediction: simulation",
         ),
     ],
 )

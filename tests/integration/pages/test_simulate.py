@@ -322,7 +322,7 @@ def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
         ("tuning=magic&duration=5&sample_time=0.1", "tuning: found &#39;magic&#39;; need one of"),
         (
             "tuning=amigo+PI&closed_loop_time_constant=1&duration=5&sample_time=0.1",
-            "closed-loop time constant: rule &#39;amigo&#39; has none",
+            "closed-loop time constant: rule &#39;amigo&#39; has no such setting",
         ),
         ("gain=abc&duration=5&sample_time=0.1", "gain: found &#39;abc&#39;; need a number"),
         ("gain=nan&duration=5&sample_time=0.1", "gain: found &#39;nan&#39;; need a number"),

@@ -68,7 +68,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 @pytest.fixture(autouse=True)
 def connected(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("jobs", "runs", "datasets"):
-        monkeypatch.setattr(f"service.cli.{module}.connected", lambda *_: Again(served.client))
+        monkeypatch.setattr(f"service.cli.{module}.connect_client", lambda *_: Again(served.client))
 
 
 class Again:

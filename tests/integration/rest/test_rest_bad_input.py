@@ -79,11 +79,11 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
     ({"validation": {"fraction": 0.999}}, "/validation/fraction", "would be empty"),
     ({"parameters": {"L": {"fixed": 40}}}, "/parameters/L/fixed", "40 lies outside the bounds"),
-    ({"parameters": {"K": {"tied": "2*K"}}}, "/parameters/K/tied", "circle, K → K"),
+    ({"parameters": {"K": {"tied": "2*K"}}}, "/parameters/K/tied", "circular, K → K"),
     (
         {"parameters": {"K": {"tied": "T"}, "T": {"tied": "K"}}},
         "/parameters/K/tied",
-        "circle, K → T → K",
+        "circular, K → T → K",
     ),
     ({"parameters": {"K": {"tied": "2*Q"}}}, "/parameters/K/tied", "'Q' is not declared"),
     ({"parameters": {"K": {"tied": "2*"}}}, "/parameters/K/tied", "column 3"),
@@ -365,7 +365,7 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
     body = {"model": model, "datasets": [dataset], "algorithm": {"population": 100_000}}
     fault = refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/algorithm/population"
-    assert "at most 99009" in fault["detail"]
+    assert "At most 99009" in fault["detail"]
 
 
 @pytest.mark.parametrize(
@@ -403,7 +403,7 @@ def test_an_output_that_is_its_own_input_is_refused(own: TestClient) -> None:
     body = {"model": "fopdt", "datasets": [answer.json()["id"]], "channels": {"u": "P2", "y": "P2"}}
     [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == "/channels/u"
-    assert "to input 'u' and to output 'y'" in fault["detail"]
+    assert "both input 'u' and output 'y'" in fault["detail"]
 
 
 def test_validation_data_in_other_units_or_with_other_channels_are_refused(own: TestClient) -> None:

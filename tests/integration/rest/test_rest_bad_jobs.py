@@ -67,7 +67,7 @@ def test_a_delay_in_another_unit_is_refused_to_a_job_and_to_the_store(
     client, _ = parts
     delay = {"lower": 0, "upper": 2, "unit": "min"}
     model = {**FIRST, "parameters": {**FIRST["parameters"], "L": delay}}
-    said = "found 'min', but this lag counts seconds: give it in s, or write t - 60*L"
+    said = "found 'min', but this delay is in seconds: give it in s, or write t - 60*L"
     job = refused(client.post("/v1/jobs", json={"model": model, "datasets": ["r"]}), 422, "invalid")
     assert ("/model/parameters/L/unit", said) in [(one["pointer"], one["detail"]) for one in job]
     [fault] = refused(client.post("/v1/models", json=model), 422, "invalid")
@@ -118,7 +118,7 @@ def test_fewer_scored_samples_than_parameters_are_refused(
     ("options", "words"),
     [
         (["--set", "parameters.L.fixed=9"], "9 lies outside the bounds [0, 5] of 'L'"),
-        (["--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"], "circle, K → T → K"),
+        (["--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"], "circular, K → T → K"),
         (["--set", "weights.z=1"], "no output 'z'"),
     ],
 )

@@ -187,8 +187,8 @@ def test_a_part_tells_and_keeps_what_was_recorded_before_it(
         "y",
         "y, before the record",
     ]
-    assert "Before them" in server.get(f"/datasets/{part['id']}").text
-    assert "Before them" not in server.get(f"/datasets/{dataset}").text
+    assert "Earlier samples" in server.get(f"/datasets/{part['id']}").text
+    assert "Earlier samples" not in server.get(f"/datasets/{dataset}").text
 
 
 def test_an_input_from_a_part_is_what_was_recorded_before_it(

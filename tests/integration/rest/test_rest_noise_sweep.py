@@ -135,7 +135,7 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
     monkeypatch.setattr("service.sweeps.output_spread.load_recording", None)
     (fault,) = refused(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"
-    assert "600 values in all" in fault["detail"]
+    assert "the datasets have 600 values; at most 599" in fault["detail"]
 
 
 def test_recordings_are_read_while_no_session_is_open(
@@ -319,7 +319,7 @@ def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> Non
         ({"truth": {**TRUTH, "parameters": {"K": 1}}}, "/truth/parameters/T", "true value"),
         ({"truth": {**TRUTH, "inputs": {}}}, "/truth/inputs/u", "give input 'u'"),
         ({"truth": {**TRUTH, "samples": 1}}, "/truth/samples", "2"),
-        ({"truth": {**TRUTH, "sample_time": 0.001}}, "/truth", "lag"),
+        ({"truth": {**TRUTH, "sample_time": 0.001}}, "/truth", "delay"),
         ({"truth": None, "datasets": ["nowhere"]}, "/datasets/0", "nowhere"),
         ({"algorithm": {"method": "simple"}}, "/algorithm/method", "'methods'"),
         ({"parameters": {"Q": {"upper": 1}}}, "/parameters/Q", "Q"),

@@ -116,7 +116,7 @@ def test_a_profile_that_cannot_be_had_is_refused(
     fault = refused(served.server.post(url, json={"points": 2}), 422, "invalid")[0]
     assert fault["pointer"] == "/points"
     refused(served.server.post("/v1/runs/run_0:profile", json={}), 404, "not-found")
-    monkeypatch.setattr(service.runs.profiles, "SECONDS", -1.0)
+    monkeypatch.setattr(service.runs.profiles, "LIMIT_SECONDS", -1.0)
     fault = refused(served.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
     assert "were stopped at 'L'" in fault["detail"]
     monkeypatch.setattr(service.runs.profiles, "MOST_WORK", 10)

@@ -269,7 +269,7 @@ def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
     [
         ({"batch": []}, "/batch", "at least 1"),
         ({"reference": "nobody"}, "/reference", "there is no reference 'nobody'"),
-        ({"warm_start": "reference"}, "/warm_start", "needs one"),
+        ({"warm_start": "reference"}, "/warm_start", "needs the field 'reference'"),
         ({"look_at": ["Q"]}, "/look_at/0", "no parameter 'Q'"),
         ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets/0", "ds_none"),
         ({"label": 'a"b'}, "/label", "quotation marks"),
@@ -290,7 +290,7 @@ def test_a_fault_is_told_at_its_place_in_the_recipe(
 @pytest.mark.parametrize(
     ("labels", "pointer", "said"),
     [
-        (None, "/trend/x", "no axis has labels"),
+        (None, "/trend/x", "No axis has labels"),
         ([{"width": 1}, {"width": 2}], "/trend/x", "no run has a label 'length_m'"),
         ([{"length_m": 1}, {}], "/sweep/axes/0/labels/1", "it is missing"),
         ([{"length_m": 1}, {"length_m": "two"}], "/sweep/axes/0/labels/1", "found 'two'"),
@@ -362,7 +362,7 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
         return opened.job(job)
 
     for module in (reidentifying, reidentify):
-        monkeypatch.setattr(f"{module.__name__}.connected", connected)
+        monkeypatch.setattr(f"{module.__name__}.connect_client", connected)
     monkeypatch.setattr(f"{reidentifying.__name__}.follow", follow)
     return CliRunner()
 

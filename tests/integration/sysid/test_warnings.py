@@ -74,7 +74,7 @@ def test_a_true_model_with_white_noise_has_no_warning() -> None:
 def test_a_model_of_too_low_an_order_is_told_that_its_lag_depends_on_it() -> None:
     y = response(parse_model(SECOND), steps(), L=0.1)
     found = identify(parse_model(FIRST), record(steps(), y), QUICK)
-    assert told(found, "the estimate of L depends on the order of the model")
+    assert told(found, "The estimate of L depends on the order of the model")
     assert told(found, "standard errors allow for the colour of the residuals")
 
 

@@ -276,7 +276,7 @@ def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
     crew = ScriptedExecutor(fails)
     feeder = Scheduler(crew)
     notebook = jobs(feeder, a=1)["a"]
-    crew.submit([AdvanceRun("stray", spec(), None, 1.0)], (), ())
+    crew.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), ())
     assert finish(feeder) == ["a"]
     assert (crew.packs, list(notebook.failures)) == ({}, ["a0"])
     assert "a pack of no job came back" in caplog.messages

@@ -32,7 +32,7 @@ def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.Monke
             raise OverflowError("too large")
         return sound(problem, algorithm, seed, warm)
 
-    monkeypatch.setattr(workers.tasks, "begin", begin)
+    monkeypatch.setattr(workers.tasks, "begin_run", begin)
     monkeypatch.setattr(workers.tasks, "PACK_LIMIT_SECONDS", 1000.0)
     pack = [AdvanceRun(f"r{seed}", spec(seed, generations=5), None, 100.0) for seed in (1, 13, 2)]
     first, faulty, last = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])

@@ -292,7 +292,7 @@ def test_what_a_rule_cannot_take_is_told() -> None:
         tune_controller(FOPDT, "u", "y", closed_loop_time_constant=-1.0)
     with pytest.raises(InvalidSettings, match="leave it out"):
         tune_controller(FOPDT, "u", "y", rule="amigo", closed_loop_time_constant=1.0)
-    with pytest.raises(InvalidSettings, match="take rule 'simc'"):
+    with pytest.raises(InvalidSettings, match="use rule 'simc'"):
         tune_controller(chain(1.0), "u", "y", rule="amigo")
     with pytest.raises(InvalidSettings, match=r"^/tuning: 'u' has no effect on 'y'"):
         tune_controller(FOPDT, "u", "y", transport=Transport(gain=0.0))

@@ -44,7 +44,7 @@ def test_migration_keeps_sizes_and_worsens_nobody(name: TopologyName, migrants: 
     before = islands()
     after, _ = migrate(before, (24,) * 4, Migration(topology=name, migrants=migrants), 0)
     for old, new in zip(before, after, strict=True):
-        assert new.chromosomes.shape == old.words.shape
+        assert new.chromosomes.shape == old.chromosomes.shape
         assert np.all(new.fitness <= old.fitness)
         assert np.all(np.diff(new.fitness) >= 0)
         there = any(np.array_equal(old.words[0], word) for word in new.chromosomes)

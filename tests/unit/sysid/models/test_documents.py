@@ -189,7 +189,7 @@ def test_a_fault_of_a_difference_document_is_told_where_it_is(
     ("entry", "pointer", "part"),
     [
         ({"tied": "2*q"}, "/parameters/L/tied", "'q' is not declared"),
-        ({"tied": "L + 1"}, "/parameters/L/tied", "circle"),
+        ({"tied": "L + 1"}, "/parameters/L/tied", "circular"),
         ({"tied": 3}, "/parameters/L/tied", "3 is not a text"),
         ({"tied": "c", "fixed": 0.5}, "/parameters/L/tied", "either fixed or tied"),
     ],

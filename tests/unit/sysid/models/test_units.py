@@ -38,7 +38,7 @@ def model(equation: str, unit: str, **fields: Any) -> Model:
 def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: str) -> None:
     [note] = list_time_unit_warnings(model(equation, "min"))
     assert note.startswith("T has the unit min, but the equations read it unconverted")
-    assert note.endswith("give it in s, or write 60*T")
+    assert note.endswith("give it in s, or write 60*T.")
     assert list_time_unit_warnings(model(equation, "s")) == []
     assert list_time_unit_warnings(model(equation, "V")) == []
 
