@@ -59,7 +59,7 @@ def test_bytes_come_back_under_their_hash(store, data):
     stored = store.put_stream([data])
     assert (stored.sha256, stored.size) == (sha256(data), len(data))
     assert store.get_bytes(stored.sha256) == data
-    assert store.size(stored.sha256) == len(data)
+    assert store.get_size(stored.sha256) == len(data)
     assert store.exists(stored.sha256)
 
 
@@ -112,7 +112,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
     assert b"".join(blocks) == data
     assert max(map(len, blocks)) == 300
     assert b"".join(store.get_stream(name, 10, 500)) == data[10:510]
-    assert b"".join(store.stream(name, 900, 500)) == data[900:]
+    assert b"".join(store.get_stream(name, 900, 500)) == data[900:]
 
 
 @pytest.mark.parametrize("name", [ABSENT, "", "../../etc/passwd", "A" * 64, "0" * 63])
@@ -124,7 +124,7 @@ def test_what_is_not_there_is_missing(store, name):
         with pytest.raises(ObjectMissing):
             read(name)
     with pytest.raises(ObjectMissing):
-        next(store.stream(name))
+        next(store.get_stream(name))
 
 
 def test_a_deleted_object_is_gone_and_others_stay(store):

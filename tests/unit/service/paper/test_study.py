@@ -171,7 +171,7 @@ def test_the_noise_enters_the_recursion_as_a_force_or_as_printed() -> None:
 
 
 def test_a_recursion_without_that_place_for_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match="no 'q"):
+    with pytest.raises(ValueError, match="must contain 'q"):
         force_noise.model_document(
             {**copy_catalogue_document("duffing-eq16"), "equations": {"x": "x(k-1)"}}, "force"
         )

@@ -74,7 +74,7 @@ def test_few_samples_do_not_make_a_linear_regression_rough(n: int, d: int) -> No
         n_scored = n
         evaluator = SimpleNamespace(lower=np.full(d, -1e9), upper=np.full(d, 1e9))
 
-        def fitness(self, theta: np.ndarray) -> np.ndarray:
+        def evaluate_fitness(self, theta: np.ndarray) -> np.ndarray:
             return np.asarray(np.sqrt(np.mean((theta @ columns.T - measured) ** 2, axis=1)))
 
     for seed in range(20):

@@ -47,7 +47,7 @@ def test_migration_keeps_sizes_and_worsens_nobody(name: TopologyName, migrants: 
         assert new.chromosomes.shape == old.chromosomes.shape
         assert np.all(new.fitness <= old.fitness)
         assert np.all(np.diff(new.fitness) >= 0)
-        there = any(np.array_equal(old.words[0], word) for word in new.chromosomes)
+        there = any(np.array_equal(old.chromosomes[0], word) for word in new.chromosomes)
         assert there or new.fitness[-1] <= old.fitness[0]  # all of it are better ones
 
 
