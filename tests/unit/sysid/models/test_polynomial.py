@@ -142,7 +142,7 @@ def _depth(tree: object) -> int:
             "/terms/candidates",
             "list is empty",
         ),
-        ({"terms": "some"}, "/terms", "is not 'all' or a list"),
+        ({"terms": "some"}, "/terms", "is not 'all', a list"),
         ({"terms": []}, "/terms", "the list is empty"),
         ({"terms": ["y(k-1)", "y(k-1)"]}, "/terms/1", "listed twice"),
         ({"terms": ["u(k-1)*y(k-1)", "y(k-1)*u(k-1)"]}, "/terms/1", "listed twice"),
