@@ -52,8 +52,8 @@ class Bench:
 def kill_worker(bench: Bench) -> float:
     """Kill a process that computes."""
     family = bench.stand.family
-    busy = family.named("ray::advance") or family.named("ray::IDLE")
-    before = len(family.named("ray::advance") + family.named("ray::IDLE"))
+    busy = family.named("ray::process_pack") or family.named("ray::IDLE")
+    before = len(family.named("ray::process_pack") + family.named("ray::IDLE"))
     return recovery(bench, lambda: kill(busy[:1]), lambda: len(_workers(bench)) >= before)
 
 
@@ -193,7 +193,7 @@ def goes_on(bench: Bench, begun: float) -> float:
 
 def _workers(bench: Bench) -> list[int]:
     family = bench.stand.family
-    return family.named("ray::advance") + family.named("ray::IDLE")
+    return family.named("ray::process_pack") + family.named("ray::IDLE")
 
 
 def kill(pids: list[int]) -> None:

@@ -32,7 +32,7 @@ class BodyLimit:
         announced = Headers(scope=scope).get("content-length", "")
         size = 0
 
-        async def watched() -> Message:
+        async def receive_counted() -> Message:
             nonlocal size
             if announced.isdecimal():
                 self._check_size(int(announced), "")
@@ -41,7 +41,7 @@ class BodyLimit:
             self._check_size(size, " or more")
             return message
 
-        return watched
+        return receive_counted
 
     def _check_size(self, size: int, suffix: str) -> None:
         if size > self._limit:

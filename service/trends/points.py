@@ -19,7 +19,7 @@ DATA_FIELDS = ("/datasets", "/noise", "/channels", "/hold", "/skip", "/validatio
 
 
 @dataclass(frozen=True, slots=True)
-class TrendPoint:
+class BatchPoint:
     """Estimate of one quantity at one label, pooled over its runs; None without standard errors."""
 
     x: float
@@ -40,7 +40,7 @@ class TrendQuantity:
     name: str
     unit: str
     kind: QuantityKind
-    points: tuple[TrendPoint, ...]
+    points: tuple[BatchPoint, ...]
     between_runs: float | None
     bounds: tuple[float, float] = (-inf, inf)
 
@@ -187,11 +187,11 @@ def _to_estimate(entry: _RunEstimate) -> TrendEstimate | None:
 
 def _build_point(
     x: float, entries: Sequence[_RunEstimate], estimate: TrendEstimate | None
-) -> TrendPoint:
+) -> BatchPoint:
     states = list(dict.fromkeys(entry.status for entry in entries))
     values = [entry.value for entry in entries if entry.value is not None]
     value = sum(values) / len(values) if values else None
-    return TrendPoint(
+    return BatchPoint(
         x,
         tuple(entry.run for entry in entries),
         ", ".join(states),

@@ -15,7 +15,7 @@ from service.storage.tables import Job
 from service.trends.drift import BatchReference, compare_with_reference
 from service.trends.notes import describe_noise_models, describe_quantity
 from service.trends.points import (
-    TrendPoint,
+    BatchPoint,
     TrendQuantity,
     build_quantities,
     group_by_label,
@@ -178,7 +178,7 @@ def _to_quantity_out(
 
 
 def _to_point_out(
-    point: TrendPoint, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
+    point: BatchPoint, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
 ) -> PointOut:
     judged = {} if influence is None else influence._asdict()
     return PointOut.from_source(

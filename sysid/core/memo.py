@@ -20,7 +20,7 @@ def cache_by_identity(
     entries: dict[tuple[object, ...], tuple[_Subject, _Value]] = {}
 
     @wraps(function)
-    def cached(subject: _Subject, /, *others: _Others.args, **named: _Others.kwargs) -> _Value:
+    def look_up(subject: _Subject, /, *others: _Others.args, **named: _Others.kwargs) -> _Value:
         key = (id(subject), *others, *sorted(named.items()))
         entry = entries.get(key)
         if entry is None:
@@ -30,4 +30,4 @@ def cache_by_identity(
             entries[key] = entry
         return entry[1]
 
-    return cached
+    return look_up

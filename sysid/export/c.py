@@ -17,7 +17,7 @@ from sysid.export.program import (
     GeneratedProgram,
     LoopScope,
     equation,
-    indented,
+    indent_lines,
     needed_helpers,
     time_loop,
     write_delay_steps,
@@ -141,7 +141,7 @@ def write_c_source(identified: IdentifiedModel) -> str:
         _write_simulate_comment(program),
         _write_signature(program, stem),
         "{",
-        *indented(body),
+        *indent_lines(body),
         "}",
     ]
     return "\n".join(parts) + "\n"
@@ -307,14 +307,14 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         lines.append(f"        const double {now} = {moved};")
     lines += [f"        (void){program.present_names[state.name]};" for state in states]
     for i in range(len(states)):
-        lines += indented(
+        lines += indent_lines(
             _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2
         )
     lines.append("    }")
     for i, state in enumerate(states):
         every = program.array_names[state.name]
         mean = f"slope[0][{i}] + 2.0*slope[1][{i}] + 2.0*slope[2][{i}] + slope[3][{i}]"
-        lines += indented(
+        lines += indent_lines(
             _wrap_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})")
         )
     return [*lines, "}"]
@@ -332,7 +332,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
     ]
     for output in model.outputs:
         text = write_expression(output.expression, program.language, LoopScope(program, "output"))
-        lines += indented(_wrap_statement(f"{program.output_names[output.name]}[i] = ", text))
+        lines += indent_lines(_wrap_statement(f"{program.output_names[output.name]}[i] = ", text))
     return [*lines, "}"]
 
 
@@ -354,7 +354,7 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
             "    for (long i = 0; i <= points; ++i) {",
             f"        const long step = i*{program.substeps};",
             "        (void)step;",
-            *indented(_wrap_statement("grid[i] = ", text), 2),
+            *indent_lines(_wrap_statement("grid[i] = ", text), 2),
             "    }",
             "    for (long i = 0; i < n; ++i)",
             f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{grid_step});",

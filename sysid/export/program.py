@@ -331,7 +331,7 @@ def _write_recursion(program: GeneratedProgram) -> list[str]:
         body += language.assign(now, equation(program, "recursion", i), is_new=True)
         body += language.assign(f"{program.array_names[name]}[k]", now)
     head = language.open_loop("k", program.n_start_samples, to_last=True)
-    return [head, *indented(body), *language.close_loop()]
+    return [head, *indent_lines(body), *language.close_loop()]
 
 
 def _write_euler(program: GeneratedProgram) -> list[str]:
@@ -345,7 +345,7 @@ def _write_euler(program: GeneratedProgram) -> list[str]:
         target = f"{program.array_names[state.name]}[step + 1]"
         body += language.assign(target, program.next_names[state.name])
     head = language.open_loop("step", 0, to_last=False)
-    return [head, *indented(body), *language.close_loop()]
+    return [head, *indent_lines(body), *language.close_loop()]
 
 
 def equation(program: GeneratedProgram, kind: EvaluationStage, index: int, floor: int = 0) -> str:
@@ -354,7 +354,7 @@ def equation(program: GeneratedProgram, kind: EvaluationStage, index: int, floor
     return write_expression(tree, program.language, LoopScope(program, kind, index), floor)
 
 
-def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
+def indent_lines(lines: Sequence[str], levels: int = 1) -> list[str]:
     """Indent lines (or several joined)."""
     return [textwrap.indent(line, "    " * levels) for line in lines]
 

@@ -16,7 +16,7 @@ from sysid.export.program import (
     GeneratedProgram,
     LoopScope,
     equation,
-    indented,
+    indent_lines,
     needed_helpers,
     time_loop,
     write_delay_steps,
@@ -118,7 +118,7 @@ def write_python_source(identified: IdentifiedModel) -> str:
     ]
     helpers = needed_helpers(HELPERS, program.helper_names, identified)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
-    body += indented(loop)
+    body += indent_lines(loop)
     parts = [
         _write_docstring(identified),
         "import numpy as np\n",
@@ -255,7 +255,7 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
     states = [program.present_names[state.name] for state in model.states]
     slopes: list[str] = []
     for i in range(len(model.states)):
-        slopes += indented(_wrap_statement("", equation(program, "slope", i), ","), 2)
+        slopes += indent_lines(_wrap_statement("", equation(program, "slope", i), ","), 2)
     every = [program.array_names[state.name] for state in model.states]
     now = ", ".join(f"{name}[step]" for name in every)
     following = [f"{name}[step + 1]" for name in every]
@@ -272,7 +272,7 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
         "    slope_3 = rates(step, 0.5, *(now + dt/2*slope_2))",
         "    slope_4 = rates(step, 1.0, *(now + dt*slope_3))",
-        *indented(
+        *indent_lines(
             _wrap_statement(
                 f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
             )
@@ -290,7 +290,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
         target = program.output_names[output.name]
         lines += [
             f"{target} = np.array([",
-            *indented(_wrap_statement("", text)),
+            *indent_lines(_wrap_statement("", text)),
             f"    {loop}",
             "], dtype=np.float64)",
         ]

@@ -92,19 +92,19 @@ def _call_kernel(
         def extent(position: int, axis: int) -> Any:
             return builder.extract_value(arrays[position].shape, axis)
 
-        def shifted(position: int, index: Any) -> Any:
+        def load_shifted(position: int, index: Any) -> Any:
             return builder.gep(arrays[position].data, [index])
 
         stride, rows, columns = extent(1, 1), extent(7, 0), extent(7, 1)
         none = builder.icmp_signed("==", rows, rows.type(0))
-        first = shifted(7, builder.mul(values[8], columns))
+        first = load_shifted(7, builder.mul(values[8], columns))
         target = builder.select(none, first.type(None), first)
         arguments = [
             stride,
             arrays[1].data,
             stride,
-            shifted(2, values[3]),
-            shifted(4, values[5]),
+            load_shifted(2, values[3]),
+            load_shifted(4, values[5]),
             arrays[6].data,
             target,
             columns,

@@ -42,7 +42,7 @@ class ForwardSelection(NamedTuple):
     unexplained_shares: tuple[float, ...] = ()
 
     @property
-    def unexplained(self) -> float:
+    def unexplained_share(self) -> float:
         """Share of the output's squares that all terms leave unexplained."""
         return self.unexplained_shares[-1] if self.unexplained_shares else 1.0
 
@@ -76,7 +76,7 @@ def select_forward(
     while (
         len(selection.order) < keep
         and whole > 0
-        and not (selection.unexplained_shares and selection.unexplained < stop)
+        and not (selection.unexplained_shares and selection.unexplained_share < stop)
     ):
         chosen = _find_best_term(remaining, target, free, squares)
         if chosen is None:

@@ -94,11 +94,11 @@ def _select_one_step(
         effort = plan_effort(values, len(model.terms))
         thinned = regression.thin_rows(effort.rows)
 
-        def unexplained(tried: Mapping[str, float]) -> float:
+        def measure_unexplained(tried: Mapping[str, float]) -> float:
             triangle, _ = thinned.factor_terms(model.terms, tried)
-            return select_forward(triangle, rule.keep, rule.err).unexplained
+            return select_forward(triangle, rule.keep, rule.err).unexplained_share
 
-        lags = search_lags(values, unexplained, effort.trials)[0].lags
+        lags = search_lags(values, measure_unexplained, effort.trials)[0].lags
     triangle, samples = regression.factor_terms(model.terms, lags)
     check_candidate_count(len(model.terms), samples)
     selection = select_terms(triangle, rule, samples)

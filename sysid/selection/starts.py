@@ -148,13 +148,13 @@ class _StartFinder:
         effort = plan_effort(self._axes, len(self._terms))
         thinned = self._regression.thin_rows(effort.rows)
 
-        def unexplained(lags: Mapping[str, float]) -> float:
+        def measure_unexplained(lags: Mapping[str, float]) -> float:
             triangle, _ = thinned.factor_terms(self._terms, lags)
             remainder = triangle[:, -1] - triangle[:, :-1] @ self._solve_coefficients(triangle)
             return float(remainder @ remainder)
 
         taken = [combination for combination in first if combination.keys() == self._axes.keys()]
-        for trial in search_lags(self._axes, unexplained, effort.trials):
+        for trial in search_lags(self._axes, measure_unexplained, effort.trials):
             if not any(self._are_neighbours(trial.lags, other) for other in taken):
                 taken.append(trial.lags)
             if len(taken) == _LAG_COMBINATIONS:

@@ -130,7 +130,7 @@ def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) 
         LeaseQueue(session).release_job(again.lease, lost=True)
     job = job_of(database, got.job.id)
     assert job.state is JobState.FAILED
-    assert "lost its workers" in (job.error or "")
+    assert "gave up after 2 attempts without progress" in (job.error or "")
 
 
 def test_deaths_over_a_run_outlive_the_dispatcher_that_counted_them(database) -> None:

@@ -70,10 +70,10 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
     again.record_failure(runs[3], RunFailure("otherwise"))
     again.write_all()
     assert (place.job(job).evaluations, place.job(job).generation) == (930, 40)
-    again.progress(runs[2], state, 1.0)
-    again.keep()
+    again.record_progress(runs[2], state, 1.0)
+    again.write_all()
     assert place.job(job).evaluations == 730 + state.evaluations
-    again.failure(runs[2], RunFailure("as told"))
+    again.record_failure(runs[2], RunFailure("as told"))
     again.finish()
     assert place.job(job).error == "3 of 4 runs failed: as told; otherwise"
     assert place.job(job).evaluations == 730 + state.evaluations

@@ -113,4 +113,4 @@ def test_lengths_of_an_axis_are_bounded(own: TestClient, axis: Any, pointer: str
         "sweep": {"axes": [{"path": "/seed", "values": [1], **axis}]},
     }
     faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
-    assert [one["pointer"] for one in faults] == [pointer]  # a fault of type: no other is looked for
+    assert [one["pointer"] for one in faults] == [pointer]  # of type: no other is sought

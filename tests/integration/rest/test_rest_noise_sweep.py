@@ -203,7 +203,7 @@ def test_without_truth_errors_are_from_the_best_run_without_noise(own: TestClien
     best = min(silent, key=lambda run: run["rms"])
     assert (reference["kind"], reference["run"]) == ("estimate", best["id"])
     assert reference["parameters"] == {one["name"]: one["value"] for one in best["parameters"]}
-    assert any("not known" in note for note in found["notes"])
+    assert any("true values are unknown" in note for note in found["notes"])
     assert all(one["floor"] > 0 for one in found["groups"][-1]["parameters"])
 
 

@@ -114,7 +114,7 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     plain = carry_out(InlineExecutor(), {"r": one})
     flying: set[Any] = set()
     most = 0
-    submit, fetch = ray_crew.submit, ray_crew.fetch
+    submit, fetch = ray_crew.submit_pack, ray_crew.fetch_results
 
     def counted(pack, keys, shared) -> Any:
         nonlocal most
@@ -128,8 +128,8 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
         flying.discard(handle)
         return fetch(handle)
 
-    monkeypatch.setattr(ray_crew, "submit", counted)
-    monkeypatch.setattr(ray_crew, "fetch", fetched)
+    monkeypatch.setattr(ray_crew, "submit_pack", counted)
+    monkeypatch.setattr(ray_crew, "fetch_results", fetched)
     spread = carry_out(ray_crew, {"r": one})
     assert most == ray_crew.slots
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])

@@ -86,7 +86,7 @@ def workers_of(pid: int) -> list[int]:
             session = os.getsid(int(entry.name))
         except (OSError, ProcessLookupError):
             continue
-        if command.startswith(b"ray::advance") and session == os.getsid(pid):
+        if command.startswith(b"ray::process_pack") and session == os.getsid(pid):
             found.append(int(entry.name))
     return found
 

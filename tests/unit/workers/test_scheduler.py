@@ -247,7 +247,7 @@ def test_a_pack_that_outlives_the_grace_period_is_killed() -> None:
 
 def test_a_run_without_records_fails_with_the_reason() -> None:
     class Empty(ListedRuns):
-        def records(self, key: str) -> Records:
+        def load_records(self, key: str) -> Records:
             raise RecordsUnavailable("there is no dataset ds_1")
 
     feeder, notebook = Scheduler(ScriptedExecutor(fails)), Notebook()

@@ -71,7 +71,7 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
     (done,) = workers.tasks.process_pack([item], ["short"], RECORDS["short"])
     assert isinstance(done.outcome, RunFailure)
     assert "the model diverged for every one of" in done.outcome.reason
-    assert "narrow the bounds" in done.outcome.reason
+    assert "Narrow the bounds" in done.outcome.reason
 
 
 def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:

@@ -143,7 +143,7 @@ def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outp
 def test_a_row_without_noise_is_explained_where_errors_are_told_against_it(reference, is_told):
     problem = {"cell": {}, "reference": reference, "note": ""}
     notes = list(StoredBounds({"problems": [problem]}).list_notes())
-    assert is_told == any("as it was measured" in one for one in notes)
+    assert is_told == any("without added noise" in one for one in notes)
 
 
 def test_what_is_not_known_is_a_dash():

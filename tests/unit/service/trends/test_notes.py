@@ -5,7 +5,7 @@ from math import inf
 import pytest
 
 from service.trends.notes import describe_quantity
-from service.trends.points import TrendPoint, TrendQuantity
+from service.trends.points import BatchPoint, TrendQuantity
 from sysid.trends.trend import TrendEstimate, fit_trend
 
 BOUNDS = (0.0, 1.0)
@@ -16,7 +16,7 @@ def noted(
 ) -> str:
     errors = [0.001] * len(x)
     points = tuple(
-        TrendPoint(at, ("run_1",), "identified", TrendEstimate(value, 0.001), value)
+        BatchPoint(at, ("run_1",), "identified", TrendEstimate(value, 0.001), value)
         for at, value in zip(x, y, strict=True)
     )
     one = TrendQuantity("L", "s", "parameter", points, None, bounds)

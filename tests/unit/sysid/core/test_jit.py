@@ -100,7 +100,7 @@ def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
 
 def what_is_compiled(value: ast.expr) -> ast.expr:
     """A function, where it is compiled by a call; else the value itself."""
-    if isinstance(value, ast.Call) and names_in(value.func) == {"compiled"}:
+    if isinstance(value, ast.Call) and names_in(value.func) == {"jit_compile"}:
         return value.args[0]
     return value
 
