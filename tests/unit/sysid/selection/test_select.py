@@ -315,7 +315,7 @@ def test_a_problem_needs_terms_that_are_selected() -> None:
 def test_an_output_that_is_zero_everywhere_selects_nothing_and_says_so() -> None:
     record = record_of(TRUTH)
     flat = replace(record, outputs=(Channel("y", record.outputs[0].times, np.zeros(400)),))
-    with pytest.raises(InvalidSettings, match="nothing to explain"):
+    with pytest.raises(InvalidSettings, match="zero at all scored samples"):
         select_model_terms(parse_model(document(frols(3))), [flat])
 
 
