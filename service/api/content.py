@@ -17,7 +17,7 @@ from starlette.datastructures import UploadFile
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from service.core.errors import (
     InvalidRequest,
     StaleVersion,
@@ -164,7 +164,7 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
         check_upload_size(int(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
-    with TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
+    with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
         path = Path(folder) / "upload"
         if kind == MULTIPART:
             yield await _receive_form(request, path, settings)

@@ -10,9 +10,8 @@ from fastapi.responses import StreamingResponse
 from service.api.content import CROSS_ORIGIN, content_response, preflight_response, receive_upload
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
 from service.core.wire import Page
-from service.datasets import datasets
+from service.datasets import datasets, simulated
 from service.datasets import datasets as lineage
-from service.datasets import simulated as simulations
 from service.datasets.recordings import load_recording
 from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
 from service.formats.csv_recordings import generate_csv
@@ -75,7 +74,7 @@ async def add_dataset(
 def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Simulate a dataset from a model, its true parameters, inputs and noise."""
     return _dataset_response(
-        simulations.simulate_dataset(parts.database, parts.store, body), response, body.name
+        simulated.simulate_dataset(parts.database, parts.store, body), response, body.name
     )
 
 

@@ -9,16 +9,15 @@ from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, Write
 from service.core.states import JobState
 from service.core.wire import Page
 from service.datasets.rms_unit import find_rms_unit
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import JobIn, JobOut
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunOrder
-from service.runs import runs
-from service.runs import table as runs_table
+from service.runs import runs, table
 from service.runs.schemas import RunOut
-from service.sweeps import summary as summaries
+from service.sweeps import summary
 from service.sweeps.schemas import SummaryOut
-from service.trends import trend as trends
+from service.trends import trend
 from service.trends.schemas import TrendOut
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -47,7 +46,7 @@ def submit_job(
     A sweep of more than 2,000 runs creates the further runs while it runs. Until then they count
     as queued, and have no page and no identifier.
     """
-    job = jobs.submit_job(parts.database, body, parts.settings, idempotency_key)
+    job = submit.submit_job(parts.database, body, parts.settings, idempotency_key)
     return _set_location(job, response)
 
 
@@ -56,41 +55,41 @@ def list_jobs(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: StatesFilter = None
 ) -> Page[JobOut]:
     """List jobs, latest first."""
-    return jobs.list_jobs(session, cursor, limit, state or [])
+    return submit.list_jobs(session, cursor, limit, state or [])
 
 
 @router.get("/{job_id}")
 def read_job(job_id: str, session: ReadSession) -> JobOut:
     """Read one job: state, progress, and the exact request."""
     job = JobRepository(session).get(job_id)
-    return jobs.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
+    return submit.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
 
 
 @router.post("/{job_id}:cancel")
 def cancel_job(job_id: str, session: WriteSession) -> JobOut:
     """Cancel a job: immediately if it is queued, within moments if it runs."""
-    return jobs.to_job_out(JobRepository(session).cancel(job_id))
+    return submit.to_job_out(JobRepository(session).cancel(job_id))
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
 def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
     """Queue a failed or cancelled job again; it continues from its last checkpoints."""
     return _set_location(
-        jobs.to_job_out(jobs.resume_job(session, job_id, parts.settings)), response
+        submit.to_job_out(submit.resume_job(session, job_id, parts.settings)), response
     )
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
 def clone_job(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     """Queue the same request as a new job."""
-    return _set_location(jobs.clone_job(parts.database, job_id, parts.settings), response)
+    return _set_location(submit.clone_job(parts.database, job_id, parts.settings), response)
 
 
 @router.get("/{job_id}/runs.csv", response_class=StreamingResponse)
 def export_runs_csv(job_id: str, parts: PartsDep) -> StreamingResponse:
     """Export all runs of a job as CSV: a row per run, with cell, estimates and standard errors."""
     disposition = {"Content-Disposition": f'attachment; filename="{job_id}.csv"'}
-    rows = runs_table.stream_table(parts.database, job_id)
+    rows = table.stream_table(parts.database, job_id)
     return StreamingResponse(rows, media_type="text/csv", headers=disposition)
 
 
@@ -123,13 +122,13 @@ def read_summary(
     ] = None,
 ) -> SummaryOut:
     """Summarise the runs for each value of the chosen axes: quantiles, success, evaluations."""
-    return summaries.summarise_job(session, job_id, by)
+    return summary.summarise_job(session, job_id, by)
 
 
 @router.get("/{job_id}/trend")
 def read_trend(job_id: str, session: ReadSession) -> TrendOut:
     """Fit the estimates over a label: law, band, predictions, outliers and drift."""
-    return trends.compute_trend(session, job_id)
+    return trend.compute_trend(session, job_id)
 
 
 def _set_location(job: JobOut, response: Response) -> JobOut:

@@ -6,16 +6,14 @@ from fastapi import APIRouter, Query, Request, Response
 
 from service.api.content import ByteRange, content_response
 from service.api.dependencies import MaxPoints, PartsDep, ReadSession
-from service.control import simulate as run_simulations
+from service.control import simulate
 from service.control.schemas import RunSimulateIn, RunSimulationOut
 from service.core.errors import NotFound
 from service.figures.plotly import apply_theme
 from service.figures.profiles import plot_profiles as profile_figure
 from service.figures.theme import Theme
 from service.repositories.runs import RunRepository
-from service.runs import comparison, exports, profiles, residuals, runs
-from service.runs import fitted as responses
-from service.runs import free_run as free_runs
+from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
 from service.runs.schemas import (
     CompareIn,
     ComparisonOut,
@@ -57,7 +55,7 @@ def read_response(
     run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> ResponseOut:
     """Read measured and simulated outputs, reduced so that extremes stay visible."""
-    return responses.build_response(session, parts.store, run_id, max_points)
+    return fitted.build_response(session, parts.store, run_id, max_points)
 
 
 @router.get("/{run_id}/residuals")
@@ -84,7 +82,7 @@ def simulate_run(
     run_id: str, body: RunSimulateIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under P, PI or PID control."""
-    return run_simulations.simulate_run(parts.database, parts.store, run_id, body, max_points)
+    return simulate.simulate_run(parts.database, parts.store, run_id, body, max_points)
 
 
 @router.post("/{run_id}:validate")
@@ -92,7 +90,7 @@ def validate_run(
     run_id: str, body: FreeRunIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> FreeRunOut:
     """Simulate the identified model (free run) on another recording: RMS and fit."""
-    return free_runs.validate_run(parts.database, parts.store, run_id, body, max_points)
+    return free_run.validate_run(parts.database, parts.store, run_id, body, max_points)
 
 
 @router.post("/{run_id}:profile")

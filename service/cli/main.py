@@ -8,10 +8,9 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import datasets, jobs, models, runs, sweeps
+from service.cli import datasets, jobs, models, runs, server, sweeps
 from service.cli import reidentify as references
 from service.cli import runs as exporting
-from service.cli import server as serving
 from service.cli import server as upkeep
 from service.cli.common import out, print_error
 from service.cli.identify import identify
@@ -32,8 +31,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-app.command("serve")(serving.serve)
-app.command("dispatcher")(serving.run_dispatcher)
+app.command("serve")(server.serve)
+app.command("dispatcher")(server.run_dispatcher)
 app.command("identify")(identify)
 app.command("paper")(reproduce_paper)
 app.command("submit")(jobs.submit_job)
@@ -59,9 +58,9 @@ def run_demo(
     data_dir: Annotated[Path, typer.Option(help="Folder for its data.")] = Path("lagid-demo"),
 ) -> None:
     """Run the paper's Example 1 through the whole service and print its Table 1."""
-    from service.cli import demo as program
+    from service.cli import demo
 
-    program.run_demo(data_dir, out)
+    demo.run_demo(data_dir, out)
 
 
 def main() -> None:

@@ -76,11 +76,11 @@ def show_model(
     """Print a model's document as YAML, to copy and change."""
     import yaml
 
-    from sysid.models.catalogue import load as library
+    from sysid.models.catalogue import load
 
     document: dict[str, Any]
-    if url is None or name in library.catalogue():
-        document = dict(library.copy_catalogue_document(name))
+    if url is None or name in load.catalogue():
+        document = dict(load.copy_catalogue_document(name))
     else:
         with connect_client(url, key) as client:
             document = client.model(name)["document"]

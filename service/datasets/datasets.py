@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from service.core.errors import DatasetNotFound, TooLarge
 from service.core.settings import Settings
 from service.core.wire import Page
@@ -296,7 +296,7 @@ def _hash_derivation(parent: Dataset, body: DeriveIn) -> str:
 def _store_file(
     store: ObjectStore, recording: Recording, metadata: Mapping[str, str]
 ) -> StoredObject:
-    with tempfile.TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
+    with tempfile.TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
         path = Path(folder) / "recording.mcap"
         write_recording(recording, path, metadata=metadata)
         return store.put_file(path)

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
@@ -67,7 +67,7 @@ def read_untrusted(
         raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
     with source.open("rb") as stream:
         sha256 = file_digest(stream, "sha256").hexdigest()
-    with TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
+    with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
         clean = Path(folder) / "clean.mcap"
         task = {
             "source": str(source.absolute()),

@@ -14,10 +14,10 @@ from service.core.errors import InvalidRequest, NotFound, to_field_errors
 from service.core.wire import FieldProblem, Page
 from service.models.schemas import CheckOut, ModelOut
 from service.repositories.models import ModelRepository
-from service.storage import errors as storage_errors
+from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
 from sysid.core.errors import SysidError, UnknownModel, suggest_name
-from sysid.models.catalogue import load as library
+from sysid.models.catalogue import load
 from sysid.models.model import Model
 from sysid.models.parse import keep_terms, parse_model
 
@@ -31,7 +31,7 @@ def list_models(session: Session, cursor: str | None, limit: int) -> Page[ModelO
 
 def list_catalogue() -> list[ModelOut]:
     """List the built-in models."""
-    return [_to_builtin_out(name) for name in library.catalogue()]
+    return [_to_builtin_out(name) for name in load.catalogue()]
 
 
 def get_model(session: Session, reference: str) -> ModelOut:
@@ -42,7 +42,7 @@ def get_model(session: Session, reference: str) -> ModelOut:
     NotFound
         With the most similar name.
     """
-    if reference in library.catalogue():
+    if reference in load.catalogue():
         return _to_builtin_out(reference, with_document=True)
     return _to_own_out(_get_own_model(session, reference), with_document=True)
 
@@ -56,7 +56,7 @@ def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
         If it has faults, or its name is that of a built-in model.
     """
     model = parse_model(document)
-    if model.name in library.catalogue():
+    if model.name in load.catalogue():
         raise InvalidRequest.from_fault(
             "/name", f"{model.name!r} is the name of a built-in model; choose another"
         )
@@ -90,8 +90,8 @@ def resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
     """
     if isinstance(reference, Mapping):
         return parse_model(reference), dict(reference)
-    if reference in library.catalogue():
-        return library.load_model(reference), reference
+    if reference in load.catalogue():
+        return load.load_model(reference), reference
     try:
         row = _get_own_model(session, reference)
     except NotFound:
@@ -108,7 +108,7 @@ def load_stored_model(reference: Any) -> Model:
         If the document has faults, or no built-in model has that name.
     """
     if isinstance(reference, str):
-        return library.load_model(reference)
+        return load.load_model(reference)
     return _parse_stored(json.dumps(reference))
 
 
@@ -127,20 +127,20 @@ def apply_selection(model: Model, result: Mapping[str, Any] | None) -> Model:
 def _get_own_model(session: Session, reference: str) -> StoredModel:
     try:
         return ModelRepository(session).get(reference)
-    except storage_errors.RowNotFound:
+    except errors.RowNotFound:
         raise NotFound("model", reference, suggest_name(reference, _list_names(session))) from None
 
 
 def _list_names(session: Session) -> set[str]:
     stored = ModelRepository(session).list_page(limit=1000).items
-    return {*library.catalogue(), *(row.name for row in stored)}
+    return {*load.catalogue(), *(row.name for row in stored)}
 
 
 def _to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
     return _to_out(
-        library.load_model(name),
+        load.load_model(name),
         0,
-        library.copy_catalogue_document(name) if with_document else None,
+        load.copy_catalogue_document(name) if with_document else None,
     )
 
 

@@ -7,8 +7,7 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import plotly as figures
-from service.figures import signals as figures_signals
+from service.figures import plotly, signals
 from service.figures.noise import noise_group_keys, plot_noise_sweep
 from service.figures.plotly import Abscissa, Figure
 from service.figures.theme import Theme
@@ -60,28 +59,26 @@ def load_run_figure(
     if name == "response":
         experiments = read_run_experiments(session, store, stored)
         if not experiments:
-            return figures.empty_figure()
+            return plotly.empty_figure()
         _check_experiment(choice.experiment, len(experiments))
-        figure = figures_signals.plot_response(
-            experiments[choice.experiment], choice.start, choice.stop
-        )
+        figure = signals.plot_response(experiments[choice.experiment], choice.start, choice.stop)
         figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
         return figure
     if name == "residuals":
         tested = analyse_residuals(session, store, stored)
         if tested is None:
-            return figures.empty_figure()
+            return plotly.empty_figure()
         _check_experiment(choice.experiment, len(tested.experiments))
         return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
     evidence = read_run_figure_data(session, stored)
     if name == "history":
-        return figures.plot_history(evidence, choice.abscissa)
+        return plotly.plot_history(evidence, choice.abscissa)
     if name == "convergence":
-        return figures.plot_convergence(evidence, choice.columns)
+        return plotly.plot_convergence(evidence, choice.columns)
     return (
-        figures.plot_correlation(evidence)
+        plotly.plot_correlation(evidence)
         if name == "correlation"
-        else figures.plot_waterfall(evidence)
+        else plotly.plot_waterfall(evidence)
     )
 
 
@@ -90,7 +87,7 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     job = JobRepository(session).get(job_id)
     keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
-        return figures.empty_figure()
+        return plotly.empty_figure()
     summary = summarise_job(session, job.id, keys, errors_only=True)
     return plot_noise_sweep(summary, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
@@ -99,7 +96,7 @@ def load_trend_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     """Draw estimates over the label of a batch; empty if the job requests no trend."""
     trend = load_trend(session, JobRepository(session).get(job_id))
     if trend is None:
-        return figures.empty_figure()
+        return plotly.empty_figure()
     return plot_trend(trend, min(choice.columns, 2))
 
 
@@ -113,6 +110,4 @@ def load_dataset_figure(
 ) -> Figure:
     """Draw the signals of a dataset."""
     dataset = DatasetRepository(session).get(dataset_id)
-    return figures_signals.plot_signals(
-        read_dataset_traces(store, dataset), choice.start, choice.stop
-    )
+    return signals.plot_signals(read_dataset_traces(store, dataset), choice.start, choice.stop)

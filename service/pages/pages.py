@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from service.core.states import JobState
 from service.core.text import join_estimate
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import signals as figures_signals
+from service.figures import signals
 from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.figures.residuals import residuals_height
@@ -184,7 +184,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
     return render_template(
         "dataset.html",
         dataset=dataset,
-        height=figures_signals.signals_height(dataset.n_channels),
+        height=signals.signals_height(dataset.n_channels),
         has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _object_href(name)}
@@ -220,7 +220,7 @@ def load_full_run(session: Session, stored: StoredRun) -> RunView:
     counts = len(model.outputs), len(model.inputs)
     # Plots that appear when the run ends lie below the live plots; they get their room then.
     heights = {
-        "response": figures_signals.response_height(*counts) if run.signals_sha256 else 0,
+        "response": signals.response_height(*counts) if run.signals_sha256 else 0,
         "convergence": convergence_height(len(sought), columns=3),
         "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
         "residuals": _residuals_height(result) if run.signals_sha256 else 0,

@@ -17,14 +17,13 @@ from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import plotly as figures
-from service.figures import signals as figures_signals
+from service.figures import plotly, signals
 from service.figures.embed import strip_template, templates_json, to_script_json
 from service.figures.plotly import Figure
 from service.figures.svg import is_drawable, to_svg
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
-from service.pages import render as assets
+from service.pages import render
 from service.pages.cell_grid import MAX_LISTED_RUNS, GridView, build_cell_grid
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
 from service.pages.diagnostics import plot_residual_tests
@@ -154,13 +153,13 @@ def _build_section(
     session: Session, store: ObjectStore, stored: StoredRun, why: str
 ) -> _ReportSection:
     evidence = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", figures.plot_history(evidence))]
+    titled = [("Progress of every island", plotly.plot_history(evidence))]
     experiments = read_run_experiments(session, store, stored)[:1]
     titled += [
-        ("Measured against identified", figures_signals.plot_response(experiment))
+        ("Measured against identified", signals.plot_response(experiment))
         for experiment in experiments
     ]
-    titled.append(("Convergence of the parameters", figures.plot_convergence(evidence)))
+    titled.append(("Convergence of the parameters", plotly.plot_convergence(evidence)))
     return _ReportSection(why, load_full_run(session, stored), _draw_figures(titled))
 
 
@@ -239,10 +238,10 @@ def _run_figures(
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures that have data."""
     evidence = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", figures.plot_history(evidence))]
+    titled = [("Progress of every island", plotly.plot_history(evidence))]
     for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
         title = f"Measured against identified: {experiment.name}"
-        titled.append((title, figures_signals.plot_response(experiment)))
+        titled.append((title, signals.plot_response(experiment)))
     tested = analyse_residuals(session, store, stored)
     if tested is not None:
         titled += [
@@ -250,9 +249,9 @@ def _run_figures(
             for number, name in enumerate(tested.experiments[:MAX_EXPERIMENTS])
         ]
     titled += [
-        ("Convergence of the parameters", figures.plot_convergence(evidence)),
-        ("Correlation of the estimates", figures.plot_correlation(evidence)),
-        ("What each island found", figures.plot_waterfall(evidence)),
+        ("Convergence of the parameters", plotly.plot_convergence(evidence)),
+        ("Correlation of the estimates", plotly.plot_correlation(evidence)),
+        ("What each island found", plotly.plot_waterfall(evidence)),
     ]
     return [
         (title, figure["layout"]["height"], to_script_json(strip_template(figure)))
@@ -268,13 +267,13 @@ def _has_points(trace: dict[str, Any]) -> bool:
 @cache
 def plotly_script() -> Markup:
     """Load the Plotly bundle as the content of a script element."""
-    return _to_script(assets.plotly_path().read_text(encoding="utf-8"))
+    return _to_script(render.plotly_path().read_text(encoding="utf-8"))
 
 
 @cache
 def draw_script() -> Markup:
     """Load the script that draws the figures, as the content of a script element."""
-    return _to_script((assets.STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
+    return _to_script((render.STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
 
 
 def _to_script(text: str) -> Markup:

@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
-from service.control import simulate as run_simulations
+from service.control import simulate
 from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
 from service.core.errors import (
     FieldError,
@@ -41,7 +41,7 @@ from service.pages.simulate_form import (
     to_form_fault,
 )
 from service.repositories.datasets import DatasetRepository
-from service.runs import free_run as free_runs
+from service.runs import free_run
 from service.runs.free_run import FreeRun
 from service.runs.schemas import FreeRunIn
 from service.storage.errors import StorageError
@@ -266,7 +266,7 @@ def _simulate_query(
 ) -> tuple[Figure, dict[str, Any]]:
     if wanted.kind == "recording":
         body = _validate_body(FreeRunIn, wanted.body)
-        free = free_runs.simulate_free_run(database, store, form.run, body)
+        free = free_run.simulate_free_run(database, store, form.run, body)
         name = next((d.name for d in form.datasets if d.id == free.dataset), free.dataset)
         return plot_response(_to_experiment_traces(free)), {
             "free": free,
@@ -274,7 +274,7 @@ def _simulate_query(
             "records": MAX_LISTED_RECORDS,
         }
     body = _validate_body(RunSimulateIn, wanted.body)
-    simulation = run_simulations.simulate_run(database, store, form.run, body, MAX_POINTS)
+    simulation = simulate.simulate_run(database, store, form.run, body, MAX_POINTS)
     with_units = apply_units(simulation, form.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
     entered = form.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.figures import theme
-from service.paper import figures, published
-from service.paper import force_noise as forces
+from service.paper import figures, force_noise, published
 from service.paper.bench import METHODS, StudyBench
 from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.oscillators import EXAMPLE_1, list_readings, record_body
@@ -127,7 +126,7 @@ def build_sections(bench: StudyBench) -> list[Section]:
             _build_checks(errors),
             links=[runs[0]["job"]],
         ),
-        forces.build_section(bench, exact),
+        force_noise.build_section(bench, exact),
     ]
 
 

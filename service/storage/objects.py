@@ -22,7 +22,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ class StoredObject:
 class ObjectStore(ABC):
     """Base class of the stores: everything but the last step of a write."""
 
-    def __init__(self, backend: Any, temporary: Path) -> None:
-        self._backend, self._temporary = backend, temporary
+    def __init__(self, backend: Any, temporary_files: Path) -> None:
+        self._backend, self._temporary = backend, temporary_files
 
     def put_file(self, path: Path) -> StoredObject:
         """Store a copy of a file."""
@@ -129,7 +129,7 @@ class ObjectStore(ABC):
     @contextmanager
     def _open_temporary_file(self) -> Iterator[BinaryIO]:
         with tempfile.NamedTemporaryFile(
-            dir=self._temporary, prefix=temporary.make_temporary_prefix()
+            dir=self._temporary, prefix=temporary_files.make_temporary_prefix()
         ) as file:
             yield file  # type: ignore[misc]  # the wrapper has all methods of BinaryIO
 
@@ -148,7 +148,7 @@ class FolderStore(ObjectStore):
         unfinished = self._folder / "tmp"
         with _translate_errors("create its folder"):
             unfinished.mkdir(parents=True, exist_ok=True)
-            temporary.remove_leftovers(unfinished, "*")
+            temporary_files.remove_leftovers(unfinished, "*")
             super().__init__(LocalStore(self._folder), unfinished)
 
     def check_writable(self) -> None:

@@ -3,7 +3,7 @@
 import tempfile
 from pathlib import Path
 
-from service.core import temporary_files as temporary
+from service.core import temporary_files
 from service.core.settings import Settings
 from service.storage import migrate
 from service.storage.objects import ObjectStore, open_store
@@ -24,7 +24,7 @@ def open_storage(settings: Settings) -> tuple[Database, ObjectStore]:
         If the database cannot be opened.
     """
     settings.prepare_data_folder()
-    temporary.remove_leftovers(Path(tempfile.gettempdir()))
+    temporary_files.remove_leftovers(Path(tempfile.gettempdir()))
     database = Database(settings.resolved_database_url)
     migrate.upgrade_database(database)
     return database, open_store(settings.resolved_store_url)

@@ -13,7 +13,7 @@ from service.core.errors import FieldError, InvalidRequest, to_field_errors
 from service.core.settings import Settings
 from service.datasets.schemas import SimulateIn
 from service.datasets.simulated import SimulatedDataset, simulate_or_find
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.checks import JobChecker, fault_in_job
 from service.jobs.schemas import JobIn, JobOut
 from service.repositories.jobs import JobRepository
@@ -83,12 +83,12 @@ def submit_noise_sweep(
         job = _build_job(store, body, plain, source)
         if source.simulated is not None:
             with database.read_session() as session:
-                jobs.check_job(session, job, settings, source.unstored_rows)
+                submit.check_job(session, job, settings, source.unstored_rows)
                 if key is not None and JobRepository(session).is_key_used(key):
                     raise KeyReused(key)  # with the same body the record would already be stored
             stored = source.simulated.store_dataset(database, store).dataset.id
             job = job.model_copy(update={"datasets": [stored]})
-        return jobs.submit_job(database, job, settings, key)
+        return submit.submit_job(database, job, settings, key)
     except InvalidRequest as error:
         raise InvalidRequest(_move_fault(fault, body) for fault in error.errors) from None
 

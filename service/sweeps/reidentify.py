@@ -6,7 +6,7 @@ from typing import Any
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
 from service.core.text_checks import find_text_fault
-from service.jobs import submit as jobs
+from service.jobs import submit
 from service.jobs.schemas import PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX, JobIn, JobOut
 from service.storage.sessions import Database
 from service.sweeps.schemas import ReidentifyIn
@@ -40,9 +40,9 @@ def submit_reidentification(
         )
     try:
         if not faults:
-            return jobs.submit_job(database, job, settings, key)
+            return submit.submit_job(database, job, settings, key)
         with database.read_session() as session:
-            jobs.check_job(session, job, settings)
+            submit.check_job(session, job, settings)
     except InvalidRequest as error:
         faults += [_move_fault(fault, order) for fault in error.errors]
     raise InvalidRequest(dict.fromkeys(faults))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from sysid.kernels import reads as demand
+from sysid.kernels import reads
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.expressions import Environment, emit_expression
 from sysid.kernels.signals import ParameterEnvironment, SignalReaders, States
@@ -50,7 +50,7 @@ class StepEnvironment(Environment):
         number = self.states.names.index(past.name)
         place = self.half_steps
         if self.is_in_equation:
-            place = demand.find_state_place(self.model, place, self.equation, number)
+            place = reads.find_state_place(self.model, place, self.equation, number)
         halves = place - 2 * past.offset
         if past.delay is None:
             return self._emit_sample(past.name, -halves // 2)
@@ -64,7 +64,7 @@ class StepEnvironment(Environment):
         return self.equation >= 0
 
     def _emit_sample(self, name: str, back: int) -> IrValue:
-        if back > demand.MAX_REGISTER_OFFSET:
+        if back > reads.MAX_REGISTER_OFFSET:
             return self.states.load_far_sample(name, back, self.turn.row)
         return self.states.now[name] if back == 0 else self.states.line[name][back]
 
@@ -93,7 +93,7 @@ def emit_next_states(
     build_environment: EnvironmentBuilder,
 ) -> dict[str, IrValue]:
     """Emit the states one step later."""
-    if demand.is_difference(model):
+    if reads.is_difference(model):
         return _emit_recursion(lanes, model, build_environment)
     if model.solver.method == "rk4":
         return _emit_runge_kutta(lanes, model, step, states, build_environment)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from sysid.kernels import reads as demand
+from sysid.kernels import reads
 from sysid.kernels.abi import KERNEL_ARGUMENTS, LANES, NARROW_LANES, build_kernel_type
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
@@ -140,7 +140,7 @@ class _Block:
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
-        if not demand.is_difference(model) or model.memory <= 1:
+        if not reads.is_difference(model) or model.memory <= 1:
             return emit_next_states(
                 lanes, model, self.experiment.get_number("step"), states, build_environment
             )

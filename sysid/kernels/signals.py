@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sysid.kernels import reads as demand
+from sysid.kernels import reads
 from sysid.kernels.delayed_reads import (
     DelayedReader,
     DirectReader,
@@ -117,7 +117,7 @@ class Delays:
         if delay not in self._steps:
             lanes = self._lanes
             value = lanes.splat(emit_expression(lanes, delay, self._scope))
-            if not demand.is_difference(self._model):
+            if not reads.is_difference(self._model):
                 value = lanes.div(value, self._step)
             if self._model.solver.interpolation == "nearest":
                 value = lanes.call_intrinsic("floor", lanes.add(value, lanes.make_number(0.5)))
@@ -151,7 +151,7 @@ class States:
                     work, [lanes.builder.mul(size, lanes.make_integer(i))], source_etype=DOUBLE
                 )
             )
-            for i, name in enumerate(demand.list_states_with_history(model))
+            for i, name in enumerate(reads.list_states_with_history(model))
         }
         self.line: dict[str, list[IrValue]] = {}
 
@@ -196,7 +196,7 @@ class States:
             first = loop.carry(self.now[name])
             before = self._before[name]
             rest = [
-                loop.carry(before) for _ in range(demand.count_register_samples(self._model, name))
+                loop.carry(before) for _ in range(reads.count_register_samples(self._model, name))
             ]
             self.line[name] = [first, *rest]
             self.now[name] = first
@@ -258,7 +258,7 @@ class SignalReaders:
                 served = places if chain[0] > 0 else set()
                 self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
         for past, places in _group_delayed_reads(model, "input").items():
-            for chain in demand.group_places(places):
+            for chain in reads.group_places(places):
                 self._add_reader(
                     past,
                     {*chain},
@@ -283,7 +283,7 @@ class SignalReaders:
     def _find_input_start(self, number: int) -> IrValue:
         """Find the place of an input at step 0; difference equations read just after a jump."""
         zero = self._experiment.get_input_field(number, "zero")
-        if not demand.is_difference(self._model):
+        if not reads.is_difference(self._model):
             return zero
         return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
 
@@ -298,7 +298,7 @@ class SignalReaders:
         b, lanes, number = self._lanes.builder, self._lanes, self._inputs[name]
         points = self._experiment.get_input_field(number, "points")
         start = b.add(self._find_input_start(number), b.mul(step, points))
-        if demand.is_difference(self._model):
+        if reads.is_difference(self._model):
             shift = b.mul(points, lanes.make_integer(halves // 2))
         elif halves == 1:
             shift = b.ashr(points, lanes.make_integer(1))
@@ -324,7 +324,7 @@ class SignalReaders:
 
 def _group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
     places: dict[tuple[str, Expression], set[int]] = {}
-    for read in demand.collect_reads(model):
+    for read in reads.collect_reads(model):
         if read.past.kind == kind and read.past.delay is not None:
             places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
     return places
@@ -333,4 +333,4 @@ def _group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression]
 def _group_state_places(places: set[int]) -> list[list[int]]:
     """Group whole steps into chains; one that reaches the present step has its start too."""
     forward = {0, 2} if any(place > 0 for place in places) else set()
-    return demand.group_places({place for place in places if place % 2 == 0} | forward)
+    return reads.group_places({place for place in places if place % 2 == 0} | forward)

@@ -8,7 +8,7 @@ from typing import Any, cast
 from sysid.core.errors import Fault, InvalidModel, InvalidSettings, join_pointer
 from sysid.language.scope import EquationForm, Scope
 from sysid.language.tree import Expression, PastValue, match_plain_state
-from sysid.models import equations as eq
+from sysid.models import equations
 from sysid.models.documents import DocumentReader, quote_value
 from sysid.models.model import (
     FixedInitial,
@@ -137,8 +137,8 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
             "constants": tuple(constants),
         },
     )
-    _, trees = eq.read_equations(reader, fields.get("equations"), scope)
-    _, outputs = eq.read_outputs(reader, fields.get("outputs"), scope, states)
+    _, trees = equations.read_equations(reader, fields.get("equations"), scope)
+    _, outputs = equations.read_outputs(reader, fields.get("outputs"), scope, states)
     _check_output_names(reader, outputs, scope)
     initial = read_initial_states(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
     solver = read_solver(reader, fields.get("solver"), form)
@@ -154,8 +154,8 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
         parameters=parameters,
         equations=trees,
         initial=initial,
-        order=eq.order_states(reader, trees, scope),
-        memory=eq.compute_memory(trees) if form == "difference" else 0,
+        order=equations.order_states(reader, trees, scope),
+        memory=equations.compute_memory(trees) if form == "difference" else 0,
         solver=solver,
         document={},
     )
@@ -239,7 +239,7 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         equations=(equation.tree,),
         initial=initial,
         order=(0,),
-        memory=eq.compute_memory((equation.tree,)),
+        memory=equations.compute_memory((equation.tree,)),
         solver=solver,
         document={},
         terms=equation.terms,
