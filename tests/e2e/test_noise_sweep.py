@@ -55,7 +55,7 @@ def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(
     expect(page).to_have_url(re.compile(r"cell=.*sigma%3D0\.25.*method%3D%22improved%22"))
     rows = page.locator("table.runs tbody tr")
     expect(rows).to_have_count(13)
-    expect(rows.first).to_contain_text("sigma 0.2500")
+    expect(rows.first).to_contain_text("sigma 0.25")
     expect(page.locator("table.cells td[aria-current] a")).to_have_count(1)
     page.get_by_role("link", name="all cells").click()
     expect(page.locator("table.runs")).to_have_count(0)
