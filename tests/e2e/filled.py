@@ -205,6 +205,10 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
     return {
         "valid": True,
         "rms": rms,
+        "rms_validation": None,
+        "fit_percent": {"estimation": 98.1, "validation": None},
+        "agreement": {"estimation": [_agreement(rms)], "validation": []},
+        "evaluations": 20_000,
         "parameters": [
             {
                 "name": name,
@@ -264,6 +268,18 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
             }
         ],
         "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
+    }
+
+
+def _agreement(rms: float) -> dict[str, Any]:
+    return {
+        "experiment": 0,
+        "output": "p",
+        "unit": "kPa",
+        "samples": 2100,
+        "rms": rms,
+        "fit_percent": 98.1,
+        "span": [0.0, 100.0],
     }
 
 
