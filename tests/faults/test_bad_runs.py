@@ -86,7 +86,7 @@ def test_a_run_that_kills_its_worker_fails_with_that_reason_and_the_others_go_on
 ) -> None:
     seeds = {"path": "/seed", "values": list(range(1, 31))}
     job = service.end(service.submit(sweep={"axes": [seeds]}))
-    runs = {run.seed: run for run in service.runs.runs(job.id)}
+    runs = {run.seed: run for run in service.runs(job.id)}
     killer = runs.pop(DEADLY)
     assert (killer.state, killer.kills) == (JobState.FAILED, 2)
     assert (killer.error or "").startswith("its worker process died 2 times")
@@ -98,7 +98,7 @@ def test_a_run_that_kills_its_worker_fails_with_that_reason_and_the_others_go_on
 def test_a_run_that_wants_too_much_memory_fails_and_the_others_go_on(service: Service) -> None:
     seeds = {"path": "/seed", "values": [1, 2, GREEDY, 4, 5]}
     job = service.end(service.submit(sweep={"axes": [seeds]}))
-    runs = {run.seed: run for run in service.runs.runs(job.id)}
+    runs = {run.seed: run for run in service.runs(job.id)}
     greedy = runs.pop(GREEDY)
     assert greedy.state is JobState.FAILED
     assert (greedy.error or "").startswith("it needs more memory than a worker may use")
@@ -112,9 +112,9 @@ def test_a_model_that_diverges_in_half_of_its_cells_ends_with_the_other_half(
     cells = [{"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8}]
     axes = [{"path": "/parameters/b", "values": cells}, {"path": "/seed", "values": [1, 2, 3]}]
     job = service.end(service.submit(sweep={"axes": axes}))
-    states = [run.state for run in service.runs.runs(job.id)]
+    states = [run.state for run in service.runs(job.id)]
     assert states == [JobState.SUCCEEDED] * 3 + [JobState.FAILED] * 3
-    assert "diverged" in (service.runs.runs(job.id)[-1].error or "")
+    assert "diverged" in (service.runs(job.id)[-1].error or "")
     assert (job.state, job.n_failed) == (JobState.SUCCEEDED, 3)
 
 
@@ -123,7 +123,7 @@ def test_a_running_job_is_cancelled_with_what_it_has(service: Service) -> None:
     until(lambda: service.job(job).evaluations > 0, "progress", LIMIT_SECONDS)
     service.stand.client.cancel(job)
     assert service.end(job).state is JobState.CANCELLED
-    assert [run.state for run in service.runs.runs(job)] == [JobState.CANCELLED]
+    assert [run.state for run in service.runs(job)] == [JobState.CANCELLED]
 
 
 def test_a_job_cancelled_while_its_dispatcher_is_dead_is_not_taken_up_again(
