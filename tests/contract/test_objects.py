@@ -119,7 +119,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
 def test_what_is_not_there_is_missing(store, name):
     assert not store.exists(name)
     store.delete(name)
-    reads = (store.get_bytes, store.size, lambda one: store.get_range(one, 0, 1))
+    reads = (store.get_bytes, store.get_size, lambda one: store.get_range(one, 0, 1))
     for read in reads:
         with pytest.raises(ObjectMissing):
             read(name)
@@ -214,7 +214,7 @@ def test_a_bucket_that_is_not_there_is_told_in_one_line(bucket):
 
 @pytest.mark.parametrize("url", ["", "objects", "ftp://x/y", "file://host/x", "file:relative"])
 def test_an_address_of_an_unknown_kind_is_refused(url):
-    with pytest.raises(InvalidStoreUrl, match="no object store"):
+    with pytest.raises(InvalidStoreUrl, match="is not the address of an object store"):
         open_store(url)
 
 

@@ -74,7 +74,7 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
     again.write_all()
     assert place.job(job).evaluations == 730 + state.evaluations
     again.record_failure(runs[2], RunFailure("as told"))
-    again.finish()
+    again.finish_job()
     assert place.job(job).error == "3 of 4 runs failed: as told; otherwise"
     assert place.job(job).evaluations == 730 + state.evaluations
     with place.database.read_session() as session:

@@ -363,7 +363,7 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
 
     for module in (reidentifying, reidentify):
         monkeypatch.setattr(f"{module.__name__}.connect_client", connected)
-    monkeypatch.setattr(f"{reidentifying.__name__}.follow", follow)
+    monkeypatch.setattr(f"{reidentifying.__name__}.follow_job", follow)
     return CliRunner()
 
 

@@ -103,8 +103,8 @@ def test_a_tie_is_identified_and_validated_with_the_rest() -> None:
 @pytest.mark.parametrize(
     ("changes", "pointer", "words"),
     [
-        ({"b": {"tied": "2*b"}}, "/parameters/b/tied", "circle, b → b"),
-        ({"b": {"tied": "c"}, "c": {"tied": "b+1"}}, "/parameters/c/tied", "circle, c → b → c"),
+        ({"b": {"tied": "2*b"}}, "/parameters/b/tied", "circular, b → b"),
+        ({"b": {"tied": "c"}, "c": {"tied": "b+1"}}, "/parameters/c/tied", "circular, c → b → c"),
         ({"b": {"tied": "2*d"}}, "/parameters/b/tied", "'d' is not declared"),
         ({"b": {"tied": "2*"}}, "/parameters/b/tied", "column 3"),
         ({"b": {"tied": "x"}}, "/parameters/b/tied", "'x' is not declared"),
