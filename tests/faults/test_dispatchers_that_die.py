@@ -35,7 +35,7 @@ def _work_on(database, claim, trouble):
             run_id=run.id,
             state=JobState.SUCCEEDED,
             best_rms=float(run.number + 1),
-            result={"by": claim.lease.owner, "attempt": claim.lease.attempt},
+            result={"by": claim.lease.owner, "attempt": claim.lease.attempt, "parameters": []},
         )
         with database.write_session() as session:
             RunWriter(session, claim.lease).record_outcomes([outcome])
