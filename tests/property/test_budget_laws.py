@@ -64,7 +64,7 @@ def test_a_budget_is_never_exceeded_or_refused_where_one_population_does(
         )
 
     if budget < population:
-        with pytest.raises(InvalidSettings, match="simulations of one population") as caught:
+        with pytest.raises(InvalidSettings, match="one simulation for each of the") as caught:
             algorithm()
         assert caught.value.pointer == "/algorithm/stop/evaluations"
         return
