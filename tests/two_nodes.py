@@ -51,10 +51,16 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
     """
     token = secrets.token_hex(32)
     temporary = Path(tempfile.mkdtemp(prefix="lgr", dir="/tmp"))  # sockets need a short path
+    (temporary / "ray").mkdir()  # where Ray writes the address of its cluster: not beside others'
     log = (folder / "cluster.log").open("w")
     child = subprocess.Popen(
         [sys.executable, "-m", "tests.two_nodes", str(folder), str(temporary)],
-        env={**os.environ, **_auth(token), "RAY_USAGE_STATS_ENABLED": "0"},
+        env={
+            **os.environ,
+            **_auth(token),
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_TMPDIR": str(temporary),
+        },
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=log,
@@ -64,7 +70,7 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
     assert child.stdin is not None
     assert child.stdout is not None
     try:
-        address = json.loads(child.stdout.readline())["address"]
+        address = _read_answer(child.stdout)["address"]
         yield TwoNodes(address, token, child.stdin, child.stdout)
     finally:
         kill_processes(find_session_processes(child.pid))
@@ -73,6 +79,13 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
         for pipe in (child.stdin, child.stdout, log):
             pipe.close()
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _read_answer(stream: IO[str]) -> dict[str, str]:
+    """Read the next answer; Ray may print lines of its own before it."""
+    answer = next((line for line in stream if line.startswith("{")), "")
+    assert answer, "the cluster ended without an answer; see cluster.log"
+    return dict(json.loads(answer))
 
 
 def _auth(token: str) -> dict[str, str]:
