@@ -34,7 +34,7 @@ def test_the_trend_is_drawn_and_a_run_accepted(own_site: Site, page: Page) -> No
     trend.get_by_label("as the reference").fill("seen in a browser")
     trend.get_by_label("Accept the run").select_option(index=2)
     trend.get_by_role("button", name="Accept").click()
-    expect(trend.locator("[data-accepted]")).to_contain_text("seen in a browser is run_")
+    expect(trend.locator("[data-accepted]")).to_contain_text("seen in a browser is now run_")
     told = httpx.get(
         f"{own_site.url}/v1/references/seen in a browser", timeout=LIMIT_SECONDS
     ).json()
