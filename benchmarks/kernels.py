@@ -109,7 +109,9 @@ def against_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
         example, theta = problem(duffing("difference"), 300), individuals(count)
         ours, c = np.inf, np.inf
         for _ in range(3):  # in turns, so that a disturbance meets both
-            ours = min(ours, microseconds(lambda e=example, t=theta: e.fitness(t), repeats))
+            ours = min(
+                ours, microseconds(lambda e=example, t=theta: e.evaluate_fitness(t), repeats)
+            )
             if timed_c is not None:
                 c = min(c, timed_c(count, 300))
         name = f"duffing-eq16, {count} individuals × 300 samples"
@@ -136,7 +138,7 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
             raise SystemExit(f"{name}: the C code does not compute what the kernel computes")
         ours = c = np.inf
         for _ in range(3):
-            ours = min(ours, microseconds(lambda e=built, t=theta: e.fitness(t), repeats))
+            ours = min(ours, microseconds(lambda e=built, t=theta: e.evaluate_fitness(t), repeats))
             c = min(c, microseconds(call, repeats))
         share = operations_a_step(built) * 48 * 300 * example.steps / ours / 1000 / peak
         rows += [
@@ -160,7 +162,7 @@ def growth(repeats: int) -> list[Row]:
         for count in counts:
             samples, many = (count, 48) if what == "sample" else (300, count)
             example, theta = problem(duffing("difference"), samples), individuals(many)
-            times.append(microseconds(lambda e=example, t=theta: e.fitness(t), repeats))
+            times.append(microseconds(lambda e=example, t=theta: e.evaluate_fitness(t), repeats))
         n, t = np.array(counts, float), np.array(times)
         slope, start = np.polyfit(n, t, 1, w=1 / t)  # relative departures count
         off = float(np.max(np.abs((start + slope * n) / t - 1)))

@@ -33,7 +33,7 @@ model = load_model({
     "parameters": {n: {"lower": 0, "upper": 2} for n in ("p", "q", "r", "L")},
     "equations": {"x": "v", "v": "p*tanh(u(t - L)) - q*v - r*x*abs(x(t - L))"},
     "outputs": {"y": "x"}, "initial": {"x": 0, "v": 0}})
-Problem.build(model, [record]).fitness(np.ones((50, 4)))
+Problem.build(model, [record]).evaluate_fitness(np.ones((50, 4)))
 print(time.perf_counter() - start)
 """
 

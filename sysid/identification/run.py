@@ -62,7 +62,7 @@ def begin_run(
         problem, algorithm, seed, warm_starts, starts.values, starts.evaluations
     )
     for island in islands:
-        island.search.is_warm_start = is_warm
+        island.search["is_warm_start"] = is_warm
     return RunState(seed, islands, is_warm=is_warm)
 
 

@@ -119,8 +119,8 @@ def create_islands(
                 places,
                 p >= len(start_values),
             )
-        search = np.zeros((), SEARCH_RECORD).view(np.recarray)
-        search.evaluations = spent if plan.island == 0 else 0
+        search = np.zeros((), SEARCH_RECORD)
+        search["evaluations"] = spent if plan.island == 0 else 0
         islands.append(
             Island(
                 plan.island,

@@ -59,12 +59,12 @@ class Island:
     @property
     def generation(self) -> int:
         """Generations completed."""
-        return int(self.search.generation)
+        return int(self.search["generation"])
 
     @property
     def evaluations(self) -> int:
         """Simulations run."""
-        return int(self.search.evaluations)
+        return int(self.search["evaluations"])
 
     @property
     def champion_rms(self) -> float:
@@ -108,7 +108,7 @@ def to_improvement(row: Sequence[float]) -> Improvement:
 
 def stack_search(islands: Sequence[Island]) -> SearchArray:
     """Copy the search records of the islands into one array (I,)."""
-    return np.array([island.search for island in islands], SEARCH_RECORD).view(np.recarray)
+    return np.array([island.search for island in islands], SEARCH_RECORD)
 
 
 _UNLIMITED = 2**62

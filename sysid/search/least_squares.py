@@ -142,19 +142,19 @@ def solve_least_squares(
     is_late : callable or None
         Called after each compiled call; True ends the search.
     """
-    progress: Any = np.zeros((), _PROGRESS).view(np.recarray)
+    progress: Any = np.zeros((), _PROGRESS)
     size, is_cut_short = scored.rows.size, False
     descent = _Descent(np.array(place), np.empty(size), np.empty((place.size, size)), progress[()])
-    while steps > 0 and not progress.has_ended and not is_cut_short:
+    while steps > 0 and not progress["has_ended"] and not is_cut_short:
         _run_steps(scored, descent, scale, min(steps, at_once), tolerance)
         steps -= at_once
-        continues = steps > 0 and not progress.has_ended
+        continues = steps > 0 and not progress["has_ended"]
         is_cut_short = continues and is_late is not None and is_late()
     return LeastSquaresSolution(
         descent.place,
-        bool(progress.has_ended),
-        int(progress.evaluations),
-        float(progress.loss),
+        bool(progress["has_ended"]),
+        int(progress["evaluations"]),
+        float(progress["loss"]),
         is_cut_short,
     )
 

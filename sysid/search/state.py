@@ -79,7 +79,7 @@ class SearchRecord(Protocol):
 SEARCH_RECORD = make_record_dtype(SearchRecord)
 
 SearchArray: TypeAlias = Any
-"""A `numpy.recarray` of search records; NumPy's own types do not know the fields."""
+"""Array of search records. Python reads a field by key; attributes of a recarray are slow."""
 
 
 class IslandArrays(NamedTuple):

@@ -94,9 +94,9 @@ def test_searches_from_beside_a_warm_start_alone_do_not_end_it(
     )
     (island,) = state.islands
     search, first = island.search.copy(), island.history[-1]._replace(generation=1)
-    search.random_starts, search.confirmed_starts = random, 0
-    search.hop_count = search.returned_hops = beside
-    search.generation = find_next_border(algorithm, state)
+    search["random_starts"], search["confirmed_starts"] = random, 0
+    search["hop_count"] = search["returned_hops"] = beside
+    search["generation"] = find_next_border(algorithm, state)
     there = replace(island, search=search, history=(first,))
     state = replace(state, islands=(there,), is_warm=True, has_ended=False)
     assert exchange_migrants(algorithm, state, state.islands).has_ended is ends

@@ -21,8 +21,8 @@ def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = F
     start = begin_run(example(), ALONE, 1)
     state = advance_run(example(), replace(ALONE, generations=1), start)
     search = state.islands[0].search.copy()
-    search.generation, search.confirmed_starts, search.random_starts = 2, again, tried
-    search.returned_hops, search.hop_count = returned, hops
+    search["generation"], search["confirmed_starts"], search["random_starts"] = 2, again, tried
+    search["returned_hops"], search["hop_count"] = returned, hops
     island = replace(state.islands[0], search=search)
     return exchange_migrants(ALONE, replace(state, has_ended=False, is_warm=is_warm), [island])
 

@@ -30,9 +30,9 @@ def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
     """How far hops of that kind lead (DRAWN, D), each by its own draw."""
     island = create_islands(PROBLEM, ALONE, 3)[0]
     search, ends = island.search, np.empty((DRAWN, BEGIN.size))
-    search.hop_kind, search.hop_count = kind, 4  # four hops have looked for jumps
+    search["hop_kind"], search["hop_count"] = kind, 4  # four hops have looked for jumps
     for k in range(DRAWN):
-        search.generation, before = k, island.evaluations
+        search["generation"], before = k, island.evaluations
         island.point[:] = BEGIN
         hop_from_champion(evaluator, PLAN, island.arrays)
         assert island.evaluations - before == BEGIN.size + 1
@@ -53,7 +53,7 @@ def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(kind
 def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
     moves = moved(COUNTED_HOP + SINGLE_PARAMETER_HOP)
     search = create_islands(PROBLEM, ALONE, 3)[0].search
-    assert search.wide_differences == 0  # hops take the same derivatives
+    assert search["wide_differences"] == 0  # hops take the same derivatives
     matrix, _, base = build_normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
     inside = np.all((moves + BEGIN > 0.0) & (moves + BEGIN < 1.0), axis=1)
     assert np.mean(inside) > 0.8
@@ -77,9 +77,9 @@ def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(
     """Whether the fitness jumps decides what settles a search: all of the first hops have to."""
     for one in (0, SINGLE_PARAMETER_HOP):
         island = create_islands(PROBLEM, ALONE, 3)[0]
-        island.search.hop_kind = kind + one
+        island.search["hop_kind"] = kind + one
         island.point[:] = BEGIN
         spent = island.evaluations + BEGIN.size + 1
         hop_from_champion(PROBLEM.evaluator, PLAN, island.arrays)
         assert (island.evaluations > spent) == looks
-        assert island.search.champion_discontinuities == 0 or looks
+        assert island.search["champion_discontinuities"] == 0 or looks

@@ -54,7 +54,7 @@ def test_a_part_is_lost_where_the_champion_fits_it_better() -> None:
     for share, wanted in ((1.001, True), (0.999, False)):
         reached = share * loss
         assert is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, reached) == wanted
-    island.search.evaluations = plan().most_evaluations
+    island.search["evaluations"] = plan().most_evaluations
     assert not is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, 2.0 * loss)
     assert island.evaluations == plan().most_evaluations
 
@@ -67,11 +67,11 @@ def test_a_champion_whose_errors_are_no_noise_lets_fresh_starts_have_the_turns_o
     for turn in (9, 11, 13, 15):
         island = island_at(values)
         search = island.search
-        search.fitness_discontinuities = search.champion_converged = 1
-        search.local_searches = turn - 1
+        search["fitness_discontinuities"] = search["champion_converged"] = 1
+        search["local_searches"] = turn - 1
         start_local_search(PROBLEM.evaluator, plan(), island.arrays)
-        seen += "f" if search.from_random_start else "h" if search.hop_kind else "?"
-        assert (search.horizon <= 0.25) == bool(search.from_random_start)
+        seen += "f" if search["from_random_start"] else "h" if search["hop_kind"] else "?"
+        assert (search["horizon"] <= 0.25) == bool(search["from_random_start"])
     assert seen == kinds
 
 
@@ -79,10 +79,10 @@ def test_jumps_that_one_island_has_met_its_neighbour_knows_after_the_exchange() 
     shared = GeneticAlgorithm(population=26, islands=4, generations=3)
     islands = advance_run(PROBLEM, shared, begin_run(PROBLEM, shared, 4)).islands
     for island in islands:
-        island.search.fitness_discontinuities = 0
-    islands[1].search.fitness_discontinuities = 5
+        island.search["fitness_discontinuities"] = 0
+    islands[1].search["fitness_discontinuities"] = 5
     for known in ([0, 5, 5, 0], [0, 5, 5, 5], [5, 5, 5, 5]):
         islands, _ = migrate(islands, (24,) * 4, Migration(), 0)
-        assert [int(island.search.fitness_discontinuities) for island in islands] == known
+        assert [int(island.search["fitness_discontinuities"]) for island in islands] == known
     alone, _ = migrate(islands[:1], (24,), Migration(topology="unconnected"), 0)
-    assert alone[0].search.fitness_discontinuities == 5
+    assert alone[0].search["fitness_discontinuities"] == 5

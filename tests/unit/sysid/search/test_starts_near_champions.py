@@ -29,8 +29,8 @@ def begun(model: str, field: str) -> list[int]:
     return [
         int(after.search[field])
         for before, after in pairwise(generations(model))
-        if after.search.local_searches > before.search.local_searches > 4
-        and (before.search.fitness_discontinuities > 0 or model == "duffing-eq16")
+        if after.search["local_searches"] > before.search["local_searches"] > 4
+        and (before.search["fitness_discontinuities"] > 0 or model == "duffing-eq16")
     ]
 
 
@@ -38,13 +38,13 @@ def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
     problem = example("coulomb-eq16")
     (plan,) = make_plans(problem, ALONE, 3)
     start = create_islands(problem, ALONE, 3)[0]
-    start.search.fitness_discontinuities = start.search.champion_discontinuities = 1
+    start.search["fitness_discontinuities"] = start.search["champion_discontinuities"] = 1
     later = evolve(problem.evaluator, plan, start, 8)
     assert later.champion_rms < 0.9 * evolve(problem.evaluator, plan, start, 1).champion_rms
     known = later.search
-    assert (known.fitness_discontinuities, known.champion_discontinuities) == (1, 0)
-    assert generations("coulomb-eq16")[-1].search.fitness_discontinuities > 0
-    assert generations("duffing-eq16")[-1].search.fitness_discontinuities == 0
+    assert (known["fitness_discontinuities"], known["champion_discontinuities"]) == (1, 0)
+    assert generations("coulomb-eq16")[-1].search["fitness_discontinuities"] > 0
+    assert generations("duffing-eq16")[-1].search["fitness_discontinuities"] == 0
 
 
 def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> None:
@@ -71,12 +71,12 @@ def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
         UNCOUNTED_HOP + SINGLE_PARAMETER_HOP: 0,
     }
     for before, after in pairwise(states):
-        hop = int(before.search.hop_kind)
-        ended = before.search.in_sequence_search == 1 and after.search.in_sequence_search == 0
+        hop = int(before.search["hop_kind"])
+        ended = before.search["in_sequence_search"] == 1 and after.search["in_sequence_search"] == 0
         if ended and hop and after.champion_rms == before.champion_rms:
             ends[hop] += 1
-            assert after.search.hop_count - before.search.hop_count == (hop & COUNTED_HOP > 0)
-            assert after.search.step_count == 0
+            assert after.search["hop_count"] - before.search["hop_count"] == (hop & COUNTED_HOP > 0)
+            assert after.search["step_count"] == 0
     assert min(ends.values()) > 0
 
 
@@ -84,5 +84,5 @@ def test_it_can_be_cut_anywhere_there_too() -> None:
     problem = example("coulomb-eq16")
     (plan,) = make_plans(problem, ALONE, 3)
     at_once = evolve(problem.evaluator, plan, create_islands(problem, ALONE, 3)[0], GENERATIONS)
-    assert at_once.search.fitness_discontinuities > 0
+    assert at_once.search["fitness_discontinuities"] > 0
     assert bits(at_once) == bits(generations("coulomb-eq16")[-1])
