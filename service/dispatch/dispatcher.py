@@ -78,7 +78,7 @@ class Dispatcher:
         self._floors: dict[
             Lease, DocumentMaker
         ] = {}  # for jobs with noise, built when their runs end
-        self._aside: BackgroundJobs[Lease] = BackgroundJobs()
+        self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._looked = 0.0
         self._waking = threading.Thread(target=self._listen_for_wakeups, name="waker", daemon=True)
@@ -192,17 +192,17 @@ class Dispatcher:
             self._drop_lost_job(recorder, error)
             self._conclude_job(lease)
         else:
-            self._aside.start_job(lease, floors)
+            self._side_jobs.start_job(lease, floors)
 
     def _list_ready_to_conclude(self) -> list[Lease]:
         """List jobs whose bounds are ready, or are no longer wanted."""
-        stopped = [key for key in self._aside.pending_keys if self._recorders[key].is_stopped]
+        stopped = [key for key in self._side_jobs.pending_keys if self._recorders[key].is_stopped]
         for lease in stopped:
-            self._aside.cancel_job(lease)
-        return [*stopped, *self._aside.list_done()]
+            self._side_jobs.cancel_job(lease)
+        return [*stopped, *self._side_jobs.list_done()]
 
     def _conclude_job(self, lease: Lease) -> None:
-        floors = self._aside.take_result(lease) if lease in self._aside else None
+        floors = self._side_jobs.take_result(lease) if lease in self._side_jobs else None
         recorder = self._recorders.pop(lease)
         del self._priorities[lease]
         if lease in self._lost:
@@ -217,7 +217,7 @@ class Dispatcher:
         self._leases.forget_lease(lease)
 
     def _release_jobs(self, *, lost: bool = False) -> None:
-        self._aside.stop()
+        self._side_jobs.stop()
         for recorder in self._list_held_recorders():
             try:
                 retry_transient(recorder.write_all)

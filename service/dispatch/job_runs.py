@@ -82,7 +82,7 @@ class JobRuns:
     ) -> None:
         self._database, self._lease, self._job = database, claim.lease, claim.job
         self._store = store
-        self._shelf = SignalsBatch(store)
+        self._signals = SignalsBatch(store)
         self._problems: dict[str, ProblemSpec] = {}
         self._data: dict[str, DataKey] = {}
         self._read: OrderedDict[str, Records] = OrderedDict()
@@ -221,7 +221,7 @@ class JobRuns:
             parts.append(
                 ("validation", fit_records.validation, identification.simulated_validation)
             )
-        return add_fitted_signals(self._shelf, run, parts)
+        return add_fitted_signals(self._signals, run, parts)
 
     def note_failure(self, run: str) -> None:
         """Record the failure of a run, so that later runs of its chain stop waiting."""

@@ -101,8 +101,10 @@ class RunRecorder:
         self._n_begun, self._begun = claim.job.n_done, time.monotonic()
         self._n_known = 0
         self._taken: list[RunOutcome] = []  # from other runs, in the present transaction
-        self._told = self._wrote = self._kept = 0.0
-        self._news = False
+        self._progress_written_at = 0.0  # these three on the monotonic clock
+        self._results_written_at = 0.0
+        self._checkpoints_written_at = 0.0
+        self._has_new_progress = False
 
     def record_start(self, run: str) -> None:
         """Record that the run was sent to a worker."""
@@ -111,7 +113,7 @@ class RunRecorder:
     def record_worker_death(self, run: str, kills: int) -> None:
         """Record that the run alone killed its worker, `kills` times since its last progress."""
         self._pending.kills[run] = kills
-        self._wrote = 0.0  # write at once: the dispatcher may die too
+        self._results_written_at = 0.0  # write at once: the dispatcher may die too
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
@@ -121,7 +123,7 @@ class RunRecorder:
             live = self._live[run] = _LiveRun(state, seconds, begun_at)
             self._waiting.pop(run, None)
         live.state, live.seconds, live.changed = state, seconds, True
-        self._news = True
+        self._has_new_progress = True
 
     def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         """Record the result of a complete run."""
@@ -140,7 +142,7 @@ class RunRecorder:
         self._generation = max(self._generation, identification.generations)
         self._best = min(self._best, identification.rms)
         self._n_done += 1
-        self._news = True
+        self._has_new_progress = True
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """Record that the run failed."""
@@ -160,7 +162,7 @@ class RunRecorder:
             self._reasons.append(failure.reason)
             self._pending.messages.append(f"{run} failed: {failure.reason}")
         self._n_done += 1
-        self._news = True
+        self._has_new_progress = True
 
     def record_reuse(self, run: str, source: str) -> None:
         """Record that the run takes over the result of `source`."""
@@ -169,7 +171,7 @@ class RunRecorder:
         self._n_done += 1
         self._n_begun += 1  # reused runs do not count for the speed
         self._n_known += 1
-        self._news = True
+        self._has_new_progress = True
 
     def should_stop(self) -> bool:
         """Test whether the job was cancelled or its lease lost."""
@@ -184,15 +186,19 @@ class RunRecorder:
             If another dispatcher holds the job. Nothing was written.
         """
         now = time.monotonic()
-        tell = self._news and now - self._told > PROGRESS_SECONDS
-        keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
-        some = self._pending.has_runs
-        if tell or keep or (some and now - self._wrote > RESULTS_SECONDS):
-            self._commit_writes(now, tell=tell, keep=keep)
+        with_progress = (
+            self._has_new_progress and now - self._progress_written_at > PROGRESS_SECONDS
+        )
+        with_checkpoints = (
+            bool(self._live) and now - self._checkpoints_written_at > CHECKPOINT_SECONDS
+        )
+        has_results = self._pending.has_runs and now - self._results_written_at > RESULTS_SECONDS
+        if with_progress or with_checkpoints or has_results:
+            self._commit_writes(now, with_progress=with_progress, with_checkpoints=with_checkpoints)
 
     def write_all(self) -> None:
         """Write everything, including checkpoints, because the dispatcher stops."""
-        self._commit_writes(time.monotonic(), tell=True, keep=True)
+        self._commit_writes(time.monotonic(), with_progress=True, with_checkpoints=True)
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
@@ -202,7 +208,7 @@ class RunRecorder:
         """
         self._store_signals()
         with self._database.write_session() as session:
-            self._write_rows(session, tell=True, keep=False)
+            self._write_rows(session, with_progress=True, with_checkpoints=False)
             queue = LeaseQueue(session)
             if floors is not None:
                 queue.write_floors(self.lease, floors)
@@ -219,13 +225,13 @@ class RunRecorder:
 
     def write_results(self) -> None:
         """Write the last results without ending the job."""
-        self._commit_writes(time.monotonic(), tell=True, keep=False)
+        self._commit_writes(time.monotonic(), with_progress=True, with_checkpoints=False)
 
     def cancel_job(self) -> None:
         """End the job as cancelled. Earlier results of its runs remain."""
         self._store_signals()
         with self._database.write_session() as session:
-            self._write_rows(session, tell=True, keep=True)
+            self._write_rows(session, with_progress=True, with_checkpoints=True)
             LeaseQueue(session).finish_job(self.lease, JobState.CANCELLED)
 
     def _compute_progress(self) -> JobProgress:
@@ -275,11 +281,13 @@ class RunRecorder:
         self._pending.history.extend(to_history_points(run, history, written))
         self._pending.migrants.extend(to_migrant_points(run, migrants, logged))
 
-    def _commit_writes(self, now: float, *, tell: bool, keep: bool) -> None:
+    def _commit_writes(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
         self._store_signals()
         with self._database.write_session() as session:
-            self._write_rows(session, tell=tell, keep=keep)
-        self._mark_written(now, tell=tell, keep=keep)
+            self._write_rows(
+                session, with_progress=with_progress, with_checkpoints=with_checkpoints
+            )
+        self._mark_written(now, with_progress=with_progress, with_checkpoints=with_checkpoints)
 
     def _report_unstored_signals(self, runs: Sequence[str], error: Exception) -> None:
         """Report unstored signals. The results are written without them."""
@@ -307,7 +315,7 @@ class RunRecorder:
             for outcome in self._pending.outcomes
         ]
 
-    def _write_rows(self, session: Session, *, tell: bool, keep: bool) -> None:
+    def _write_rows(self, session: Session, *, with_progress: bool, with_checkpoints: bool) -> None:
         ledger, pending = RunWriter(session, self.lease), self._pending
         self._taken = take_over_runs(session, self.lease, pending.reused)
         ledger.start_runs(pending.started)
@@ -315,34 +323,34 @@ class RunRecorder:
         ledger.write_kills(pending.kills)
         for text in pending.messages:
             LeaseQueue(session).append_event(self.lease, "log", {"message": text})
-        if tell:
+        if with_progress:
             for run, live in self._live.items():
                 points = to_history_points(run, live.state.history, live.written)
                 ledger.append_history(
                     points, to_migrant_points(run, live.state.migrations, live.migrants)
                 )
             LeaseQueue(session).write_progress(self.lease, self._compute_progress())
-        if keep:
+        if with_checkpoints:
             changed = [(run, live) for run, live in self._live.items() if live.changed]
             ledger.save_checkpoints(
                 (run, live.state.evaluations, pack_state(live.state)) for run, live in changed
             )
 
-    def _mark_written(self, now: float, *, tell: bool, keep: bool) -> None:
-        self._pending, self._wrote = _PendingWrites(), now
+    def _mark_written(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
+        self._pending, self._results_written_at = _PendingWrites(), now
         self._evaluations += sum(outcome.evaluations for outcome in self._taken)
         self._generation = max(
             [self._generation, *(outcome.generations for outcome in self._taken)]
         )
         self._best = min([self._best, *_list_rms(self._taken)])
         self._taken = []
-        if tell:
-            self._told, self._news = now, False
+        if with_progress:
+            self._progress_written_at, self._has_new_progress = now, False
             for live in self._live.values():
                 live.written = dict(enumerate(map(len, live.state.history)))
                 live.migrants = len(live.state.migrations)
-        if keep:
-            self._kept = now
+        if with_checkpoints:
+            self._checkpoints_written_at = now
             for live in self._live.values():
                 live.changed = False
 
