@@ -13,4 +13,4 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("lagid", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("lagid")
 
-pytest_plugins = ["tests.database", "tests.cluster"]
+pytest_plugins = ["tests.database", "tests.cluster", "tests.needs"]

@@ -1,7 +1,6 @@
 """Exported programs, run: Python in this process, C compiled and called, scripts with a stub."""
 
 import ctypes
-import os
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -10,14 +9,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.model import Model
 from sysid.simulation.simulate import simulate
+from tests.needs import report_missing
 
-REQUIRED = "LAGID_REQUIRE_COMPILER"
 FLAGS = ("-O1", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
 
 
@@ -25,10 +23,8 @@ def compiler() -> str:
     """The C compiler; without one the test is skipped, at the gate it fails."""
     found = shutil.which("cc")
     if found is None:
-        if os.environ.get(REQUIRED) == "1":
-            pytest.fail(f"there is no C compiler (cc), and {REQUIRED} is 1")
-        pytest.skip(f"there is no C compiler (cc); set {REQUIRED}=1 to make that an error")
-    return found
+        report_missing("compiler", "there is no C compiler (cc)")
+    return str(found)
 
 
 def simulated(

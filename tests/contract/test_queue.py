@@ -116,9 +116,11 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     assert set(reap(database, clock).requeued) == others
 
 
-def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(database):
-    if not database.is_sqlite:
-        pytest.skip("only SQLite lets one writer in at a time")
+def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(
+    sqlite_database,
+):
+    """Only SQLite lets one writer in at a time."""
+    database = sqlite_database
     submit(database)
     is_held, may_end = threading.Event(), threading.Event()
     asked: list[bool] = []  # for the time, and whether the other writer had come to its end

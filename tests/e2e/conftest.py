@@ -1,6 +1,5 @@
 """A server over a filled data folder, and Chromium to look at its pages."""
 
-import os
 import threading
 import time
 from collections.abc import Iterator
@@ -16,9 +15,9 @@ from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.core.settings import Settings
 from tests.e2e.filled import Filled, fill
+from tests.needs import report_missing
 
 CHROMIUM = Path("/usr/bin/chromium")
-REQUIRED = "LAGID_REQUIRE_BROWSER"
 ARGUMENTS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -86,10 +85,7 @@ def _serving(folder: Path) -> Iterator[Site]:
 def browser() -> Iterator[Browser]:
     """Headless Chromium of the system."""
     if not CHROMIUM.exists():
-        reason = f"there is no Chromium at {CHROMIUM}"
-        if os.environ.get(REQUIRED) == "1":
-            pytest.fail(f"{reason}, and {REQUIRED} is 1")
-        pytest.skip(f"{reason}; install it, or set {REQUIRED}=1 to make its absence an error")
+        report_missing("browser", f"there is no Chromium at {CHROMIUM}")
     expect.set_options(timeout=LIMIT_MILLISECONDS)
     with sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)

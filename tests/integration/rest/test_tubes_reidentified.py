@@ -1,6 +1,5 @@
 """Tubes of three lengths through the recipe, on stored records of another program."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -8,17 +7,13 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from tests.identified import carried_out
-from tests.repository import ROOT
+from tests.needs import DATA
 from tests.rest import CSV, settings_of
 
-DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data")) / "tube_reference"
 # T and L in s by another program's least squares, printed to 0.1 ms.
 KNOWN = {5: (0.0153, 0.0181), 20: (0.1287, 0.0494), 40: (0.3492, 0.1127)}
 
-pytestmark = [
-    pytest.mark.data,
-    pytest.mark.skipif(not DATA.is_dir(), reason="the reference records (LAGID_DATA) are absent"),
-]
+pytestmark = pytest.mark.data
 
 
 def test_a_warm_batch_finds_the_known_time_constants_and_lags(tmp_path: Path) -> None:
@@ -27,7 +22,7 @@ def test_a_warm_batch_finds_the_known_time_constants_and_lags(tmp_path: Path) ->
         batch = []
         for length in KNOWN:
             name = f"tube_{length:03d}m_pattern1.csv"
-            content = (DATA / name).read_bytes()
+            content = (DATA / "tube_reference" / name).read_bytes()
             stored = server.post(f"/v1/datasets?name={name}", content=content, headers=CSV)
             batch.append({"x": length, "datasets": [stored.json()["id"]]})
         body = {

@@ -1,8 +1,6 @@
 """The measured records, as far as they are there: reading, trimming, pooling."""
 
 import csv
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,15 +8,11 @@ import pytest
 from service.formats.csv_recordings import read_csv
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Recording
-from tests.repository import ROOT
+from tests.needs import DATA
 
-DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
 LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
 
-pytestmark = [
-    pytest.mark.data,
-    pytest.mark.skipif(not DATA.is_dir(), reason="the measured records (LAGID_DATA) are absent"),
-]
+pytestmark = pytest.mark.data
 
 
 def tube(remainder: int) -> Recording:

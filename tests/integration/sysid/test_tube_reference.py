@@ -1,20 +1,12 @@
 """The tube plant against stored records that another program made of the same specification."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sysid.plants.tube import Tube, build_excitation, simulate_tube_record
-from tests.repository import ROOT
+from tests.needs import DATA
 
-DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data")) / "tube_reference"
-
-pytestmark = [
-    pytest.mark.data,
-    pytest.mark.skipif(not DATA.is_dir(), reason="the reference records (LAGID_DATA) are absent"),
-]
+pytestmark = pytest.mark.data
 
 
 @pytest.mark.parametrize("length", [5, 40])
@@ -22,7 +14,7 @@ pytestmark = [
 def test_both_ends_follow_the_record_within_0_2_percent_of_its_span(
     length: int, pattern: int
 ) -> None:
-    path = DATA / f"tube_{length:03d}m_pattern{pattern}.csv"
+    path = DATA / "tube_reference" / f"tube_{length:03d}m_pattern{pattern}.csv"
     times, command, first, second = np.loadtxt(
         path, delimiter=",", skiprows=1, usecols=(0, 1, 2, 3), unpack=True
     )

@@ -1,8 +1,5 @@
 """The onset delay: read from the measurement, against systems whose delay is known."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,13 +9,11 @@ from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model
 from sysid.residuals import onset_delay
 from sysid.residuals.onset_delay import OnsetDelay, estimate_onset_delays, find_unprompted_output
-from tests.repository import ROOT
+from tests.needs import DATA
 
 STEP, HOLD = 0.01, 300
 LEVELS = np.array([0.0, 1.0, 0.4, 0.9, 0.1, 0.6])
 K, T, L = 2.0, 0.35, 0.127
-
-DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
 
 
 def response(times: FloatArray, delay: float = L) -> FloatArray:
@@ -128,7 +123,6 @@ def test_steps_at_which_another_input_moves_too_do_not_count() -> None:
 
 
 @pytest.mark.data
-@pytest.mark.skipif(not DATA.is_dir(), reason="the measured records (LAGID_DATA) are absent")
 @pytest.mark.parametrize("length", [20, 40, 80])
 @pytest.mark.parametrize("pattern", [1, 2])
 def test_of_a_long_tube_it_is_about_3_46_ms_a_metre(length: int, pattern: int) -> None:
