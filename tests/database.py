@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
+from service.core.settings import make_sqlite_url
 from service.storage.migrate import upgrade_database
-from service.storage.sessions import Database, make_sqlite_url
+from service.storage.sessions import Database
 
 _numbers = count()
 

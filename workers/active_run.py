@@ -2,7 +2,12 @@
 
 from dataclasses import dataclass, field, replace
 
-from sysid.identification.run import exchange_migrants, find_next_border, is_finished
+from sysid.identification.run import (
+    count_generations,
+    exchange_migrants,
+    find_next_border,
+    is_finished,
+)
 from sysid.islands.state import RunState
 from sysid.search.island import Island
 from workers.packing import MeanCost, choose_slice_seconds, is_worth_spreading
@@ -93,8 +98,8 @@ class ActiveRun:
 
     def absorb_slice(self, state: RunState, seconds: float) -> None:
         """Record a time slice of the whole run."""
-        before = 0 if self.state is None else _count_generations(self.state)
-        done = _count_generations(state) - before
+        before = 0 if self.state is None else count_generations(self.state)
+        done = count_generations(state) - before
         if done > 0:
             self.generation_seconds = seconds / done
         self.state = state
@@ -118,7 +123,3 @@ class ActiveRun:
     def restart_epoch(self) -> None:
         """Discard the islands that are with the workers, and restart the epoch."""
         self.islands, self.awaited_islands, self.pack_handles = {}, set(), set()
-
-
-def _count_generations(state: RunState) -> int:
-    return sum(island.generation for island in state.islands)

@@ -1,6 +1,6 @@
 """Fair share: which job of several projects gets the next slot at the workers.
 
-The rules, in this order (`docs/decisions/0017-who-goes-next.md`):
+The rules, in this order (`docs/decisions/0017-fair-sharing-of-workers.md`):
 
 1. A higher priority goes first.
 2. A job's first `HEADSTART_SECONDS` of compute go before jobs that have had theirs. So a single

@@ -19,7 +19,8 @@ import httpx
 from benchmarks.breaking.processes import MARK, Family
 from service.client.client import Client
 from service.client.embedded import find_free_port
-from service.storage.sessions import Database, make_sqlite_url
+from service.core.settings import make_sqlite_url
+from service.storage.sessions import Database
 
 SHIM = Path(__file__).with_name("shim")
 START_SECONDS = 180.0

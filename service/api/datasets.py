@@ -11,7 +11,6 @@ from service.api.content import CROSS_ORIGIN, content_response, preflight_respon
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
 from service.core.wire import Page
 from service.datasets import datasets, simulated
-from service.datasets import datasets as lineage
 from service.datasets.recordings import load_recording
 from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
 from service.formats.csv_recordings import generate_csv
@@ -112,7 +111,7 @@ def read_signals(
 @router.get("/datasets/{dataset_id}/lineage")
 def read_lineage(dataset_id: str, session: ReadSession) -> LineageOut:
     """Read the lineage: the datasets it was derived from, and those derived from it."""
-    return lineage.read_lineage(session, dataset_id)
+    return datasets.read_lineage(session, dataset_id)
 
 
 @router.head("/datasets/{dataset_id}/content", include_in_schema=False)

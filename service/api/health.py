@@ -26,6 +26,8 @@ PROBLEM_KINDS = {
     "range": "The byte range lies outside the content.",
     "stale": "The resource has changed since it was read.",
     "too-large": "The body is larger than the stated limit.",
+    "too-much-unfinished": "The project has reached its limit of unfinished jobs or runs. "
+    "Try again later.",
     "unavailable": "A part of the service is down.",
     "unsupported-media-type": "The content type of the body is not supported.",
 }

@@ -13,7 +13,6 @@ from service.core.states import JobState
 from service.figures import plotly as figures
 from service.pages import figures as results
 from service.pages import pages, report
-from service.pages import pages as recipe_pages
 from service.pages import render as assets
 from service.pages.figures import FigureChoice, FigureName
 from service.pages.simulate import simulate_page as simulate
@@ -44,13 +43,13 @@ def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = 
 @router.get("/new/noise-sweep", **HIDDEN)
 def noise_sweep_page(session: ReadSession) -> Response:
     """Show the form of a noise sweep."""
-    return HtmlPage(recipe_pages.noise_sweep_page(session))
+    return HtmlPage(pages.noise_sweep_page(session))
 
 
 @router.get("/new/reidentify", **HIDDEN)
 def reidentify_page(session: ReadSession) -> Response:
     """Show the form of a batch re-identification."""
-    return HtmlPage(recipe_pages.reidentify_page(session))
+    return HtmlPage(pages.reidentify_page(session))
 
 
 @router.get("/jobs/{job_id}", **HIDDEN)

@@ -35,9 +35,9 @@ log = logging.getLogger(__name__)
 RETRY_HEADERS = {"Retry-After": "1"}
 TOO_DEEP_MESSAGE = "the body is nested too deeply"
 MAX_FAULTS = 1000
+"""Limit on reported fields, since each one is compared with the valid names."""
 MAX_DETAIL_CHARACTERS, MAX_TOTAL_CHARACTERS = 1000, 20_000
 """Limits for one message and for all: a quoted value may be as long as the body."""
-"""`MAX_FAULTS` limits the reported fields, since each one is compared with the valid names."""
 PROBLEM_TYPE = "application/problem+json"
 STATUS_KINDS = {
     404: "not-found",

@@ -28,6 +28,7 @@ from service.cli.common import (
 )
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
+from service.core.job_fields import METHOD_PATH, SIGMA_PATH
 from service.core.text import append_unit
 from sysid.core.settings import SEARCH_METHODS
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Recipes: sweeps for one purpose.", no_args_is_help=True)
 
 MAX_SIGMA_VALUES = 100_000
-SIGMA_PATH, RELATIVE_KEY, METHOD_PATH = "/noise/sigma", "relative", "/algorithm/method"
+RELATIVE_KEY = "relative"
 # With a relative σ, rows show the typed value and the value in the output's unit.
 GROUP_KEYS = {False: None, True: [RELATIVE_KEY, SIGMA_PATH, METHOD_PATH]}
 RELATIVE_NOTE = "relative σ is in standard deviations of the output, σ is in the output's unit"

@@ -19,6 +19,7 @@ from service.cli.common import (
     print_table,
 )
 from service.client.calls import ProblemError
+from service.core.job_fields import DATASETS_PATH
 from service.core.text import DASH, append_unit, format_labels, plain_unit
 from service.trends.text import PLAIN, build_tables, format_reference, list_notes
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-DATASETS_PATH = "/datasets"
 REUSE_NOTE = "this run was computed before; the result of {} is shown"
 
 

@@ -241,7 +241,7 @@ class AsyncClient:
 
     async def history(self, run: str) -> Document:
         """Fetch the improvements of each island's champion."""
-        return await self._fetch_document(calls.HISTORY_KEY(run))
+        return await self._fetch_document(calls.HISTORY(run))
 
     async def response(self, run: str, max_points: int = 1000) -> Document:
         """Fetch the measured and simulated outputs."""

@@ -179,7 +179,7 @@ SUMMARY = Endpoint("GET", "jobs/{}/summary")
 TREND = Endpoint("GET", "jobs/{}/trend")
 
 RUN = Endpoint("GET", "runs/{}")
-HISTORY_KEY = Endpoint("GET", "runs/{}/history")
+HISTORY = Endpoint("GET", "runs/{}/history")
 RESPONSE = Endpoint("GET", "runs/{}/response")
 SIMULATE_RUN = Endpoint("POST", "runs/{}:simulate")
 VALIDATE_RUN = Endpoint("POST", "runs/{}:validate")

@@ -245,7 +245,7 @@ class Client:
 
     def history(self, run: str) -> Document:
         """Fetch the improvements of each island's champion."""
-        return self._fetch_document(calls.HISTORY_KEY(run))
+        return self._fetch_document(calls.HISTORY(run))
 
     def response(self, run: str, max_points: int = 1000) -> Document:
         """Fetch the measured and simulated outputs."""

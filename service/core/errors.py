@@ -74,7 +74,7 @@ class ServiceError(Exception):
 class NotFound(ServiceError):
     """The dataset, model, job or run does not exist."""
 
-    status, kind, title = 404, "not-found", "There is no such thing"
+    status, kind, title = 404, "not-found", "Not found"
 
     def __init__(self, what: str, name: str, hint: str = "") -> None:
         super().__init__(f"there is no {what} {name!r}{hint}")
@@ -84,19 +84,19 @@ class NotFound(ServiceError):
 class DatasetNotFound(ServiceError):
     """No dataset has that identifier or name, or several share the name; the text says which."""
 
-    status, kind, title = 404, "not-found", "There is no such thing"
+    status, kind, title = 404, "not-found", "Not found"
 
 
 class Conflict(ServiceError):
     """The state of the resource does not allow the request."""
 
-    status, kind, title = 409, "conflict", "The state does not allow it"
+    status, kind, title = 409, "conflict", "Conflict with the current state"
 
 
 class StaleVersion(ServiceError):
     """A precondition does not hold: the resource has changed since it was read."""
 
-    status, kind, title = 412, "stale", "The thing has changed since it was read"
+    status, kind, title = 412, "stale", "The resource has changed since it was read"
 
 
 class TooLarge(ServiceError):
@@ -108,7 +108,7 @@ class TooLarge(ServiceError):
 class UnsupportedMediaType(ServiceError):
     """The media type of the body is not supported."""
 
-    status, kind, title = 415, "unsupported-media-type", "The body is of a kind that is not read"
+    status, kind, title = 415, "unsupported-media-type", "Unsupported media type"
 
 
 class UnsatisfiableRange(ServiceError):
@@ -129,7 +129,7 @@ class UnsatisfiableRange(ServiceError):
 class InvalidRequest(ServiceError):
     """The body or a query value is invalid."""
 
-    status, kind, title = 422, "invalid", "The request cannot be used"
+    status, kind, title = 422, "invalid", "The request is invalid"
 
     def __init__(self, errors: Iterable[FieldError]) -> None:
         faults = tuple(errors)
@@ -161,7 +161,7 @@ class Unavailable(ServiceError):
 class ServiceBusy(Unavailable):
     """Too many heavy requests run at once."""
 
-    title = "The service has too much to do"
+    title = "The service is busy"
 
     @property
     def headers(self) -> Mapping[str, str]:

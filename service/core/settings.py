@@ -13,6 +13,11 @@ LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 """Format of the log lines of all processes."""
 
 
+def make_sqlite_url(path: Path) -> str:
+    """Return the address of a SQLite file."""
+    return f"sqlite:///{path.absolute()}"
+
+
 class Settings(BaseSettings):
     """Storage, address and limits of the service.
 
@@ -70,8 +75,7 @@ class Settings(BaseSettings):
     @property
     def resolved_database_url(self) -> str:
         """SQLAlchemy address of the database."""
-        folder = self.data_dir.absolute()
-        return self.database_url or f"sqlite:///{folder / 'lagid.db'}"
+        return self.database_url or make_sqlite_url(self.data_dir / "lagid.db")
 
     @property
     def worker_memory_bytes(self) -> int | None:

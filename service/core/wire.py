@@ -82,17 +82,6 @@ class FieldProblem(Answer):
     column: int | None = None
 
 
-class ProblemDocument(Answer):
-    """An RFC 9457 problem document."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    instance: str | None = None
-    errors: list[FieldProblem] = Field(default=[])
-
-
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 

@@ -1,6 +1,5 @@
 """Background thread of the dispatcher, which builds documents of ended jobs."""
 
-import logging
 import threading
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
@@ -9,8 +8,6 @@ from queue import SimpleQueue
 from typing import Generic, TypeVar
 
 from service.storage.columns import Document
-
-_log = logging.getLogger(__name__)
 
 STOP_SECONDS = 2.0
 """Longest wait for the step in progress when the dispatcher stops."""

@@ -13,6 +13,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from service.core.job_fields import WARM_START_PATH
 from service.core.states import OPEN_STATES, JobState
 from service.jobs.axes import locate_cell
 from service.jobs.schemas import PREVIOUS, SweepIn
@@ -82,7 +83,7 @@ class OpenChains:
         return bool(self._free)
 
     def take_ready(self, limit: int, n_created: int) -> list[int]:
-        """Take at most `limit` numbers below `made` of runs that may begin, each once."""
+        """Take at most `limit` numbers below `n_created` of runs that may begin, each once."""
         self._open_chains(limit)
         numbers: list[int] = []
         for _ in range(len(self._free)):
@@ -152,9 +153,6 @@ class OpenChains:
         if chain.position == len(chain.numbers):
             return False
         return not chain.running or not self._waits(chain.numbers[chain.position])
-
-
-WARM_START_PATH = "/warm_start"
 
 
 class WarmStarts:

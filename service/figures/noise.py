@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.core.job_fields import SIGMA_PATH
 from service.core.text import append_unit, bracket_unit, format_value
 from service.figures import theme
 from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
 from service.figures.plotly import Figure, base_layout, to_json_numbers
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
-SIGMA_PATH = "/noise/sigma"
 METHOD_PATH = "/algorithm/method"
 MAX_SERIES = 12
 NORMAL_95 = 1.6449  # standard deviations from the median to the 95 % quantile

@@ -152,7 +152,7 @@ def _find_value_faults(
 ) -> Iterator[FieldError]:
     """Report faults of axis values; for a range or a logarithmic axis only the first one.
 
-    `known` are the faults of the job without its axes. They are not repeated for every value.
+    `base_faults` are the faults of the job without its axes. They are not repeated for every value.
     """
     reported: set[str] = set()
     n_wrong = 0

@@ -6,6 +6,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
+from service.core.job_fields import WARM_START_PATH
 from service.jobs import references
 from service.jobs.schemas import PREVIOUS, REFERENCE_PREFIX
 from service.jobs.stored_run import load_run
@@ -13,11 +14,9 @@ from service.models.models import have_same_equations
 from service.storage.tables import Run
 from sysid.models.model import Model
 
-WARM_START_POINTER = "/warm_start"
-
 
 def find_warm_start_faults(
-    session: Session, reference: str | None, model: Model, pointer: str = WARM_START_POINTER
+    session: Session, reference: str | None, model: Model, pointer: str = WARM_START_PATH
 ) -> list[FieldError]:
     """Report why a warm start or reference cannot be used: no such run, or another model.
 
@@ -31,7 +30,7 @@ def find_warm_start_faults(
     except InvalidRequest as error:
         return list(error.errors)
     text = _describe_other_parameters(session, run, model)
-    if not text and (pointer != WARM_START_POINTER or str(reference).startswith(REFERENCE_PREFIX)):
+    if not text and (pointer != WARM_START_PATH or str(reference).startswith(REFERENCE_PREFIX)):
         text = _describe_other_equations(session, run, model)
     return [FieldError(pointer, text)] if text else []
 
@@ -40,7 +39,7 @@ def resolve_warm_start(session: Session, reference: str | None) -> str | None:
     """Resolve the run that is meant now. Later acceptances do not change a queued job."""
     if reference in (None, PREVIOUS):
         return reference
-    return references.resolve_reference(session, str(reference), WARM_START_POINTER).id
+    return references.resolve_reference(session, str(reference), WARM_START_PATH).id
 
 
 def _describe_other_equations(session: Session, run: Run, model: Model) -> str:

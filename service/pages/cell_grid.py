@@ -8,9 +8,9 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
+from service.core.job_fields import SIGMA_PATH
 from service.core.states import JobState
 from service.core.text import format_count, format_number, format_value
-from service.figures.noise import SIGMA_PATH
 from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity
 from service.storage.columns import to_json
 from service.storage.tables import Job

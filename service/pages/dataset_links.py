@@ -6,8 +6,9 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.job_fields import DATASETS_PATH
 from service.core.text import format_labels
-from service.pages.views import DATASETS_PATH, sweep_axes
+from service.pages.views import sweep_axes
 from service.repositories.datasets import DatasetRepository
 from service.repositories.lineage import LineageRepository
 from service.storage.columns import Document

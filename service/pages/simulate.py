@@ -30,7 +30,7 @@ from service.jobs.stored_run import StoredRun, load_run
 from service.pages.render import render_template
 from service.pages.simulate_form import (
     CHOICES,
-    NOISE_KINDS,
+    SIMULATION_KINDS,
     TUNINGS,
     SimulationKind,
     SimulationQuery,
@@ -142,7 +142,7 @@ def simulate_page(
         "simulate.html",
         known=form,
         kind=kind,
-        kinds=NOISE_KINDS,
+        kinds=SIMULATION_KINDS,
         tunings=TUNINGS,
         choices=CHOICES,
         values={

@@ -15,7 +15,7 @@ from sysid.core.errors import suggest_name
 from sysid.models.model import Model
 
 SimulationKind = Literal["loop", "recording", "signal"]
-NOISE_KINDS: Mapping[SimulationKind, str] = {
+SIMULATION_KINDS: Mapping[SimulationKind, str] = {
     "loop": "Closed loop: a step of the reference",
     "recording": "Free run over a recording",
     "signal": "Free run on a signal",
@@ -107,11 +107,11 @@ def read_kind(query: Mapping[str, str]) -> SimulationKind:
         If the kind is unknown.
     """
     wanted = query.get("kind", "loop")
-    for kind in NOISE_KINDS:
+    for kind in SIMULATION_KINDS:
         if kind == wanted:
             return kind
     raise InvalidRequest.from_fault(
-        "?kind", f"found {wanted!r}; need one of {', '.join(NOISE_KINDS)}"
+        "?kind", f"found {wanted!r}; need one of {', '.join(SIMULATION_KINDS)}"
     )
 
 

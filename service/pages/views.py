@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from service.core.job_fields import DATASETS_PATH
 from service.core.states import OPEN_STATES, StateName
 from service.core.text import format_count, format_estimate, format_interval, format_value
 from service.core.wire import Answer
@@ -29,9 +30,6 @@ class EstimateView:
     bounds_text: str
     status: str
     reason: str
-
-
-DATASETS_PATH = "/datasets"
 
 
 class RunView(Answer):

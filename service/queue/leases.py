@@ -311,7 +311,8 @@ class LeaseQueue:
             Job.state == JobState.RUNNING, _ends_too_late(now, current_owners)
         )
         ends = _choose_by_owner(
-            {owner: now + length for owner, length in current_owners.lease_lengths.items()}, now
+            {owner: now + length for owner, length in current_owners.lease_lengths.items()},
+            now + DEFAULT_LEASE,
         )
         self._session.execute(ahead.values(lease_until=ends), execution_options=RETURNING_OPTIONS)
         expired = (
@@ -410,7 +411,8 @@ def _ends_too_late(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:
     latest = {
         owner: now + MAX_LEASE_LENGTHS * length for owner, length in owners.lease_lengths.items()
     }
-    return and_(Job.lease_owner.in_(latest), Job.lease_until > _choose_by_owner(latest, now))
+    other = now + MAX_LEASE_LENGTHS * DEFAULT_LEASE
+    return Job.lease_until > _choose_by_owner(latest, other)
 
 
 def _choose_by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnElement[datetime]:

@@ -70,9 +70,9 @@ def pack_history(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
             "run_id": run,
             "digest": _hash_part(data),
             "n_parameters": count,
-            "generation": max([int(point.generation) for point in part]),
-            "evaluations": max([int(point.evaluations) for point in part]),
-            "rms": min([float(point.rms) for point in part]),
+            "generation": max(int(point.generation) for point in part),
+            "evaluations": max(int(point.evaluations) for point in part),
+            "rms": min(float(point.rms) for point in part),
             "points": data,
         }
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
+from service.core.job_fields import SIGMA_PATH
 from service.core.states import JobState
 from service.jobs.axes import AxisGroup, SweepCell, locate_cell
 from service.jobs.stored_cells import read_axis_groups
@@ -21,8 +22,6 @@ from service.repositories.runs import RunRepository
 from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity, read_groups
 from service.storage.columns import to_json
 from service.storage.tables import Job
-
-SIGMA_PATH = "/noise/sigma"
 
 
 def group_all_runs(

@@ -30,7 +30,7 @@ def describe_differences(
     ----------
     bodies : sequence of dict
         Requests of the runs of the batch.
-    known : DatasetChannels
+    dataset_channels : DatasetChannels
         Channels of their datasets.
     """
     body = load_run(session, run.id).body

@@ -469,7 +469,7 @@ static double lately(const double *array, double before, long step, double part,
     return past(array, before, step, lag - part);
 }
 """
-_SIGN_LEVEL = """\
+_SIGN = """\
 static double sign(double x)
 {
     return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x;
@@ -488,7 +488,7 @@ static double greatest(double a, double b)
 }
 """
 HELPERS: Mapping[str, str] = {
-    "sign": _SIGN_LEVEL,
+    "sign": _SIGN,
     "least": _LEAST,
     "greatest": _GREATEST,
     "between": _BETWEEN,

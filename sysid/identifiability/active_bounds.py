@@ -36,7 +36,7 @@ class ActiveBound(NamedTuple):
     limit: float | None = None
 
     def __str__(self) -> str:
-        return f"{self.name} beyond its {self.side} bound {self.bound:g}{format_unit(self.unit)}"
+        return f"{self.name} is at its {self.side} bound {self.bound:g}{format_unit(self.unit)}"
 
     @property
     def advice(self) -> str:

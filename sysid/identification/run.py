@@ -21,7 +21,7 @@ from sysid.islands.evolve import (
 )
 from sysid.islands.migration import migrate
 from sysid.islands.state import RunState
-from sysid.islands.stopping import has_process_ended
+from sysid.islands.stopping import has_search_ended
 from sysid.search.island import Island, evolve, get_island_settings
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
@@ -100,7 +100,7 @@ def exchange_migrants(
 def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
     is_old = state.is_warm and state.is_unimproved_since(state.generation // 2)
     ends = make_stopping_rule(algorithm, is_warm=state.is_warm)
-    return has_process_ended(ends, state.generation, *state.champions_and_counters, is_old)
+    return has_search_ended(ends, state.generation, *state.champions_and_counters, is_old)
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
@@ -130,7 +130,7 @@ def advance_run(
         FIRST_CALL_STEPS // (size * max(problem.n_steps, 1)),
     )
     while not is_finished(algorithm, state) and not budget.is_over():
-        before, left = _count_generations(state), algorithm.generations - state.generation
+        before, left = count_generations(state), algorithm.generations - state.generation
         archipelago = evolve_islands(
             problem.evaluator,
             plan,
@@ -146,13 +146,13 @@ def advance_run(
             epoch=archipelago.epoch,
             migrations=state.migrations + archipelago.migrants,
         )
-        budget.record_call(_count_generations(state) - before)
+        budget.record_call(count_generations(state) - before)
         ended = archipelago.has_crossed and _has_ended(algorithm, state)
         state = replace(state, has_ended=ended, seconds=budget.measure_used_seconds())
     return state
 
 
-def _count_generations(state: RunState) -> int:
+def count_generations(state: RunState) -> int:
     """Count the generations of all islands together."""
     return sum(island.generation for island in state.islands)
 

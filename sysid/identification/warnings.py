@@ -108,7 +108,7 @@ def _warn_active_bounds(analysis: Analysis) -> list[str]:
     first, *others = analysis.active_bounds
     also = f", and {', '.join(map(str, others))}" if others else ""
     cures = " and ".join(bound.advice for bound in analysis.active_bounds)
-    return [f"the data pull {first}{also}. To widen: {cures}, unless it is a physical limit."]
+    return [f"{first}{also}. To widen: {cures}, unless it is a physical limit."]
 
 
 def _warn_held_inputs(problem: Problem) -> list[str]:

@@ -24,7 +24,7 @@ from sysid.islands.packed import (
     pack_islands,
     unpack_islands,
 )
-from sysid.islands.stopping import StoppingRule, has_process_ended
+from sysid.islands.stopping import StoppingRule, has_search_ended
 from sysid.search.evolution import is_done, run_generations
 from sysid.search.island import NO_TARGET_RMS, Island
 from sysid.search.state import COLUMN_RMS, COLUMN_VALUES, IslandArrays, IslandPlan, Migrant
@@ -263,7 +263,7 @@ def _run_epochs(
         if generation % plan.migration_interval == 0 and packed.champion_rms.size > 1:
             exchange_migrants(plan.routes, packed, epoch, log)
             epoch += 1
-        if has_process_ended(
+        if has_search_ended(
             plan.stopping_rule, generation, packed.champion_rms, packed.search, False
         ):
             break

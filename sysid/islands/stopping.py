@@ -73,7 +73,7 @@ def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
 
 
 @jit_compile
-def has_process_ended(
+def has_search_ended(
     rule: StoppingRule, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
 ) -> bool:
     """Return whether one of the stopping conditions holds at the border `generation`.

@@ -128,7 +128,7 @@ def estimate_coloured_covariance(
 
     Parameters
     ----------
-    seen : FloatArray, shape (n,)
+    influence : FloatArray, shape (n,)
         Influence of the weighted residuals of the scored samples on the loss.
     columns : FloatArray, shape (n, D)
         Sensitivities of these samples.

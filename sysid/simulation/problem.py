@@ -109,7 +109,11 @@ class Problem:
         """
         records = tuple(records)
         if model.rule is not None:
-            raise InvalidSettings("/model/terms", "the terms are not selected yet. See `selected`")
+            raise InvalidSettings(
+                "/model/terms",
+                "the terms of this model are not selected yet. Use `identify`, or "
+                "`sysid.selection.select.select_model_terms`",
+            )
         if not records:
             raise InvalidRecord("there is no record to compare the model with. Need one or more")
         scoring_starts = (

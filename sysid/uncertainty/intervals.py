@@ -123,12 +123,13 @@ def _explain_status(
         if lacks_stderr:
             return f"only a combination with other parameters has an effect on the output{others}"
         return (
-            f"the data say little about it apart from a combination with other parameters{others}"
+            "these data determine it poorly, apart from a combination with other "
+            f"parameters{others}"
         )
     if lacks_stderr:
         return "the output does not change with it"
     return {
-        "unidentifiable": "the data say little about it: its standard error is as large as "
+        "unidentifiable": "these data determine it poorly: its standard error is as large as "
         "its range",
         "at bound": "it lies at its bound; the standard error is that of the linear model",
     }.get(status, "")

@@ -31,13 +31,13 @@ def test_an_offset_outside_its_bounds_is_at_bound_and_is_the_one_to_widen(offset
     y0 = next(one for one in found.estimates if one.name == "y0")
     assert y0.status == "at bound"
     side, cure, bound = ("upper", "raise", 10) if offset > 0 else ("lower", "lower", -10)
-    assert found.warnings[0].startswith(f"the data pull y0 beyond its {side} bound {bound}")
+    assert found.warnings[0].startswith(f"y0 is at its {side} bound {bound}")
     assert f"{cure} the bound of y0" in found.warnings[0]
     assert not any("not identified" in one for one in found.warnings)
 
 
 def test_with_bounds_that_are_wide_enough_nothing_is_said_of_them() -> None:
     found = fitted(40.0, {"lower": 0, "upper": 100})
-    assert not any("the data pull" in one for one in found.warnings)
+    assert not any("To widen" in one for one in found.warnings)
     values = {one.name: one.value for one in found.estimates}
     assert values["y0"] == pytest.approx(40.0, abs=0.05)

@@ -8,8 +8,9 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 
+from service.core.settings import make_sqlite_url
 from service.storage import retry
-from service.storage.sessions import Database, make_sqlite_url
+from service.storage.sessions import Database
 
 
 def away() -> OperationalError:
