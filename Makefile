@@ -6,7 +6,7 @@ READY  := $(VENV)/.ready
 FAST   := not slow and not ray and not postgres and not browser and not data
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test check check-code check-unit check-laws format bench bench-full mutants real-data clean
+.PHONY: help demo paper serve test check check-code check-unit check-laws format bench bench-full mutants night real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -16,6 +16,7 @@ help:
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
 	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
 	@echo "make mutants     the gate's tests against faults made by hand, about an hour"
+	@echo "make night       all long tests with new seeds, mutants, robustness, torture: hours, one table"
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -83,6 +84,9 @@ bench-full: $(READY)
 
 mutants: $(READY)
 	$(BIN)/python -m tests.mutants -j 2
+
+night: $(READY)
+	$(BIN)/python -m benchmarks.night
 
 real-data: $(READY)
 	@mkdir -p benchmarks/results
