@@ -105,12 +105,12 @@ class FairShare(Generic[Key]):
         was_fresh = account.received_seconds < HEADSTART_SECONDS
         account.received_seconds += seconds
         account.level += seconds
-        mates = [
-            self._jobs[mate] for mate in self._list_past_headstart(account.project) if mate != job
+        others = [
+            self._jobs[other] for other in self._list_past_headstart(account.project) if other != job
         ]
         if was_fresh and account.received_seconds >= HEADSTART_SECONDS:
-            account.level = max(account.level, min((mate.level for mate in mates), default=0.0))
-        _raise_levels(account, mates)
+            account.level = max(account.level, min((other.level for other in others), default=0.0))
+        _raise_levels(account, others)
         project = self._projects[account.project]
         project.level += seconds
         _raise_levels(project, self._projects.values())

@@ -130,18 +130,18 @@ class Scheduler(Generic[Key]):
         If all cores are busy (`is_saturated`), a job with packs in flight keeps its turn. Otherwise
         its next slice would wait behind a pack of another job.
         """
-        going = {job: work for job, work in self._jobs.items() if job not in self._stopped}
+        active = {job: work for job, work in self._jobs.items() if job not in self._stopped}
         wanted = max(
-            MIN_PREFETCH_RUNS, PREFETCH_RUNS_PER_CORE * self._executor.slots // max(len(going), 1)
+            MIN_PREFETCH_RUNS, PREFETCH_RUNS_PER_CORE * self._executor.slots // max(len(active), 1)
         )
         for job in self._shares.order_jobs(
-            {job: len(work.in_flight) for job, work in going.items()}
+            {job: len(work.in_flight) for job, work in active.items()}
         ):
-            if not self._has_project_core(job) or self._has_report_backlog(going[job]):
+            if not self._has_project_core(job) or self._has_report_backlog(active[job]):
                 continue
-            if going[job].read_ahead(wanted, deadline):
+            if active[job].read_ahead(wanted, deadline):
                 return job
-            if going[job].in_flight and self.is_saturated:
+            if active[job].in_flight and self.is_saturated:
                 return None
         return None
 
@@ -162,8 +162,8 @@ class Scheduler(Generic[Key]):
         project = self._shares.get_project(job)
         in_flight = (
             len(work.in_flight)
-            for mate, work in self._jobs.items()
-            if self._shares.get_project(mate) == project
+            for other, work in self._jobs.items()
+            if self._shares.get_project(other) == project
         )
         return sum(in_flight) < self._project_cores
 

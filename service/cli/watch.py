@@ -28,7 +28,7 @@ BAR_COLUMNS = (
     TextColumn("{task.description:<24.24}", markup=False),
     BarColumn(bar_width=30),
     TextColumn("{task.percentage:>3.0f} %"),
-    TextColumn("{task.fields[told]}", markup=False),
+    TextColumn("{task.fields[text]}", markup=False),
     TextColumn("{task.fields[state]}"),
     TimeElapsedColumn(),
 )
@@ -42,12 +42,12 @@ def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Documen
         return client.wait(job_id)
     first = client.job(job_id)
     console = Console(stderr=True, highlight=False)
-    many = RunsProgress(lambda: _find_newest_run(client, job_id), first["rms_unit"])
+    runs = RunsProgress(lambda: _find_newest_run(client, job_id), first["rms_unit"])
     if not console.is_terminal:
-        lines = ProgressLog(partial(console.print, markup=False, soft_wrap=True), many)
+        lines = ProgressLog(partial(console.print, markup=False, soft_wrap=True), runs)
         return client.wait(job_id, progress=lines.log_progress)
     with Progress(*BAR_COLUMNS, console=console, refresh_per_second=5) as progress:
-        bars = _ProgressBars(client, progress, many, is_one=first["progress"]["runs"] > MAX_BARS)
+        bars = _ProgressBars(client, progress, runs, is_one=first["progress"]["runs"] > MAX_BARS)
         return client.wait(job_id, progress=bars.update_bars)
 
 
@@ -56,7 +56,7 @@ class RunsProgress:
 
     Parameters
     ----------
-    newest : callable
+    find_newest : callable
         Returns the run that ended last, or None.
     unit : str or None
         Unit of the RMS.
@@ -66,13 +66,13 @@ class RunsProgress:
 
     def __init__(
         self,
-        newest: Callable[[], Document | None],
+        find_newest: Callable[[], Document | None],
         unit: str | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        self._newest, self.unit, self.clock = newest, unit, clock
+        self._find_newest, self.unit, self.clock = find_newest, unit, clock
         self._begun: tuple[float, int] | None = None
-        self._looked, self._seen, self._text = 0.0, 0, ""
+        self._last_request, self._seen, self._text = 0.0, 0, ""
 
     def describe_progress(self, job: Document) -> list[str]:
         """Return the parts of a progress line of a job with several runs."""
@@ -100,9 +100,9 @@ class RunsProgress:
 
     def _describe_last_run(self, finished: int) -> str:
         now = self.clock()
-        if finished != self._seen and (not self._seen or now - self._looked >= RUN_POLL_SECONDS):
-            self._looked, self._seen = now, finished
-            run = self._newest()
+        if finished != self._seen and (not self._seen or now - self._last_request >= RUN_POLL_SECONDS):
+            self._last_request, self._seen = now, finished
+            run = self._find_newest()
             self._text = "" if run is None else f"last {self._describe_run(run)}"
         return self._text
 
@@ -113,32 +113,32 @@ class RunsProgress:
 
 
 class ProgressLog:
-    """Progress lines of one job for a log; `tell` writes a line."""
+    """Progress lines of one job for a log; `write_line` writes a line."""
 
-    def __init__(self, tell: Callable[[str], object], many: RunsProgress) -> None:
-        self._tell, self._many = tell, many
+    def __init__(self, write_line: Callable[[str], object], runs: RunsProgress) -> None:
+        self._write_line, self._runs = write_line, runs
         self._state, self._last, self._text = "", 0.0, ""
 
     def log_progress(self, job: Document) -> None:
         """Write a line if the state has changed or the last line is old enough."""
-        now = self._many.clock()
+        now = self._runs.clock()
         if job["state"] == self._state and now - self._last < LOG_INTERVAL_SECONDS:
             return
         text = self._format_line(job)
         if job["state"] == self._state and text == self._text:
             return
         self._state, self._last, self._text = job["state"], now, text
-        self._tell(text)
+        self._write_line(text)
 
     def _format_line(self, job: Document) -> str:
         done = job["progress"]
         parts = [f"{job['id']} {job['state']}", f"{done['finished']}/{done['runs']} runs"]
         if done["runs"] > 1:
-            return ", ".join([*parts, *self._many.describe_progress(job)])
+            return ", ".join([*parts, *self._runs.describe_progress(job)])
         if done["generation"]:
             parts.append(f"generation {done['generation']}")
         if done["best_rms"] is not None:
-            parts.append(self._many.format_rms(done["best_rms"]))
+            parts.append(self._runs.format_rms(done["best_rms"]))
         return ", ".join(parts)
 
 
@@ -146,9 +146,9 @@ class _ProgressBars:
     """Progress bars of one job: one for all runs, or one per run."""
 
     def __init__(
-        self, client: "Client", progress: Progress, many: RunsProgress, *, is_one: bool
+        self, client: "Client", progress: Progress, runs: RunsProgress, *, is_one: bool
     ) -> None:
-        self._client, self._progress, self._many = client, progress, many
+        self._client, self._progress, self._runs = client, progress, runs
         self._is_one = is_one
         self._bars: dict[str, TaskID] = {}
 
@@ -158,20 +158,20 @@ class _ProgressBars:
             part = done["finished"] / done["runs"]
             label = f"{done['finished']}/{done['runs']} runs"
             self._update_bar(
-                job["id"], label, part, ", ".join(self._many.describe_progress(job)), job["state"]
+                job["id"], label, part, ", ".join(self._runs.describe_progress(job)), job["state"]
             )
             return
         for run in self._client.runs(job["id"]):
             label = _describe_cell(run) or str(job["name"])
             self._update_bar(
-                run["id"], label, run["progress"], self._many.format_rms(run["rms"]), run["state"]
+                run["id"], label, run["progress"], self._runs.format_rms(run["rms"]), run["state"]
             )
 
     def _update_bar(self, key: str, label: str, part: float, text: str, state: str) -> None:
         if key not in self._bars:
-            self._bars[key] = self._progress.add_task(label, total=1.0, told=text, state=state)
+            self._bars[key] = self._progress.add_task(label, total=1.0, text=text, state=state)
         self._progress.update(
-            self._bars[key], description=label, completed=part, told=text, state=state
+            self._bars[key], description=label, completed=part, text=text, state=state
         )
 
 

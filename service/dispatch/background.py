@@ -33,38 +33,38 @@ class BackgroundJobs(Generic[Key]):
     """
 
     def __init__(self) -> None:
-        self._making: dict[Key, _BackgroundJob] = {}
+        self._jobs: dict[Key, _BackgroundJob] = {}
         self._queue: SimpleQueue[_BackgroundJob | None] = SimpleQueue()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
     def __contains__(self, key: Key) -> bool:
-        return key in self._making
+        return key in self._jobs
 
     @property
     def pending_keys(self) -> tuple[Key, ...]:
         """Keys of documents that were started and neither taken nor cancelled."""
-        return tuple(self._making)
+        return tuple(self._jobs)
 
     def start_job(self, key: Key, make: DocumentMaker) -> None:
         """Start to build the document of a key."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run_jobs, name="aside", daemon=True)
+            self._thread = threading.Thread(target=self._run_jobs, name="background", daemon=True)
             self._thread.start()
-        self._making[key] = job = _BackgroundJob(make())
+        self._jobs[key] = job = _BackgroundJob(make())
         self._queue.put(job)
 
     def list_done(self) -> tuple[Key, ...]:
         """List the keys of finished documents."""
-        return tuple(key for key, job in self._making.items() if job.future.done())
+        return tuple(key for key, job in self._jobs.items() if job.future.done())
 
     def take_result(self, key: Key) -> Document | None:
         """Take the finished document. An error of its steps is raised here."""
-        return self._making.pop(key).future.result()
+        return self._jobs.pop(key).future.result()
 
     def cancel_job(self, key: Key) -> None:
         """Cancel a document."""
-        job = self._making.pop(key, None)
+        job = self._jobs.pop(key, None)
         if job is not None:
             job.future.cancel()
 

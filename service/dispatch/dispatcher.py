@@ -60,18 +60,18 @@ class Dispatcher:
         self,
         database: Database,
         store: ObjectStore,
-        crew: Executor,
+        executor: Executor,
         leases: HeldLeases,
         *,
         project_cores: int | None = None,
     ) -> None:
         self.stopping = threading.Event()
-        self._database, self._store, self._crew = database, store, crew
+        self._database, self._store, self._executor = database, store, executor
         self._woken = threading.Event()
         self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
         # Keyed by lease: a job may return as a new attempt while packs of the old one still run.
-        self._feeder: Scheduler[Lease] = Scheduler(crew, project_cores=project_cores)
+        self._scheduler: Scheduler[Lease] = Scheduler(executor, project_cores=project_cores)
         self._recorders: dict[Lease, RunRecorder] = {}
         self._priorities: dict[Lease, int] = {}
         self._is_filling = False
@@ -80,8 +80,8 @@ class Dispatcher:
         ] = {}  # for jobs with noise, built when their runs end
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
-        self._looked = 0.0
-        self._waking = threading.Thread(target=self._listen_for_wakeups, name="waker", daemon=True)
+        self._checked_at = 0.0
+        self._listener = threading.Thread(target=self._listen_for_wakeups, name="notifier", daemon=True)
 
     def run_until_stopped(self) -> None:
         """Work until `stopping` is set. Then release every job with its checkpoints.
@@ -91,29 +91,29 @@ class Dispatcher:
         ClusterLost
             If the workers are lost. The jobs were released as lost.
         """
-        self._leases.start_heartbeat({"cpus": self._crew.slots, "pid": os.getpid()})
-        _log.info("ready: %s with %d cores", self._leases.owner, self._crew.slots)
-        self._waking.start()
+        self._leases.start_heartbeat({"cpus": self._executor.slots, "pid": os.getpid()})
+        _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
+        self._listener.start()
         try:
             while not self.stopping.is_set():
                 self.run_round()
         except ClusterLost:
             self._release_jobs(lost=True)
             raise
-        self._feeder.stop_jobs()
+        self._scheduler.stop_jobs()
         self._release_jobs()
 
     def run_round(self) -> None:
         """Run one round: check the queue, feed and collect runs, write."""
         if not self._recorders:
             self._woken.wait(IDLE_SECONDS)
-        pause = time.monotonic() - self._looked
+        pause = time.monotonic() - self._checked_at
         if self._woken.is_set() or pause > (BUSY_SECONDS if self._recorders else 0.0):
             self._woken.clear()
-            self._looked = time.monotonic()
+            self._checked_at = time.monotonic()
             self._check_queue()
         has_time = self._recorders and not self._is_filling
-        for lease in self._feeder.run_step(STEP_SECONDS if has_time else 0.0):
+        for lease in self._scheduler.run_step(STEP_SECONDS if has_time else 0.0):
             self._end_runs(lease)
         for lease in self._list_ready_to_conclude():
             self._conclude_job(lease)
@@ -152,9 +152,9 @@ class Dispatcher:
         return [recorder for lease, recorder in self._recorders.items() if lease not in self._lost]
 
     def _listen_for_wakeups(self) -> None:
-        with open_notifier(self._database, self.stopping) as waker:
+        with open_notifier(self._database, self.stopping) as notifier:
             while not self.stopping.is_set():
-                if waker.wait_for_change():
+                if notifier.wait_for_change():
                     self._woken.set()
         self._woken.set()
 
@@ -169,7 +169,7 @@ class Dispatcher:
         self._recorders[claim.lease] = recorder
         job = claim.job
         self._priorities[claim.lease] = job.priority
-        self._feeder.add_job(
+        self._scheduler.add_job(
             claim.lease, source, recorder, priority=job.priority, project=job.project_id
         )
         _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
@@ -264,56 +264,56 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
     compiling = threading.Thread(target=warm_up_worker, name="warm", daemon=True)
     compiling.start()  # in parallel with the start of Ray
     where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory_bytes)
-    crew = RayExecutor(where, local)
+    executor = RayExecutor(where, local)
     try:
         compiling.join()
-        crew.warm_up_workers()
+        executor.warm_up_workers()
         leases = HeldLeases(database, settings.lease_seconds)
-        dispatcher = Dispatcher(database, store, crew, leases, project_cores=settings.project_cores)
-        _stop_on_signals(dispatcher.stopping, crew)
+        dispatcher = Dispatcher(database, store, executor, leases, project_cores=settings.project_cores)
+        _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()
     except ClusterLost as error:
         _log.error("%s", error)
-        _exit_now(crew)
+        _exit_now(executor)
     finally:
-        crew.close()
+        executor.close()
         database.dispose()
     return 0
 
 
-def _stop_on_signals(stopping: threading.Event, crew: RayExecutor) -> None:
+def _stop_on_signals(stopping: threading.Event, executor: RayExecutor) -> None:
     """Stop on SIGTERM, on SIGINT, and when a supervisor closes standard input."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        stopping.set()  # the waker's thread sees it and wakes the main loop
+        stopping.set()  # the listener's thread sees it and wakes the main loop
 
     # After ray.init, which sets handlers of its own.
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     if os.environ.get(SUPERVISED_VARIABLE):
-        threading.Thread(target=_exit_with_parent, args=(stopping, crew), daemon=True).start()
-    threading.Thread(target=_exit_with_cluster, args=(stopping, crew), daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(stopping, executor), daemon=True).start()
+    threading.Thread(target=_exit_with_cluster, args=(stopping, executor), daemon=True).start()
 
 
-def _exit_with_parent(stopping: threading.Event, crew: RayExecutor) -> None:
+def _exit_with_parent(stopping: threading.Event, executor: RayExecutor) -> None:
     # Not through the buffer, because its lock would be held when the interpreter exits.
     while os.read(sys.stdin.fileno(), 1024):
         pass
     stopping.set()
     time.sleep(RELEASE_SECONDS)
-    _exit_now(crew)
+    _exit_now(executor)
 
 
-def _exit_with_cluster(stopping: threading.Event, crew: RayExecutor) -> None:
+def _exit_with_cluster(stopping: threading.Event, executor: RayExecutor) -> None:
     """Exit when the cluster is lost, even if the main thread hangs in a call to Ray."""
     while not stopping.wait(IDLE_SECONDS):
-        if not crew.is_alive():
+        if not executor.is_alive():
             time.sleep(RELEASE_SECONDS)
-            _exit_now(crew)
+            _exit_now(executor)
 
 
-def _exit_now(crew: RayExecutor) -> None:
+def _exit_now(executor: RayExecutor) -> None:
     """End the process without Ray's own shutdown, which may wait for lost processes."""
-    crew.abandon_cluster()
+    executor.abandon_cluster()
     logging.shutdown()
     os._exit(RESTART_EXIT_CODE)

@@ -124,7 +124,7 @@ class SignalsBatch:
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = _RetryingStore(store)
-        self._parcel = _Upload(self._store)
+        self._upload = _Upload(self._store)
 
     def add_file(self, file: bytes) -> StoredSignals:
         """Add a file to the current upload. A full upload is stored at once.
@@ -134,17 +134,17 @@ class SignalsBatch:
         ObjectStoreFailed
             If that cannot be written.
         """
-        parcel = self._parcel
-        if parcel.is_closed:
-            parcel = self._parcel = _Upload(self._store)
-        start = parcel.add_file(file)
-        if parcel.size >= UPLOAD_BYTES:
-            parcel.store_files()
-        return StoredSignals(parcel, start, len(file))
+        upload = self._upload
+        if upload.is_closed:
+            upload = self._upload = _Upload(self._store)
+        start = upload.add_file(file)
+        if upload.size >= UPLOAD_BYTES:
+            upload.store_files()
+        return StoredSignals(upload, start, len(file))
 
 
 def add_fitted_signals(
-    shelf: SignalsBatch,
+    batch: SignalsBatch,
     run: str,
     parts: Sequence[FittedPart],
 ) -> StoredSignals:
@@ -162,7 +162,7 @@ def add_fitted_signals(
         for fit in _list_fitted_outputs(role, records, simulated)
     ]
     write_fitted_outputs(run, fits, target)
-    return shelf.add_file(target.getvalue())
+    return batch.add_file(target.getvalue())
 
 
 def _list_fitted_outputs(

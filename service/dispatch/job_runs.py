@@ -85,7 +85,7 @@ class JobRuns:
         self._signals = SignalsBatch(store)
         self._problems: dict[str, ProblemSpec] = {}
         self._data: dict[str, DataKey] = {}
-        self._read: OrderedDict[str, Records] = OrderedDict()
+        self._cached_records: OrderedDict[str, Records] = OrderedDict()
         self._warm = WarmStarts(database, claim.job)
         self._groups: list[AxisGroup] | None = None
 
@@ -176,17 +176,17 @@ class JobRuns:
         RecordsUnavailable
             If a dataset or a channel is missing or invalid.
         """
-        if key not in self._read:  # needed by every run of a sweep to store its signals
-            self._read[key] = self._read_records(key)
-            while len(self._read) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
-                self._read.popitem(last=False)
-        self._read.move_to_end(key)
-        return self._read[key]
+        if key not in self._cached_records:  # needed by every run of a sweep to store its signals
+            self._cached_records[key] = self._read_records(key)
+            while len(self._cached_records) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
+                self._cached_records.popitem(last=False)
+        self._cached_records.move_to_end(key)
+        return self._cached_records[key]
 
     def _count_cached_samples(self) -> int:
         channels = (
             channel
-            for records in self._read.values()
+            for records in self._cached_records.values()
             for record in records
             for channel in (*record.inputs, *record.outputs)
         )

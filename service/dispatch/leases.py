@@ -136,16 +136,16 @@ class HeldLeases:
         for lease in held:
             try:
                 retry_transient(
-                    partial(self._release_lease, lease, lost=lost, beside_others=worked)
+                    partial(self._release_lease, lease, lost=lost, others_progressed=worked)
                 )
             except LeaseLost:
                 _log.info("%s belongs to another dispatcher", lease.job_id)
             self.forget_lease(lease)
 
-    def _release_lease(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:
+    def _release_lease(self, lease: Lease, *, lost: bool, others_progressed: bool) -> None:
         with self._database.write_session() as session:
             LeaseQueue(session, self._clock).release_job(
-                lease, lost=lost, beside_others=beside_others
+                lease, lost=lost, others_progressed=others_progressed
             )
 
     def _has_worked(self) -> bool:

@@ -81,16 +81,16 @@ class RunRecorder:
         database: Database,
         claim: Claim,
         save_signals: SaveSignals,
-        tell_failed: Callable[[str], None],
+        report_failure: Callable[[str], None],
     ) -> None:
         self.lease = claim.lease
-        self._tell_failed = tell_failed
+        self._report_failure = report_failure
         self.is_stopped = False
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MOST_REASONS)
         self._reasons = list(before.failure_reasons)
         # Evaluations of runs that have not continued yet.
-        self._waiting = before.checkpoint_evaluations
+        self._checkpoint_evaluations = before.checkpoint_evaluations
         self._database, self._save_signals = database, save_signals
         self._live: dict[str, _LiveRun] = {}
         self._pending = _PendingWrites()
@@ -99,8 +99,8 @@ class RunRecorder:
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
         self._n_begun, self._begun = claim.job.n_done, time.monotonic()
-        self._n_known = 0
-        self._taken: list[RunOutcome] = []  # from other runs, in the present transaction
+        self._n_reused = 0
+        self._reused_outcomes: list[RunOutcome] = []  # from other runs, in the present transaction
         self._progress_written_at = 0.0  # these three on the monotonic clock
         self._results_written_at = 0.0
         self._checkpoints_written_at = 0.0
@@ -119,15 +119,15 @@ class RunRecorder:
         """Record a state from which the run can continue."""
         live = self._live.get(run)
         if live is None:
-            begun_at = state.generation if run in self._waiting else 0
+            begun_at = state.generation if run in self._checkpoint_evaluations else 0
             live = self._live[run] = _LiveRun(state, seconds, begun_at)
-            self._waiting.pop(run, None)
+            self._checkpoint_evaluations.pop(run, None)
         live.state, live.seconds, live.changed = state, seconds, True
         self._has_new_progress = True
 
     def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         """Record the result of a complete run."""
-        self._waiting.pop(run, None)
+        self._checkpoint_evaluations.pop(run, None)
         identification, live = concluded.identification, self._live.pop(run, None)
         self._collect_history(run, identification.history, identification.migrations, live)
         try:
@@ -146,8 +146,8 @@ class RunRecorder:
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """Record that the run failed."""
-        self._tell_failed(run)
-        live, evaluations = self._live.pop(run, None), self._waiting.pop(run, 0)
+        self._report_failure(run)
+        live, evaluations = self._live.pop(run, None), self._checkpoint_evaluations.pop(run, 0)
         if live is not None:
             self._collect_history(run, live.state.history, live.state.migrations, live)
             evaluations = live.state.evaluations
@@ -167,10 +167,10 @@ class RunRecorder:
     def record_reuse(self, run: str, source: str) -> None:
         """Record that the run takes over the result of `source`."""
         self._pending.reused[run] = source
-        self._waiting.pop(run, None)
+        self._checkpoint_evaluations.pop(run, None)
         self._n_done += 1
         self._n_begun += 1  # reused runs do not count for the speed
-        self._n_known += 1
+        self._n_reused += 1
         self._has_new_progress = True
 
     def should_stop(self) -> bool:
@@ -215,8 +215,8 @@ class RunRecorder:
             job = queue.lock_job(self.lease)
             session.refresh(job)
             complaint = self._summarise_failures(job.n_failed, job.n_runs)
-            if self._n_known:
-                text = f"{self._n_known} of {job.n_runs} runs were taken over from earlier runs"
+            if self._n_reused:
+                text = f"{self._n_reused} of {job.n_runs} runs were taken over from earlier runs"
                 queue.append_event(self.lease, "log", {"message": text})
             if job.n_failed == job.n_runs:
                 queue.finish_job(self.lease, JobState.FAILED, complaint)
@@ -237,16 +237,16 @@ class RunRecorder:
     def _compute_progress(self) -> JobProgress:
         """Compute the job's progress; its generation is that of the most advanced run."""
         states = [live.state for live in self._live.values()]
-        best = min([self._best, *_list_rms(self._taken), *(state.rms for state in states)])
+        best = min([self._best, *_list_rms(self._reused_outcomes), *(state.rms for state in states)])
         return JobProgress(
             evaluations=self._evaluations
-            + sum(self._waiting.values())
-            + sum(outcome.evaluations for outcome in self._taken)
+            + sum(self._checkpoint_evaluations.values())
+            + sum(outcome.evaluations for outcome in self._reused_outcomes)
             + sum(state.evaluations for state in states),
             generation=max(
                 [
                     self._generation,
-                    *(outcome.generations for outcome in self._taken),
+                    *(outcome.generations for outcome in self._reused_outcomes),
                     *(state.generation for state in states),
                 ]
             ),
@@ -298,11 +298,11 @@ class RunRecorder:
 
     def _store_signals(self) -> None:
         """Store the files of ended runs, before the rows that refer to them."""
-        places: dict[str, SignalsLocation] = {}
+        locations: dict[str, SignalsLocation] = {}
         failed: dict[int, tuple[Exception, list[str]]] = {}
-        for run, shelved in self._pending.signals.items():
+        for run, signals in self._pending.signals.items():
             try:
-                places[run] = shelved.store_file()
+                locations[run] = signals.store_file()
             except ObjectStoreFailed as error:
                 failed.setdefault(id(error), (error, []))[1].append(run)
         for reason, runs in failed.values():
@@ -310,40 +310,40 @@ class RunRecorder:
         self._pending.signals = {}
         self._pending.outcomes = [
             outcome
-            if outcome.run_id not in places
-            else _add_signals_location(outcome, places[outcome.run_id])
+            if outcome.run_id not in locations
+            else _add_signals_location(outcome, locations[outcome.run_id])
             for outcome in self._pending.outcomes
         ]
 
     def _write_rows(self, session: Session, *, with_progress: bool, with_checkpoints: bool) -> None:
-        ledger, pending = RunWriter(session, self.lease), self._pending
-        self._taken = take_over_runs(session, self.lease, pending.reused)
-        ledger.start_runs(pending.started)
-        ledger.record_outcomes(pending.outcomes, pending.history, pending.migrants)
-        ledger.write_kills(pending.kills)
+        writer, pending = RunWriter(session, self.lease), self._pending
+        self._reused_outcomes = take_over_runs(session, self.lease, pending.reused)
+        writer.start_runs(pending.started)
+        writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
+        writer.write_kills(pending.kills)
         for text in pending.messages:
             LeaseQueue(session).append_event(self.lease, "log", {"message": text})
         if with_progress:
             for run, live in self._live.items():
                 points = to_history_points(run, live.state.history, live.written)
-                ledger.append_history(
+                writer.append_history(
                     points, to_migrant_points(run, live.state.migrations, live.migrants)
                 )
             LeaseQueue(session).write_progress(self.lease, self._compute_progress())
         if with_checkpoints:
             changed = [(run, live) for run, live in self._live.items() if live.changed]
-            ledger.save_checkpoints(
+            writer.save_checkpoints(
                 (run, live.state.evaluations, pack_state(live.state)) for run, live in changed
             )
 
     def _mark_written(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
         self._pending, self._results_written_at = _PendingWrites(), now
-        self._evaluations += sum(outcome.evaluations for outcome in self._taken)
+        self._evaluations += sum(outcome.evaluations for outcome in self._reused_outcomes)
         self._generation = max(
-            [self._generation, *(outcome.generations for outcome in self._taken)]
+            [self._generation, *(outcome.generations for outcome in self._reused_outcomes)]
         )
-        self._best = min([self._best, *_list_rms(self._taken)])
-        self._taken = []
+        self._best = min([self._best, *_list_rms(self._reused_outcomes)])
+        self._reused_outcomes = []
         if with_progress:
             self._progress_written_at, self._has_new_progress = now, False
             for live in self._live.values():

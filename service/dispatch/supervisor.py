@@ -49,7 +49,7 @@ class Supervisor:
     ) -> None:
         self._command, self._environment, self._log_path = tuple(command), dict(environment), log
         self._stopping = threading.Event()
-        self._lock, self._one_stop = threading.Lock(), threading.Lock()
+        self._lock, self._stop_lock = threading.Lock(), threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._keep_running, name="supervisor", daemon=True)
 
@@ -63,7 +63,7 @@ class Supervisor:
         A second call, also from another thread, waits for the first. A child that receives two
         signals would not end in order.
         """
-        with self._one_stop:
+        with self._stop_lock:
             if not self._stopping.is_set():
                 self._stop_child()
 

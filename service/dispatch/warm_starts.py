@@ -53,7 +53,7 @@ class OpenChains:
         Layout of the chains of this sweep.
     n_runs : int
         Runs of the job.
-    waits : callable
+    wait_rule : callable
         Whether the run with a number waits for those before it in its chain.
     ended : container of int
         Numbers of runs that an earlier attempt has ended. They are skipped.
@@ -63,10 +63,10 @@ class OpenChains:
         self,
         chain: ChainLayout,
         n_runs: int,
-        waits: Callable[[int], bool],
+        wait_rule: Callable[[int], bool],
         ended: Container[int] = frozenset(),
     ) -> None:
-        self._chain, self._waits, self._ended = chain, waits, ended
+        self._chain, self._wait_rule, self._ended = chain, wait_rule, ended
         self._n_chains, self._opened = n_runs // chain.length, 0
         self._open: dict[int, _OpenChain] = {}
         self._n_unfinished = 0  # open chains with runs left to take
@@ -152,7 +152,7 @@ class OpenChains:
     def _is_ready(self, chain: _OpenChain) -> bool:
         if chain.position == len(chain.numbers):
             return False
-        return not chain.running or not self._waits(chain.numbers[chain.position])
+        return not chain.running or not self._wait_rule(chain.numbers[chain.position])
 
 
 class WarmStarts:
@@ -169,10 +169,10 @@ class WarmStarts:
 
     def open_chains(self) -> OpenChains | None:
         """Open the chains of the job where it was left; None if no run waits for another."""
-        waits = _WaitRule(self._job)
+        wait_rule = _WaitRule(self._job)
         axes = SweepIn.model_validate(self._job.spec["sweep"]).axes
         chain = ChainLayout.from_axes(axes)
-        if chain is None or not waits.any:
+        if chain is None or not wait_rule.any:
             return None
         with self._database.read_session() as session:
             query = select(Run.number).where(
@@ -180,7 +180,7 @@ class WarmStarts:
                 Run.state.in_([state for state in JobState if state not in OPEN_STATES]),
             )
             ended = set(session.scalars(query))
-        self._chains = OpenChains(chain, self._job.n_runs, waits, ended)
+        self._chains = OpenChains(chain, self._job.n_runs, wait_rule, ended)
         return self._chains
 
     def register_run(self, row: Run) -> None:

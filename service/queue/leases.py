@@ -149,7 +149,7 @@ class LeaseQueue:
             .with_for_update(skip_locked=True, of=waiting)
         )
         now = self._read_clock()
-        taken = (
+        claim = (
             update(Job)
             .where(Job.id == first.scalar_subquery())
             .values(
@@ -161,7 +161,7 @@ class LeaseQueue:
             )
             .returning(Job)
         )
-        job = self._session.scalar(taken, execution_options=RETURNING_OPTIONS)
+        job = self._session.scalar(claim, execution_options=RETURNING_OPTIONS)
         if job is None:
             return None
         self._events.append_state(job)
@@ -272,17 +272,17 @@ class LeaseQueue:
         held = select(Job.id).where(Job.lease_owner == owner, Job.state == JobState.RUNNING)
         return bool(self._session.scalar(select(held.where(_has_progressed()).exists())))
 
-    def release_job(self, lease: Lease, *, lost: bool = False, beside_others: bool = False) -> None:
+    def release_job(self, lease: Lease, *, lost: bool = False, others_progressed: bool = False) -> None:
         """Give a job back when the dispatcher shuts down, or has `lost` its workers.
 
         Parameters
         ----------
-        beside_others : bool
+        others_progressed : bool
             Whether another job of the same owner progressed meanwhile.
         """
         job = self.lock_job(lease)
         if lost:
-            self._fail_or_retry(job, beside_others=beside_others)
+            self._fail_or_retry(job, others_progressed=others_progressed)
         elif job.cancel_requested:
             self._end_job(job, JobState.CANCELLED, None)
         else:
@@ -326,7 +326,7 @@ class LeaseQueue:
         busy = {owner for owner in lost_owners if self.has_progressed(owner)}
         fates: dict[JobState, list[str]] = {state: [] for state in JobState}
         for job in lost:
-            fates[self._fail_or_retry(job, beside_others=job.lease_owner in busy)].append(job.id)
+            fates[self._fail_or_retry(job, others_progressed=job.lease_owner in busy)].append(job.id)
         queued, failed, cancelled = (
             tuple(fates[state]) for state in (JobState.QUEUED, JobState.FAILED, JobState.CANCELLED)
         )
@@ -356,10 +356,10 @@ class LeaseQueue:
         if n_left:
             raise RowConflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
-    def _fail_or_retry(self, job: Job, *, beside_others: bool) -> JobState:
+    def _fail_or_retry(self, job: Job, *, others_progressed: bool) -> JobState:
         progressed = self._session.scalar(select(Job.id).where(Job.id == job.id, _has_progressed()))
         job.lost_leases = job.lost_leases + 1 if progressed is None else 1
-        is_spared = beside_others and progressed is None
+        is_spared = others_progressed and progressed is None
         max_losses = job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
         if job.cancel_requested:
             self._end_job(job, JobState.CANCELLED, None)
