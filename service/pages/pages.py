@@ -216,13 +216,13 @@ def load_run_row(session: Session, stored: StoredRun) -> RunView:
 def load_full_run(session: Session, stored: StoredRun) -> RunView:
     """Load a run with the heights of its plots, so that the page reserves their room."""
     run, result, model = stored.run, stored.result, stored.model
-    sought = list_free_parameters(session, stored)
+    names = list_free_parameters(session, stored)
     counts = len(model.outputs), len(model.inputs)
     # Plots that appear when the run ends lie below the live plots; they get their room then.
     heights = {
         "response": signals.response_height(*counts) if run.signals_sha256 else 0,
-        "convergence": convergence_height(len(sought), columns=3),
-        "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
+        "convergence": convergence_height(len(names), columns=3),
+        "correlation": correlation_height(len(names)) if result.get("correlation") else 0,
         "residuals": _residuals_height(result) if run.signals_sha256 else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
     }
@@ -248,8 +248,8 @@ def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
     """Height (px) of the figure of a sweep over σ; 0 for other jobs."""
     if job.n_runs == 1 or noise_group_keys(job.spec["sweep"]["axes"]) is None:
         return 0
-    sought = list_free_parameters(session, stored) if stored is not None else []
-    return noise_sweep_height(1 + len(sought), columns=2)
+    names = list_free_parameters(session, stored) if stored is not None else []
+    return noise_sweep_height(1 + len(names), columns=2)
 
 
 def _load_trend_view(session: Session, job: Job) -> TrendView | None:

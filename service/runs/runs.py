@@ -68,20 +68,20 @@ def get_run(session: Session, run_id: str) -> RunOut:
 
 def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> RunOut:
     """Build the answer for a run: its result document, or its progress."""
-    so_far: dict[str, Any] = {
+    progress: dict[str, Any] = {
         "rms": run.best_rms,
         "evaluations": run.evaluations,
         "generations": run.generations,
     }
     if written is not None:
-        so_far = {
+        progress = {
             "rms": written.rms,
             "evaluations": written.evaluations,
             "generations": written.generation,
         }
     return RunOut.model_validate(
         {
-            **so_far,
+            **progress,
             **(run.result or {}),
             "id": run.id,
             "job": run.job_id,

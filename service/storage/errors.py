@@ -118,4 +118,4 @@ class DatabaseNotAtHead(StorageError):
             f"the database is at revision {current or 'none'}, but this program needs {head}; "
             "run `lagid db upgrade`"
         )
-        self.found, self.head = current, head
+        self.current, self.head = current, head

@@ -156,19 +156,19 @@ class _GroupCache:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._found: OrderedDict[Hashable, list[RunGroup]] = OrderedDict()
+        self._groups: OrderedDict[Hashable, list[RunGroup]] = OrderedDict()
 
     def get(self, key: Hashable) -> list[RunGroup] | None:
         with self._lock:
-            if key in self._found:
-                self._found.move_to_end(key)
-            return self._found.get(key)
+            if key in self._groups:
+                self._groups.move_to_end(key)
+            return self._groups.get(key)
 
     def put(self, key: Hashable, groups: list[RunGroup]) -> None:
         with self._lock:
-            self._found[key] = groups
-            while len(self._found) > CACHE_SIZE:
-                self._found.popitem(last=False)
+            self._groups[key] = groups
+            while len(self._groups) > CACHE_SIZE:
+                self._groups.popitem(last=False)
 
 
 _cache = _GroupCache()

@@ -143,7 +143,11 @@ def _build_base(
         for fault in checker.find_faults(job.to_normal_form())
         if not (source.is_missing and fault.pointer.startswith("/datasets"))
     )
-    rows = [one for name in job.datasets if isinstance(one := checker.get_dataset(name), Dataset)]
+    rows = [
+        dataset
+        for name in job.datasets
+        if isinstance(dataset := checker.get_dataset(name), Dataset)
+    ]
     model = checker.resolve_model(job.model)
     if body.relative and not isinstance(model, list):
         faults += relative_faults(model[0], rows)

@@ -34,13 +34,13 @@ def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldErro
 
 
 def compute_spread(
-    store: ObjectStore, rows: Sequence[Dataset], channel: str, made: Recording | None = None
+    store: ObjectStore, rows: Sequence[Dataset], channel: str, unstored: Recording | None = None
 ) -> float:
     """Compute the standard deviation of a channel about each dataset's mean, over all datasets.
 
     Parameters
     ----------
-    made : Recording, optional
+    unstored : Recording, optional
         The recording of the only row if it is not stored.
 
     Raises
@@ -50,7 +50,7 @@ def compute_spread(
     """
     squares, count, largest = 0.0, 0, 0.0
     for row in rows:
-        recording = load_recording(store, row.sha256) if made is None else made
+        recording = load_recording(store, row.sha256) if unstored is None else unstored
         values = recording.channel(channel).values
         finite = values[np.isfinite(values)]
         if finite.size:

@@ -33,11 +33,11 @@ class BatchReference:
     why_no_trend: str = ""
     names: tuple[str, ...] = ()
 
-    def explain_gaps(self, x: str, places: Mapping[float, Any]) -> str:
+    def explain_gaps(self, x: str, labels: Mapping[float, Any]) -> str:
         """Explain why fewer comparisons are made than expected; empty if all are."""
         if self.trends:
             return ""
-        if self.x is not None and self.x in places:
+        if self.x is not None and self.x in labels:
             return f"{self.why_no_trend}, so the batch is compared with the reference run only"
         where = (
             f"the reference run has no label {x!r}"
@@ -63,15 +63,15 @@ def compare_with_reference(
     if fitted is None or reference_quantity is None or fitted.best_law is None:
         return drifts
     used = [(p.x, p.estimate.stderr) for p in reference_quantity.points if p.estimate is not None]
-    places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
-    new_places = np.array([x for x, _ in new])
+    reference_x, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
+    new_x = np.array([x for x, _ in new])
     moved = compute_law_drifts(
-        [estimate for _, estimate in new], fitted.best_law, places, errors, new_places, comparisons
+        [estimate for _, estimate in new], fitted.best_law, reference_x, errors, new_x, comparisons
     )
-    for (x, estimate), so_far in zip(new, moved, strict=True):
-        if isfinite(so_far.difference):
-            expected = estimate.value - so_far.difference
-            drifts.setdefault(x, []).append(_to_drift_out("trend", expected, so_far))
+    for (x, estimate), drift in zip(new, moved, strict=True):
+        if isfinite(drift.difference):
+            expected = estimate.value - drift.difference
+            drifts.setdefault(x, []).append(_to_drift_out("trend", expected, drift))
     return drifts
 
 

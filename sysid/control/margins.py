@@ -147,8 +147,8 @@ def _choose_frequencies(
     scales = sorted(_find_corner_frequencies(pair, control)) or [1.0]
     middle = scales[len(scales) // 2]
     scales = [
-        min(max(one, middle / _MAX_FREQUENCY_RATIO), middle * _MAX_FREQUENCY_RATIO)
-        for one in scales
+        min(max(frequency, middle / _MAX_FREQUENCY_RATIO), middle * _MAX_FREQUENCY_RATIO)
+        for frequency in scales
     ]
     low, high = scales[0] / 10**_OUTER_DECADES, scales[-1] * 10**_OUTER_DECADES
     decades = np.log10(high / low)
@@ -159,7 +159,8 @@ def _choose_frequencies(
         _find_last_frequency(coarse, size > _NEGLIGIBLE_GAIN, high),
     )
     delays = sum(
-        max((d for _, d in one), default=0.0) for one in (pair.numerator, pair.denominator)
+        max((d for _, d in polynomial), default=0.0)
+        for polynomial in (pair.numerator, pair.denominator)
     )
     delays += control.transport.delay if control.transport else 0.0
     fine = (

@@ -232,16 +232,21 @@ def _build_equations(
     identified: IdentifiedModel, linear: LinearForm
 ) -> tuple[list[list[QuasiPolynomial]], Mapping[str, list[QuasiPolynomial]]]:
     """Build M X = Σ b U: the matrix M, and b of every input."""
-    states = [one.name for one in identified.model.states]
+    states = [state.name for state in identified.model.states]
     power = 0 if is_difference(identified.model) else 1
     matrix = []
-    columns: dict[str, list[QuasiPolynomial]] = {one.name: [] for one in identified.model.inputs}
+    columns: dict[str, list[QuasiPolynomial]] = {
+        channel.name: [] for channel in identified.model.inputs
+    }
     for i, form in enumerate(linear.equations):
         read = _make_coefficient_reader(identified, i)
         row = [read(form, "state", name) for name in states]
         derivative: QuasiPolynomial = {(power, 0.0): 1.0}
         matrix.append(
-            [add_polynomials(derivative if i == j else {}, one, -1.0) for j, one in enumerate(row)]
+            [
+                add_polynomials(derivative if i == j else {}, entry, -1.0)
+                for j, entry in enumerate(row)
+            ]
         )
         for name, column in columns.items():
             column.append(read(form, "input", name))
@@ -278,15 +283,15 @@ def _make_coefficient_reader(
             at = [state.name for state in model.states].index(signal.name)
             updated = model.order.index(at) < model.order.index(equation or 0)
         finished = 0 if equation is None else 1
-        found = compute_taps(identified, signal, finished=finished, updated=updated)
-        return [(float(back), weight) for back, weight in found.items()]
+        taps = compute_taps(identified, signal, finished=finished, updated=updated)
+        return [(float(back), weight) for back, weight in taps.items()]
 
     def read(form: AffineForm, kind: str, name: str) -> QuasiPolynomial:
-        found: QuasiPolynomial = {}
+        polynomial: QuasiPolynomial = {}
         for signal, coefficient in form.terms.items():
             if (signal.kind, signal.name) == (kind, name):
                 parts = {(0, delay): weight * coefficient for delay, weight in weights(signal)}
-                found = add_polynomials(found, parts)
-        return found
+                polynomial = add_polynomials(polynomial, parts)
+        return polynomial
 
     return read

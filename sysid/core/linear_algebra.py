@@ -8,15 +8,15 @@ from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 
 
 class TruncatedSvd(NamedTuple):
-    """Singular values (K,), left vectors (N, K), right vectors (K, D), and `kept` (K,).
+    """Singular values (K,), left vectors (N, K), right vectors (K, D), and `retained` (K,).
 
-    K = min(N, D). A value is kept if it exceeds the rounding of the largest.
+    K = min(N, D). A value is retained if it exceeds the rounding of the largest.
     """
 
     left: FloatArray
     singular: FloatArray
     rows: FloatArray
-    kept: BoolArray
+    retained: BoolArray
 
 
 def truncated_svd(columns: FloatArray) -> TruncatedSvd:

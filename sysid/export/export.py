@@ -32,7 +32,7 @@ _WRITERS: Mapping[str, Callable[[IdentifiedModel], str]] = {
 
 def export_model(
     model: Model,
-    found: Identification | Mapping[str, float],
+    result: Identification | Mapping[str, float],
     format: ExportFormat = "python",
     *,
     sample_time: float | None = None,
@@ -47,7 +47,7 @@ def export_model(
     ----------
     model : Model
         The model that was identified. Selected terms are taken from the result.
-    found : Identification or mapping of str to float
+    result : Identification or mapping of str to float
         A result, or every parameter's value, with initial values such as ``x(0)`` if the model
         estimates them. Tied parameters may be left out.
     format : {"json", "python", "c", "control"}
@@ -70,13 +70,13 @@ def export_model(
         If the format is ``control`` and the model has no transfer function.
     """
     holds = dict(hold or {})
-    if isinstance(found, Identification):
-        if model.rule is not None and found.selection:
-            model = keep_terms(model, [one.term for one in found.selection])
-        known = {one.name for one in model.inputs}
-        holds = {**{k: v for k, v in found.holds.items() if k in known}, **holds}
-        sample_time = found.sample_time if sample_time is None else sample_time
-    values, covariance = _collect_values(model, found)
+    if isinstance(result, Identification):
+        if model.rule is not None and result.selection:
+            model = keep_terms(model, [term.term for term in result.selection])
+        input_names = {signal.name for signal in model.inputs}
+        holds = {**{k: v for k, v in result.holds.items() if k in input_names}, **holds}
+        sample_time = result.sample_time if sample_time is None else sample_time
+    values, covariance = _collect_values(model, result)
     _check_options(model, values, sample_time, holds)
     identified = IdentifiedModel(
         model, values, covariance, sample_time, holds, version, dict(provenance or {})
@@ -109,34 +109,37 @@ def write_export(identified: IdentifiedModel, format: str, pade_order: int = 3) 
 
 
 def _collect_values(
-    model: Model, found: Identification | Mapping[str, float]
+    model: Model, result: Identification | Mapping[str, float]
 ) -> tuple[tuple[IdentifiedValue, ...], Covariance | None]:
-    if isinstance(found, Identification):
+    if isinstance(result, Identification):
         values = tuple(
             IdentifiedValue(
                 estimate.name, estimate.value, estimate.unit, estimate.stderr, estimate.status
             )
-            for estimate in found.estimates
+            for estimate in result.estimates
         )
-        known = found.uncertainty
-        return values, None if known is None else Covariance(known.names, known.covariance)
+        uncertainty = result.uncertainty
+        return values, None if uncertainty is None else Covariance(
+            uncertainty.names, uncertainty.covariance
+        )
     units = {estimate.name: estimate.unit for estimate in model.parameters}
     units |= {name_initial_state(state.name, 0): state.unit for state in model.states}
-    numbers = _add_tied_values(model, found)
+    numbers = _add_tied_values(model, result)
     return tuple(IdentifiedValue(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
 
 
-def _add_tied_values(model: Model, found: Mapping[str, float]) -> dict[str, float]:
+def _add_tied_values(model: Model, values: Mapping[str, float]) -> dict[str, float]:
     """Add the values of tied parameters that are missing."""
-    free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
+    free = [replace(p, tied=None) if p.name in values else p for p in model.parameters]
     for parameter in free:
-        if parameter.tied is None and parameter.name not in found:
+        if parameter.tied is None and parameter.name not in values:
             raise InvalidSettings(f"/values/{parameter.name}", "a value is missing")
     return {
         **{
-            name: evaluate_expression(tie, found) for name, tie in resolve_ties(model, free).items()
+            name: evaluate_expression(tie, values)
+            for name, tie in resolve_ties(model, free).items()
         },
-        **found,
+        **values,
     }
 
 
@@ -146,10 +149,10 @@ def _check_options(
     sample_time: float | None,
     hold: Mapping[str, Hold],
 ) -> None:
-    _check_values(model, {one.name: one.value for one in values})
+    _check_values(model, {value.name: value.value for value in values})
     if sample_time is not None and not 0.0 < sample_time < float("inf"):
         raise InvalidSettings("/sample_time", f"{sample_time!r} is not a period in s")
-    inputs = [one.name for one in model.inputs]
+    inputs = [signal.name for signal in model.inputs]
     for name, kind in hold.items():
         if name not in inputs:
             detail = f"the model has no input {name!r}{suggest_name(name, inputs)}"

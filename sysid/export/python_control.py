@@ -85,10 +85,12 @@ def write_control_source(identified: IdentifiedModel, pade_order: int) -> str:
     functions = compute_transfer_functions(identified)
     if functions.period is None:
         body = _CONTINUOUS_TEMPLATE.replace("@ORDER@", str(pade_order))
-        pairs = [_write_pair(one, *map(_write_delayed_terms, one[2:])) for one in functions.pairs]
+        pairs = [
+            _write_pair(pair, *map(_write_delayed_terms, pair[2:])) for pair in functions.pairs
+        ]
     else:
         body = _DISCRETE_TEMPLATE.replace("@PERIOD@", write_number(functions.period))
-        pairs = [_write_pair(one, *_write_fraction(one)) for one in functions.pairs]
+        pairs = [_write_pair(pair, *_write_fraction(pair)) for pair in functions.pairs]
     body = body.replace("@PAIRS@", "\n".join(pairs))
     lines = [*describe_model(identified), *_describe_constants(identified, functions)]
     title, *others = map(escape_docstring, lines)
@@ -130,12 +132,12 @@ def _describe_constants(identified: IdentifiedModel, functions: TransferFunction
     """Describe the constants that the transfer functions leave out."""
     model = identified.model
     constants = [
-        f"the output {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.outputs, functions.linear_form.outputs, strict=True)
+        f"the output {output.name} has the constant {form.constant:.10g}"
+        for output, form in zip(model.outputs, functions.linear_form.outputs, strict=True)
         if form.constant
     ] + [
-        f"the equation of {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.states, functions.linear_form.equations, strict=True)
+        f"the equation of {state.name} has the constant {form.constant:.10g}"
+        for state, form in zip(model.states, functions.linear_form.equations, strict=True)
         if form.constant
     ]
     if not constants:

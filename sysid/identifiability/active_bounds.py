@@ -74,7 +74,7 @@ def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
 
 def rank_active_bounds(
     space: tuple[Parameter, ...],
-    reaches: tuple[Interval, ...],
+    limits: tuple[Interval, ...],
     influence: FloatArray,
     columns: FloatArray,
     place: FloatArray,
@@ -85,10 +85,10 @@ def rank_active_bounds(
     ----------
     space : tuple of Parameter
         The free parameters, D.
-    reaches : tuple of (float, float)
+    limits : tuple of (float, float)
         Lowest and highest value that the bounds of each may have.
     """
-    step = _LinearStep.from_place(space, reaches, influence, columns, place)
+    step = _LinearStep.from_place(space, limits, influence, columns, place)
     low, high = is_at_bounds(place)
     room = np.where(low, -step.outer_moves[0] - place, step.outer_moves[1] - (1.0 - place))
     candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _LEAST_ROOM))]
@@ -104,7 +104,7 @@ def rank_active_bounds(
         shares[best], loss = share, reached
     moved = place + step.solve_released(tuple(shares))[0]
     active = [
-        _make_active_bound(space[d], reaches[d], bool(low[d]), share)
+        _make_active_bound(space[d], limits[d], bool(low[d]), share)
         for d, share in shares.items()
         if (moved[d] < 0.0 if low[d] else moved[d] > 1.0)
     ]
@@ -112,9 +112,9 @@ def rank_active_bounds(
 
 
 def _make_active_bound(
-    parameter: Parameter, reach: Interval, is_low: bool, share: float
+    parameter: Parameter, limits: Interval, is_low: bool, share: float
 ) -> ActiveBound:
-    limit = reach[0] if is_low else reach[1]
+    limit = limits[0] if is_low else limits[1]
     finite_limit = limit if np.isfinite(limit) else None
     bound, side = (parameter.lower, "lower") if is_low else (parameter.upper, "upper")
     return ActiveBound(parameter.name, side, bound, parameter.unit, share, finite_limit)
@@ -136,7 +136,7 @@ class _LinearStep(NamedTuple):
     def from_place(
         cls,
         space: tuple[Parameter, ...],
-        reaches: tuple[Interval, ...],
+        limits: tuple[Interval, ...],
         influence: FloatArray,
         columns: FloatArray,
         place: FloatArray,
@@ -146,8 +146,8 @@ class _LinearStep(NamedTuple):
         target = -(basis.T @ influence)
         rest = float(influence @ influence - target @ target)
         ends = [
-            [_to_unit_value(parameter, end) for end in reach]
-            for parameter, reach in zip(space, reaches, strict=True)
+            [_to_unit_value(parameter, end) for end in interval]
+            for parameter, interval in zip(space, limits, strict=True)
         ]
         return cls(root, target, rest, np.array([-place, 1.0 - place]), np.array(ends).T - place)
 

@@ -97,13 +97,13 @@ def _find_group(groups: list[ExchangeGroup], unit: ExchangeUnit) -> ExchangeGrou
 
 
 def _merge_units(
-    groups: list[ExchangeGroup], one: ExchangeUnit, other: ExchangeUnit
+    groups: list[ExchangeGroup], first: ExchangeUnit, second: ExchangeUnit
 ) -> list[ExchangeGroup]:
     """Merge the groups of two units; all units follow the order of the first."""
-    first_group, second_group = _find_group(groups, one), _find_group(groups, other)
-    goes_to = dict(zip(one, other, strict=True))
-    first_unit = next(unit for unit in first_group if set(unit) == set(one))
-    second_unit = next(unit for unit in second_group if set(unit) == set(other))
+    first_group, second_group = _find_group(groups, first), _find_group(groups, second)
+    goes_to = dict(zip(first, second, strict=True))
+    first_unit = next(unit for unit in first_group if set(unit) == set(first))
+    second_unit = next(unit for unit in second_group if set(unit) == set(second))
     order = [second_unit.index(goes_to[d]) for d in first_unit]
     reordered = tuple(tuple(unit[i] for i in order) for unit in second_group)
     return [

@@ -122,8 +122,8 @@ class _WeightEquations:
     The weight of an expression that is 0 is None, because every weight fits.
     """
 
-    def __init__(self, known: Mapping[str, float], zero: set[str]) -> None:
-        self._known, self._zero = known, zero
+    def __init__(self, fixed: Mapping[str, float], zero: set[str]) -> None:
+        self._fixed, self._zero = fixed, zero
         self.equations: list[ScalingWeight] = []
 
     def require_equal(
@@ -160,7 +160,7 @@ class _WeightEquations:
     def _weigh_parameter(self, name: str) -> ScalingWeight | None:
         if name in self._zero:
             return None
-        return {} if name in self._known else {name: Fraction(1)}
+        return {} if name in self._fixed else {name: Fraction(1)}
 
     def _weigh_binary(self, tree: Binary) -> ScalingWeight | None:
         a, b = self.weigh_expression(tree.left), self.weigh_expression(tree.right)
@@ -182,7 +182,7 @@ class _WeightEquations:
         self, base: ScalingWeight | None, exponent: Expression, weight: ScalingWeight | None
     ) -> ScalingWeight | None:
         """Compute the weight of a power; an unknown exponent gives it and the base weight 0."""
-        power = _evaluate_fraction(exponent, self._known)
+        power = _evaluate_fraction(exponent, self._fixed)
         if power is None:
             self.require_equal({}, weight)
             return self._require_zero(base)
@@ -208,18 +208,18 @@ class _WeightEquations:
         return {}
 
 
-def _evaluate_fraction(tree: Expression, known: Mapping[str, float]) -> Fraction | None:
+def _evaluate_fraction(tree: Expression, fixed: Mapping[str, float]) -> Fraction | None:
     """Evaluate an expression of numbers and fixed parameters; None if it is no number."""
     match tree:
         case Number(value):
             return _to_fraction(value)
-        case Symbol(name, "parameter") if isfinite(known.get(name, nan)):
-            return _to_fraction(known[name])
+        case Symbol(name, "parameter") if isfinite(fixed.get(name, nan)):
+            return _to_fraction(fixed[name])
         case Unary("-", operand):
-            inside = _evaluate_fraction(operand, known)
+            inside = _evaluate_fraction(operand, fixed)
             return None if inside is None else -inside
         case Binary(operator, left, right) if operator in _ARITHMETIC:
-            a, b = _evaluate_fraction(left, known), _evaluate_fraction(right, known)
+            a, b = _evaluate_fraction(left, fixed), _evaluate_fraction(right, fixed)
             if a is None or b is None or (operator == "/" and b == 0):
                 return None
             return _ARITHMETIC[operator](a, b)

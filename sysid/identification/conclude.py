@@ -122,7 +122,7 @@ def _build_identification(
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
-                {one.name for one in analysis.estimates if one.stderr is not None},
+                {estimate.name for estimate in analysis.estimates if estimate.stderr is not None},
             ),
             *warn_time_limit(any(end.is_cut_short for end in refined if end is not None)),
             *_check_feedback(problem, simulated, analysis),
@@ -137,7 +137,7 @@ def _build_identification(
         residual_tests=tests,
         onset_delays=estimate_onset_delays(problem.model, problem.records),
         correlation_times=times,
-        holds={one.name: one.hold for one in problem.records[0].inputs},
+        holds={channel.name: channel.hold for channel in problem.records[0].inputs},
         sample_time=find_common_sample_time(problem.records),
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),

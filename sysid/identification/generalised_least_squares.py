@@ -312,13 +312,13 @@ class _WhitenedLeastSquares:
             solution = self._solve(start, whitening, steps)
             self.is_cut |= steps < _MAX_STEPS and not solution.is_converged
             solutions.append(solution)
-        self.ends = np.array([one.place for one in solutions])
-        self.rms = np.sqrt([one.loss for one in solutions])
+        self.ends = np.array([solution.place for solution in solutions])
+        self.rms = np.sqrt([solution.loss for solution in solutions])
         return solutions[int(np.argmin(self.rms))].place
 
     def _solve(self, place: FloatArray, whitening: Whitening, steps: int) -> LeastSquaresSolution:
         at_once = steps_at_once(place.size, self.problem.n_steps)
-        scored = self._scored._replace(owed=whitening.ar1_coefficient)
+        scored = self._scored._replace(ar1_coefficient=whitening.ar1_coefficient)
         solution = solve_least_squares(scored, place, 0.0, steps=steps, at_once=at_once)
         self.evaluations += solution.evaluations
         return solution

@@ -40,7 +40,7 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
         return []  # whitened, or not of squares
     if analysis.is_cut_short:
         return []  # the time is over
-    if not all(isinstance(one, EstimatedInitial) for one in problem.model.initial):
+    if not all(isinstance(initial, EstimatedInitial) for initial in problem.model.initial):
         return []  # a fixed start carries the effect of the assumption into the other samples
     parts = find_assumed_samples(problem, analysis)
     assumed = np.concatenate(parts)[problem.scored_rows]
@@ -60,7 +60,7 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
         f"{subject} an input from before the record, which was not recorded. Its first value is "
         f"assumed there. Without {pronoun} {', '.join(moves)}. Give the input before the record "
         "(trim a longer recording, or put rows with an empty output before it), or skip: "
-        f"{max(int(np.count_nonzero(one)) for one in parts)}"
+        f"{max(int(np.count_nonzero(part)) for part in parts)}"
     ]
 
 
@@ -93,12 +93,12 @@ def _compute_longest_input_delay(problem: Problem, analysis: Analysis) -> float:
     """Compute how far (s) the estimated time lags of inputs reach back."""
     if not list_delayed_values(problem.model, "input"):
         return 0.0
-    spans = {one.name: (one.value, one.value) for one in analysis.estimates}
+    spans = {estimate.name: (estimate.value, estimate.value) for estimate in analysis.estimates}
     step = problem.experiments[0].grid.integration_step
     return max(
-        compute_longest_delay(problem.model, one, spans, step)
-        for one in list_past_values(problem.model)
-        if one.kind == "input"
+        compute_longest_delay(problem.model, past, spans, step)
+        for past in list_past_values(problem.model)
+        if past.kind == "input"
     )
 
 

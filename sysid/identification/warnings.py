@@ -399,12 +399,12 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
     messages = []
     for quantity in problem.model.inputs:
         values = [
-            one.values
+            channel.values
             for record in problem.records
-            for one in record.inputs
-            if one.name == quantity.name
+            for channel in record.inputs
+            if channel.name == quantity.name
         ]
-        if unidentified and all(float(np.ptp(one)) == 0.0 for one in values):
+        if unidentified and all(float(np.ptp(signal)) == 0.0 for signal in values):
             messages.append(
                 f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
                 f"unidentified: {unidentified}"

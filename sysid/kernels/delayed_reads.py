@@ -21,7 +21,7 @@ class StateHistory:
 class TimeStep:
     """One step of the time loop: its number, and the history's row of the last finished step."""
 
-    step: IrValue
+    index: IrValue
     row: IrValue
 
 
@@ -35,7 +35,7 @@ class DelayedReader(Protocol):
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
 
-    def begin_step(self, turn: TimeStep) -> None:
+    def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
@@ -105,16 +105,18 @@ class LinearReader:
         self._newest = loop.carry(newest) if self._forward else None
         self._older, *self._chain = [loop.carry(value) for value in rest]
 
-    def begin_step(self, turn: TimeStep) -> None:
+    def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
         lanes = self._lanes
         if self._forward:
             b = lanes.builder
-            index = b.mul(b.add(turn.row, lanes.make_integer(1)), lanes.make_integer(lanes.width))
+            index = b.mul(
+                b.add(time_step.row, lanes.make_integer(1)), lanes.make_integer(lanes.width)
+            )
             self._sample_now = self._newest
             self._ahead = lanes.gather(self._ahead_addresses, index)
         else:
-            self._sample_now = self._load_sample(turn.row, self._top)
+            self._sample_now = self._load_sample(time_step.row, self._top)
         self._values = [
             lanes.interpolate(self._sample_now, self._fraction, self._older),
             *self._chain,
@@ -167,9 +169,9 @@ class DirectReader:
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
 
-    def begin_step(self, turn: TimeStep) -> None:
+    def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
-        self._turn = turn
+        self._time_step = time_step
         self._finished: dict[int, IrValue] = {}
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
@@ -209,7 +211,7 @@ class DirectReader:
             lanes.make_lane_numbers(), b.mul(place, lanes.splat(lanes.make_integer(lanes.width)))
         )
         addresses = lanes.compute_addresses(self._history.base, index)
-        return lanes.gather(addresses, b.mul(self._turn.row, lanes.make_integer(lanes.width)))
+        return lanes.gather(addresses, b.mul(self._time_step.row, lanes.make_integer(lanes.width)))
 
 
 def _interpolate_lagrange(
@@ -264,9 +266,9 @@ class InputReader:
         """Create the values that are carried from step to step."""
         self._chain = [loop.carry(value) for value in self._initial]
 
-    def begin_step(self, turn: TimeStep) -> None:
+    def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
-        self._values = [self._load_value(turn.step, self._places[0]), *self._chain]
+        self._values = [self._load_value(time_step.index, self._places[0]), *self._chain]
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at `halves` half steps."""

@@ -25,7 +25,7 @@ class StepEnvironment(Environment):
     parameters: ParameterEnvironment
     states: States
     signals: SignalReaders
-    turn: TimeStep
+    time_step: TimeStep
     half_steps: int
     values: dict[str, IrValue]
     equation: int = 0
@@ -34,7 +34,7 @@ class StepEnvironment(Environment):
         """Emit a parameter, the sampling period, the sample number or the time."""
         if symbol.kind in ("parameter", "period"):
             return self.parameters.emit_symbol(symbol)
-        steps = self.lanes.builder.sitofp(self.turn.step, DOUBLE)
+        steps = self.lanes.builder.sitofp(self.time_step.index, DOUBLE)
         if self.half_steps:
             steps = self.lanes.add(steps, self.lanes.make_number(self.half_steps / 2))
         if symbol.kind == "index":
@@ -65,13 +65,13 @@ class StepEnvironment(Environment):
 
     def _emit_sample(self, name: str, back: int) -> IrValue:
         if back > reads.MAX_REGISTER_OFFSET:
-            return self.states.load_far_sample(name, back, self.turn.row)
+            return self.states.load_far_sample(name, back, self.time_step.row)
         return self.states.now[name] if back == 0 else self.states.line[name][back]
 
     def _emit_input(self, past: PastValue) -> IrValue:
         halves = self.half_steps - 2 * past.offset
         if past.delay is None:
-            return self.signals.load_input(past.name, halves, self.turn.step)
+            return self.signals.load_input(past.name, halves, self.time_step.index)
         zero = self.lanes.make_number(0.0)
         return self.signals.get_reader(past, halves).read_value(halves, zero, zero)
 

@@ -60,8 +60,8 @@ def emit_kernel(model: Model, variant: KernelVariant) -> str:
 def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:
     """Simulate a block and add its losses to the stored ones."""
     loss, target = block.emit_simulation(), block.arguments["loss"]
-    so_far = lanes.load_row(target, block.first)
-    lanes.store_row(lanes.add(so_far, loss), target, block.first)
+    total = lanes.load_row(target, block.first)
+    lanes.store_row(lanes.add(total, loss), target, block.first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,23 +96,23 @@ class _Block:
         )
 
         loop = KernelLoop(lanes)
-        turn = TimeStep(loop.carry(lanes.make_integer(0)), loop.carry(row))
+        time_step = TimeStep(loop.carry(lanes.make_integer(0)), loop.carry(row))
         states.open_loop(loop)
         signals.open_loop(loop)
         comparison.open_loop(loop)
-        signals.begin_step(turn)
-        build_environment = _bind_environment(lanes, model, scope, states, signals, turn)
-        comparison.compare_step(turn, states, build_environment)
-        loop.leave_if(lanes.builder.icmp_signed(">=", turn.step, experiment.get_head("last")))
+        signals.begin_step(time_step)
+        build_environment = _bind_environment(lanes, model, scope, states, signals, time_step)
+        comparison.compare_step(time_step, states, build_environment)
+        loop.leave_if(lanes.builder.icmp_signed(">=", time_step.index, experiment.get_head("last")))
         if self.variant.one_step:
-            states.store_states(turn.row)
-            signals.begin_step(turn)
-        following = self._emit_following_states(turn, states, build_environment)
+            states.store_states(time_step.row)
+            signals.begin_step(time_step)
+        following = self._emit_following_states(time_step, states, build_environment)
         signals.end_step(loop, following)
         states.end_step(loop, following)
         comparison.end_step(loop)
-        loop.update(turn.row, states.advance_row(turn.row))
-        loop.update(turn.step, lanes.builder.add(turn.step, lanes.make_integer(1)))
+        loop.update(time_step.row, states.advance_row(time_step.row))
+        loop.update(time_step.index, lanes.builder.add(time_step.index, lanes.make_integer(1)))
         loop.repeat()
         return self._mark_divergence(comparison.loss, states)
 
@@ -136,7 +136,7 @@ class _Block:
         return self._load_parameter(self.experiment.get_state_field(i, "row"))
 
     def _emit_following_states(
-        self, turn: TimeStep, states: States, build_environment: EnvironmentBuilder
+        self, time_step: TimeStep, states: States, build_environment: EnvironmentBuilder
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
@@ -144,7 +144,7 @@ class _Block:
             return emit_next_states(
                 lanes, model, self.experiment.get_number("step"), states, build_environment
             )
-        following = lanes.builder.add(turn.step, lanes.make_integer(1))
+        following = lanes.builder.add(time_step.index, lanes.make_integer(1))
         measured = [
             lanes.splat(self._load_measured_state(i, following)) for i in range(len(states.names))
         ]
@@ -175,13 +175,15 @@ def _bind_environment(
     scope: ParameterEnvironment,
     states: States,
     signals: SignalReaders,
-    turn: TimeStep,
+    time_step: TimeStep,
 ) -> EnvironmentBuilder:
     """Bind the environment of this step; its places and the states' values stay open."""
 
     def build_environment(
         halves: int, values: dict[str, IrValue], equation: int = 0
     ) -> StepEnvironment:
-        return StepEnvironment(lanes, model, scope, states, signals, turn, halves, values, equation)
+        return StepEnvironment(
+            lanes, model, scope, states, signals, time_step, halves, values, equation
+        )
 
     return build_environment

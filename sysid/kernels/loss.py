@@ -40,23 +40,23 @@ class LossAccumulator:
         self._carried_earlier = list(self._earlier)
 
     def compare_step(
-        self, turn: TimeStep, states: States, build_environment: EnvironmentBuilder
+        self, time_step: TimeStep, states: States, build_environment: EnvironmentBuilder
     ) -> None:
         """Compare if the step is a grid point; one-step prediction then replaces the states."""
         lanes, b = self._lanes, self._lanes.builder
         substeps = self._substeps
         if substeps == 1:
-            self._compare_grid_point(turn.step, states, build_environment)
+            self._compare_grid_point(time_step.index, states, build_environment)
             return
         number = lanes.make_integer(substeps)
-        grid = b.sdiv(turn.step, number)
+        grid = b.sdiv(time_step.index, number)
         before = [self.loss, *self._earlier, *states.now.values()]
 
         def body() -> list[IrValue]:
             self._compare_grid_point(grid, states, build_environment)
             return [self.loss, *self._earlier, *states.now.values()]
 
-        is_grid = b.icmp_signed("==", b.mul(grid, number), turn.step)
+        is_grid = b.icmp_signed("==", b.mul(grid, number), time_step.index)
         self.loss, *rest = lanes.branch(is_grid, body, before)
         count = len(self._earlier)
         self._earlier = rest[:count]

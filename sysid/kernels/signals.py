@@ -311,10 +311,10 @@ class SignalReaders:
         for _, reader in self._owners:
             reader.open_loop(loop)
 
-    def begin_step(self, turn: TimeStep) -> None:
+    def begin_step(self, time_step: TimeStep) -> None:
         """Begin a step of all readers."""
         for _, reader in self._owners:
-            reader.begin_step(turn)
+            reader.begin_step(time_step)
 
     def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
         """End a step of all readers."""

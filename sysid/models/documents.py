@@ -148,7 +148,7 @@ class DocumentReader:
             raise InvalidModel(self._faults)
 
     def read_section(
-        self, value: object, place: str, known: Iterable[str] | None = None, most: int = 256
+        self, value: object, place: str, allowed: Iterable[str] | None = None, most: int = 256
     ) -> dict[str, Any]:
         """Read a mapping of names to values; None is an empty one.
 
@@ -157,7 +157,7 @@ class DocumentReader:
         value : object
         place : str
             JSON pointer of the mapping.
-        known : iterable of str or None
+        allowed : iterable of str or None
             Fields that it may have; None: any name.
         most : int
             Largest number of fields.
@@ -170,7 +170,7 @@ class DocumentReader:
         if len(value) > most:
             self.add_fault(place, f"has {len(value)} entries; at most {most} are allowed")
             return {}
-        names = tuple(known) if known is not None else None
+        names = tuple(allowed) if allowed is not None else None
         fields: dict[str, Any] = {}
         for key, item in value.items():
             if not isinstance(key, str):

@@ -149,7 +149,7 @@ class SignalUnits:
         signals = [(signal.name, signal.unit) for signal in model.inputs]
         signals += [(signal.name, signal.unit) for signal in model.outputs]
         owner = f"model {model.name!r}"
-        self._known = {name: (unit, owner) for name, unit in signals if not is_blank_unit(unit)}
+        self._units = {name: (unit, owner) for name, unit in signals if not is_blank_unit(unit)}
 
     def describe_mismatch(self, signal: str, channel: str, unit: str | None, where: str) -> str:
         """Describe how a channel's unit differs from its signal's; empty if it does not.
@@ -161,10 +161,10 @@ class SignalUnits:
         """
         if unit is None or is_blank_unit(unit):
             return ""
-        expected, owner = self._known.setdefault(signal, (unit, where))
+        expected, owner = self._units.setdefault(signal, (unit, where))
         # A readable unit checks more of the records that follow.
         if is_readable_unit(unit) and not is_readable_unit(expected):
-            self._known[signal] = (unit, where)
+            self._units[signal] = (unit, where)
         difference = describe_difference(unit, expected)
         if not difference:
             return ""

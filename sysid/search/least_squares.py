@@ -61,7 +61,7 @@ class ScoredSamples(NamedTuple):
     evaluator : Evaluator
     rows : IntArray, shape (n,)
     weight : FloatArray, shape (n,)
-    owed : FloatArray, shape (n,), or empty
+    ar1_coefficient : FloatArray, shape (n,), or empty
         AR(1) coefficient of each sample (`sysid.residuals.whitening.Whitening`). Empty: the
         residuals are not whitened.
     """
@@ -69,7 +69,7 @@ class ScoredSamples(NamedTuple):
     evaluator: Evaluator
     rows: IntArray
     weight: FloatArray
-    owed: FloatArray = np.zeros(0)
+    ar1_coefficient: FloatArray = np.zeros(0)
 
 
 class _Descent(NamedTuple):
@@ -232,7 +232,7 @@ def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
         row = scored.rows[i]
         for p in range(places.shape[0]):
             errors[p, i] = scored.weight[i] * (predicted[row, p] - evaluator.measured[row])
-    _whiten(scored.owed, errors)
+    _whiten(scored.ar1_coefficient, errors)
     return errors
 
 

@@ -98,12 +98,12 @@ class _StartFinder:
             if parameter.fixed is not None
         }
         self._terms = tuple(t for t in model.terms if fixed.get(t.coefficient_name) != 0.0)
-        self._given = {
+        self._fixed = {
             i: fixed[t.coefficient_name]
             for i, t in enumerate(self._terms)
             if t.coefficient_name in fixed
         }
-        self._sought = [i for i in range(len(self._terms)) if i not in self._given]
+        self._free = [i for i in range(len(self._terms)) if i not in self._fixed]
         rows = int(_MOST_OPERATIONS / (2 * (2 * len(self._terms) + 1) ** 2))
         self._rows = self._regression.thin_rows(max(rows, 20 * len(self._terms)))
 
@@ -173,16 +173,16 @@ class _StartFinder:
     ) -> FloatArray:
         """Solve the least-squares coefficients (T,); fixed ones stay."""
         fixed = np.zeros(len(self._terms))
-        for i, value in self._given.items():
+        for i, value in self._fixed.items():
             fixed[i] = value
         rest = np.column_stack([triangle[:, :-1], triangle[:, -1] - triangle[:, :-1] @ fixed])
-        return fixed + solve_coefficients(rest, self._sought if taken is None else taken, ridge)
+        return fixed + solve_coefficients(rest, self._free if taken is None else taken, ridge)
 
     def _fit_one_step(self, lags: Mapping[str, float]) -> list[FloatArray]:
         """Fit coefficients that explain the measured output one step ahead."""
         triangle, _ = self._rows.factor_terms(self._terms, lags)
-        order = select_forward(triangle, _TERM_COUNTS[-1], among=self._sought).order
-        counts = [k for k in _TERM_COUNTS if k < len(self._sought)]
+        order = select_forward(triangle, _TERM_COUNTS[-1], among=self._free).order
+        counts = [k for k in _TERM_COUNTS if k < len(self._free)]
         return [
             self._solve_coefficients(triangle),
             *(self._solve_coefficients(triangle, ridge=ridge) for ridge in _RIDGES),

@@ -23,7 +23,7 @@ MIN_DISTINCT_X = 3
 _OUTLIER_PROBABILITY = 0.05  # share of batches without an outlier that get a false alarm
 _DRIFT_PROBABILITY = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
 _SCATTER_PROBABILITY = 0.05  # share of batches with right errors that fail the χ² test
-_NORMAL_95 = NormalDist().inv_cdf(0.975)
+_TWO_SIDED_95 = NormalDist().inv_cdf(0.975)
 _BAND_POINTS = 101
 _MAX_LEVERAGE = 1.0 - 1e-9
 
@@ -138,7 +138,7 @@ def compute_half_width(law: TrendLaw) -> float:
     It is that of the normal distribution if the stated errors hold. It is that of Student's t if
     the size of the errors comes from the scatter of few points.
     """
-    return _NORMAL_95 if law.birge_ratio <= 1.0 else float(stdtrit(law.degrees, 0.975))
+    return _TWO_SIDED_95 if law.birge_ratio <= 1.0 else float(stdtrit(law.degrees, 0.975))
 
 
 def _compute_band(law: TrendLaw, x: FloatArray) -> tuple[TrendPoint, ...]:
@@ -281,7 +281,7 @@ def compute_drift_limit(law: TrendLaw | None = None, comparisons: int = 1) -> fl
     limit = -NormalDist().inv_cdf(_DRIFT_PROBABILITY / (2.0 * comparisons))
     if law is None or chdtrc(law.degrees, law.chi_squared) >= _SCATTER_PROBABILITY:
         return limit
-    return limit * float(stdtrit(law.degrees, 0.975)) / _NORMAL_95
+    return limit * float(stdtrit(law.degrees, 0.975)) / _TWO_SIDED_95
 
 
 def compute_drift(new: TrendEstimate, old: TrendEstimate, comparisons: int = 1) -> Drift:

@@ -152,7 +152,7 @@ def _analyse_sensitivities(
     max_simulations: int | None,
     whitening: Whitening | None = None,
 ) -> Analysis:
-    error, columns, plateau, one_sided, aside, count = sensitivities
+    error, columns, plateau, one_sided, plateau_offset, count = sensitivities
     n, d = columns.shape
     criteria = compute_criteria(error, d, whitening)
     if n <= d:
@@ -213,7 +213,7 @@ def _analyse_sensitivities(
         scale,
     )
     estimates = _correct_for_jumps(
-        problem, make_estimates(problem, statistics), one_sided, aside * scale
+        problem, make_estimates(problem, statistics), one_sided, plateau_offset * scale
     )
     linear = None
     if problem.loss_scale == 0.0:
@@ -235,11 +235,11 @@ def _find_active_bounds(
     problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
 ) -> tuple[ActiveBound, ...]:
     at_end = np.logical_or(*is_at_bounds(place))
-    reaches = tuple(
+    limits = tuple(
         find_widest_bounds(problem, parameter) if is_at_end else (parameter.lower, parameter.upper)
         for parameter, is_at_end in zip(problem.free_parameters, at_end, strict=True)
     )
-    return rank_active_bounds(problem.free_parameters, reaches, influence, columns, place)
+    return rank_active_bounds(problem.free_parameters, limits, influence, columns, place)
 
 
 def compute_criteria(
@@ -281,15 +281,25 @@ def remove_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Floa
 
 
 def _correct_for_jumps(
-    problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
+    problem: Problem,
+    estimates: tuple[Estimate, ...],
+    one_sided: BoolArray,
+    plateau_offset: FloatArray,
 ) -> tuple[Estimate, ...]:
     """Correct the estimates of parameters with which the output changes in jumps only."""
     names = problem.free_names
-    blind = {name for name, one in zip(names, one_sided, strict=True) if one}
-    moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
-    seen = (_remove_stderr(one) if one.name in blind else one for one in estimates)
+    blind = {name for name, jumps in zip(names, one_sided, strict=True) if jumps}
+    offsets = {
+        name: float(offset) for name, offset in zip(names, plateau_offset, strict=True) if offset
+    }
+    corrected = (
+        _remove_stderr(estimate) if estimate.name in blind else estimate for estimate in estimates
+    )
     return tuple(
-        _centre_on_plateau(one, moved[one.name]) if one.name in moved else one for one in seen
+        _centre_on_plateau(estimate, offsets[estimate.name])
+        if estimate.name in offsets
+        else estimate
+        for estimate in corrected
     )
 
 
@@ -299,15 +309,15 @@ def _remove_stderr(estimate: Estimate) -> Estimate:
     return replace(estimate, stderr=None, interval95=None, reason=reason)
 
 
-def _centre_on_plateau(estimate: Estimate, aside: float) -> Estimate:
-    """Centre the interval of an estimate on its plateau, whose middle is `aside` above it.
+def _centre_on_plateau(estimate: Estimate, plateau_offset: float) -> Estimate:
+    """Centre the interval of an estimate on its plateau, whose middle is `plateau_offset` above it.
 
     The loss is constant on a plateau, so the position where the search ended has no meaning.
     """
     if estimate.interval95 is None:
         return estimate
     lower, upper = estimate.interval95
-    return replace(estimate, interval95=(lower + aside, upper + aside))
+    return replace(estimate, interval95=(lower + plateau_offset, upper + plateau_offset))
 
 
 def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
