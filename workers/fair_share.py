@@ -106,7 +106,9 @@ class FairShare(Generic[Key]):
         account.received_seconds += seconds
         account.level += seconds
         others = [
-            self._jobs[other] for other in self._list_past_headstart(account.project) if other != job
+            self._jobs[other]
+            for other in self._list_past_headstart(account.project)
+            if other != job
         ]
         if was_fresh and account.received_seconds >= HEADSTART_SECONDS:
             account.level = max(account.level, min((other.level for other in others), default=0.0))

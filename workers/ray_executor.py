@@ -155,7 +155,9 @@ class RayExecutor:
         in_flight = list(self._in_flight)
         ready, _ = self._ray.wait(in_flight, num_returns=1, timeout=timeout, fetch_local=False)
         if ready:  # all others that have ended by now
-            ready, _ = self._ray.wait(in_flight, num_returns=len(in_flight), timeout=0, fetch_local=False)
+            ready, _ = self._ray.wait(
+                in_flight, num_returns=len(in_flight), timeout=0, fetch_local=False
+            )
             self._last_answer = time.monotonic()
         return tuple(ready)
 

@@ -136,7 +136,7 @@ def _measured_tubes(client: Client, folder: Path) -> list[Row]:
         client,
         batch,
         channels={"u": "p_in_bar", "y": "p_out_bar"},
-        look_at=["T", "L"],
+        trend_parameters=["T", "L"],
         loss={"kind": "soft-l1", "scale": 0.1},
         parameters={"L": {"upper": shortest / 2}},
     )
@@ -163,7 +163,7 @@ def print_trend(title: str, found: Carried) -> None:
     print(f"\n### {title}: {found.evaluations} simulations\n")
     print(f"| length, m | runs | {' | '.join(names)} | measured span |")
     print(f"|--:|--:|{'--:|' * len(names)}--:|")
-    for place in found.trend["places"]:
+    for place in found.trend["labels"]:
         cells = [_shown(one, place["x"]) for one in quantities]
         span = "; ".join(f"{one['lower']:.6g} to {one['upper']:.6g}" for one in place["spans"])
         print(f"| {place['x']:g} | {len(place['runs'])} | {' | '.join(cells)} | {span} |")

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Query, Request, Response
 from service.api.content import ByteRange, content_response
 from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
-from service.control.schemas import RunSimulateIn, RunSimulationOut
+from service.control.schemas import RunSimulationIn, RunSimulationOut
 from service.core.errors import NotFound
 from service.figures.plotly import apply_theme
 from service.figures.profiles import plot_profiles as profile_figure
@@ -79,7 +79,7 @@ def export_model(
 
 @router.post("/{run_id}:simulate")
 def simulate_run(
-    run_id: str, body: RunSimulateIn, parts: PartsDep, max_points: MaxPoints = 1000
+    run_id: str, body: RunSimulationIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under P, PI or PID control."""
     return simulate.simulate_run(parts.database, parts.store, run_id, body, max_points)

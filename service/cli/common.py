@@ -325,18 +325,18 @@ def file_origins(name: object) -> FieldOrigins:
 
 
 @contextmanager
-def report_faults(places: FieldOrigins) -> Iterator[None]:
+def report_faults(origins: FieldOrigins) -> Iterator[None]:
     """End the command with the server's faults, reported where the user typed."""
     try:
         yield
     except NotFinite as error:
-        fail(f"{places.locate(error.pointer)}: {error.reason}", 2)
+        fail(f"{origins.locate(error.pointer)}: {error.reason}", 2)
     except ProblemError as error:
         entries = error.document.get("errors") or ()
         if error.status != INVALID_STATUS or not entries:
             raise
         fail(
-            places.describe_faults(
+            origins.describe_faults(
                 FieldError(
                     str(entry.get("pointer") or ""), str(entry.get("detail")), entry.get("column")
                 )

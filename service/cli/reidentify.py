@@ -110,7 +110,7 @@ def reidentify(
     body: dict[str, Any] = {
         "model": read_model(model),
         "label": label,
-        "look_at": split_names(parameters),
+        "trend_parameters": split_names(parameters),
         "predict": [parse_number("--predict", text) for text in split_names(predict)],
         "channels": parse_channels(channels),
         **_drop_missing(reference=reference, warm_start=warm_start, name=name),
@@ -137,7 +137,7 @@ def _field_origins(experiments: list[str]) -> FieldOrigins:
         {
             "/model": "--model …",
             "/label": "--label",
-            "/look_at": "--parameters",
+            "/trend_parameters": "--parameters",
             "/predict": "--predict",
             "/reference": "--reference",
             "/warm_start": "--warm-start",

@@ -100,8 +100,8 @@ def simulate_run(
 ) -> None:
     """Simulate the identified model on a new input or under P, PI or PID control."""
     body = read_object(file)
-    places = FieldOrigins({"?max_points": "--max-points"}, rest=f"{file} …")
-    with connect_client(url, key) as client, report_faults(places):
+    origins = FieldOrigins({"?max_points": "--max-points"}, rest=f"{file} …")
+    with connect_client(url, key) as client, report_faults(origins):
         simulation = client.simulate_run(run, body, max_points)
     if as_json:
         print_json(simulation)

@@ -187,8 +187,8 @@ def _print_warning_kinds(warnings: list[str]) -> None:
         print_line(f"… and {len(kinds) - MAX_WARNING_KINDS} more kinds of notes")
 
 
-def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
-    """Print the answer of `GET /v1/jobs/{id}/trend`; notes name the options of `places`."""
+def print_trend(trend: dict[str, Any], origins: FieldOrigins) -> None:
+    """Print the answer of `GET /v1/jobs/{id}/trend`; notes name the options of `origins`."""
     tables = build_tables(trend, PLAIN)
     headings = [
         f">{trend['x']}",
@@ -220,4 +220,4 @@ def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
         text = f"compared with {trend['reference']}{named and ', '}{named}"
         print_line(text)
     for note in list_notes(trend):
-        print_line(f"note: {places.rewrite_note(note)}")
+        print_line(f"note: {origins.rewrite_note(note)}")

@@ -100,7 +100,9 @@ class RunsProgress:
 
     def _describe_last_run(self, finished: int) -> str:
         now = self.clock()
-        if finished != self._seen and (not self._seen or now - self._last_request >= RUN_POLL_SECONDS):
+        if finished != self._seen and (
+            not self._seen or now - self._last_request >= RUN_POLL_SECONDS
+        ):
             self._last_request, self._seen = now, finished
             run = self._find_newest()
             self._text = "" if run is None else f"last {self._describe_run(run)}"

@@ -81,7 +81,7 @@ _EXAMPLE_CONTROL = {
 }
 
 
-class RunSimulateIn(Body):
+class RunSimulationIn(Body):
     """Simulation of a run's model with new inputs or in a closed loop, from t = 0.
 
     `parameters` replace estimates. An initial state is given as ``x(0)``. Initial states that the

@@ -12,7 +12,7 @@ from service.control.closed_loop import (
     find_control_faults,
     simulate_closed_loop,
 )
-from service.control.schemas import ControlIn, RunSimulateIn, RunSimulationOut
+from service.control.schemas import ControlIn, RunSimulationIn, RunSimulationOut
 from service.core.concurrency import simulation_limit
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.datasets import add_recording, hash_source, to_out, to_series
@@ -54,7 +54,7 @@ class _SimulationResult:
 
 @simulation_limit.acquire()
 def simulate_run(
-    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, max_points: int
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulationIn, max_points: int
 ) -> RunSimulationOut:
     """Simulate a run's model. With `store` the result becomes a dataset.
 
@@ -98,7 +98,7 @@ def simulate_run(
 
 
 def _read_request(
-    session: Session, store: ObjectStore, run_id: str, body: RunSimulateIn
+    session: Session, store: ObjectStore, run_id: str, body: RunSimulationIn
 ) -> _SimulationRequest:
     stored = load_estimated_run(session, run_id, "simulate with")
     model = stored.model
@@ -140,7 +140,7 @@ def _describe_early_inputs(model: Model, signals: Sequence[Channel], period: flo
 
 
 def _choose_sample_time(
-    session: Session, stored: StoredRun, body: RunSimulateIn
+    session: Session, stored: StoredRun, body: RunSimulationIn
 ) -> tuple[float, list[str]]:
     """Choose the sampling period in s, with notes about it."""
     try:
@@ -214,7 +214,7 @@ def _store_simulation(
     database: Database,
     store: ObjectStore,
     run_id: str,
-    body: RunSimulateIn,
+    body: RunSimulationIn,
     resolved: _SimulationRequest,
     result: _SimulationResult,
     reference: Channel | None,
@@ -258,7 +258,7 @@ def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> Iterato
             yield FieldError(f"/parameters/{name}", detail)
 
 
-def _find_input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
+def _find_input_faults(model: Model, body: RunSimulationIn) -> Iterator[FieldError]:
     inputs = [signal.name for signal in model.inputs]
     controlled = body.control.input if body.control else None
     if body.control is not None:

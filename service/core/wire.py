@@ -74,7 +74,7 @@ class Page(Answer, Generic[Item]):
     next: str | None = None
 
 
-class FieldProblem(Answer):
+class FaultOut(Answer):
     """One fault of a request."""
 
     pointer: str

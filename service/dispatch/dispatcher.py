@@ -81,7 +81,9 @@ class Dispatcher:
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._checked_at = 0.0
-        self._listener = threading.Thread(target=self._listen_for_wakeups, name="notifier", daemon=True)
+        self._listener = threading.Thread(
+            target=self._listen_for_wakeups, name="notifier", daemon=True
+        )
 
     def run_until_stopped(self) -> None:
         """Work until `stopping` is set. Then release every job with its checkpoints.
@@ -269,7 +271,9 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
         compiling.join()
         executor.warm_up_workers()
         leases = HeldLeases(database, settings.lease_seconds)
-        dispatcher = Dispatcher(database, store, executor, leases, project_cores=settings.project_cores)
+        dispatcher = Dispatcher(
+            database, store, executor, leases, project_cores=settings.project_cores
+        )
         _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()
     except ClusterLost as error:

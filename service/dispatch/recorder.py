@@ -237,7 +237,9 @@ class RunRecorder:
     def _compute_progress(self) -> JobProgress:
         """Compute the job's progress; its generation is that of the most advanced run."""
         states = [live.state for live in self._live.values()]
-        best = min([self._best, *_list_rms(self._reused_outcomes), *(state.rms for state in states)])
+        best = min(
+            [self._best, *_list_rms(self._reused_outcomes), *(state.rms for state in states)]
+        )
         return JobProgress(
             evaluations=self._evaluations
             + sum(self._checkpoint_evaluations.values())

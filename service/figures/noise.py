@@ -13,7 +13,7 @@ from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
 METHOD_PATH = "/algorithm/method"
 MAX_SERIES = 12
-NORMAL_95 = 1.6449  # standard deviations from the median to the 95 % quantile
+QUANTILE_95 = 1.6449  # standard deviations from the median to the 95 % quantile
 
 _METHOD_STYLES: Mapping[str, dict[str, Any]] = {
     "simple": {"color": theme.VERMILLION, "dash": "dashdot", "width": 1.6},
@@ -229,7 +229,7 @@ def _floor_traces(
     x = sorted(panel.floor)
     if not x:
         return []
-    signs = (-NORMAL_95, NORMAL_95) if panel.is_signed else (1.0,)
+    signs = (-QUANTILE_95, QUANTILE_95) if panel.is_signed else (1.0,)
     name = "Cramér–Rao bound (of parameters: 5 and 95 %)"
     lines = []
     for sign in signs:

@@ -6,7 +6,7 @@ from math import exp, log, prod
 from typing import Any
 
 from service.core.errors import FieldError
-from service.jobs.schemas import JobIn, SweepAxis
+from service.jobs.schemas import JobIn, SweepAxisIn
 from sysid.core.errors import split_pointer, suggest_name
 
 # Fields of the job as a whole. A cell cannot change them.
@@ -42,10 +42,10 @@ class AxisGroup(Sequence[AxisPosition]):
         Number of each axis of the group in the sweep, the axis, and its values.
     """
 
-    columns: tuple[tuple[int, SweepAxis, Sequence[Any]], ...]
+    columns: tuple[tuple[int, SweepAxisIn, Sequence[Any]], ...]
 
     @classmethod
-    def from_axes(cls, axes: Sequence[SweepAxis], numbers: Sequence[int]) -> "AxisGroup":
+    def from_axes(cls, axes: Sequence[SweepAxisIn], numbers: Sequence[int]) -> "AxisGroup":
         """Build the group of the axes with these numbers."""
         return cls(tuple((number, axes[number], expand_values(axes[number])) for number in numbers))
 
@@ -62,7 +62,7 @@ class AxisGroup(Sequence[AxisPosition]):
         return AxisPosition(_build_pointer(self.columns[0][0], self.columns[0][1], position), cell)
 
 
-def group_axes(axes: Sequence[SweepAxis]) -> list[list[int]]:
+def group_axes(axes: Sequence[SweepAxisIn]) -> list[list[int]]:
     """List the numbers of the axes that step together, group by group."""
     groups: dict[str, list[int]] = {}
     for number, axis in enumerate(axes):
@@ -75,7 +75,7 @@ def count_runs(job: JobIn, groups: list[list[int]]) -> int:
     return prod(count_values(job.sweep.axes[numbers[0]]) for numbers in groups)
 
 
-def build_axis_groups(axes: Sequence[SweepAxis], groups: list[list[int]]) -> list[AxisGroup]:
+def build_axis_groups(axes: Sequence[SweepAxisIn], groups: list[list[int]]) -> list[AxisGroup]:
     """Build the groups of axes."""
     return [AxisGroup.from_axes(axes, numbers) for numbers in groups]
 
@@ -102,14 +102,14 @@ def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:
     return positions[::-1]
 
 
-def count_values(axis: SweepAxis) -> int:
+def count_values(axis: SweepAxisIn) -> int:
     """Count the values of an axis."""
     if axis.log is not None:
         return axis.log[2]
     return len(axis.values if axis.values is not None else range(*(axis.range or [0])))
 
 
-def expand_values(axis: SweepAxis) -> Sequence[Any]:
+def expand_values(axis: SweepAxisIn) -> Sequence[Any]:
     """List the values of an axis."""
     if axis.values is not None:
         return axis.values
@@ -128,7 +128,7 @@ def _to_whole_number(value: float) -> float | int:
     return int(value) if value.is_integer() and value < 2**53 else value
 
 
-def _build_pointer(number: int, axis: SweepAxis, position: int) -> str:
+def _build_pointer(number: int, axis: SweepAxisIn, position: int) -> str:
     kind = next(n for n in ("values", "range", "log") if getattr(axis, n) is not None)
     return f"/sweep/axes/{number}/{kind}" + (f"/{position}" if kind == "values" else "")
 
@@ -163,7 +163,7 @@ def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
             )
 
 
-def _find_axis_label_faults(axis: SweepAxis, pointer: str) -> Iterator[FieldError]:
+def _find_axis_label_faults(axis: SweepAxisIn, pointer: str) -> Iterator[FieldError]:
     """Report label names that a database cannot look up in a document, which would merge groups."""
     for position, labels in enumerate(axis.labels or ()):
         for name in labels:
@@ -180,7 +180,7 @@ def _find_axis_label_faults(axis: SweepAxis, pointer: str) -> Iterator[FieldErro
                 return  # the other positions usually have the same names
 
 
-def _describe_bad_spacing(axis: SweepAxis) -> str | None:
+def _describe_bad_spacing(axis: SweepAxisIn) -> str | None:
     if axis.log is not None:
         start, stop, points = axis.log
         if not (start > 0 and stop > 0 and points >= 1):

@@ -140,7 +140,7 @@ MOST_AXIS_VALUES = 1_000_000
 AxisLabels = Annotated[dict[str, float | str], Field(max_length=32)]
 
 
-class SweepAxis(Body):
+class SweepAxisIn(Body):
     """One axis of a sweep: the field it changes and its values.
 
     Give exactly one of `values`, `range` and `log`. `range` is start, stop[, step] in whole
@@ -170,7 +170,7 @@ class SweepAxis(Body):
 class SweepIn(Body):
     """Sweep: the crossed axes give one run per cell."""
 
-    axes: list[SweepAxis] = Field(default=[], max_length=16)
+    axes: list[SweepAxisIn] = Field(default=[], max_length=16)
 
 
 PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX = "previous", "reference:", "run_"

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.jobs.axes import count_values, group_axes
-from service.jobs.schemas import SweepAxis
+from service.jobs.schemas import SweepAxisIn
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class ChainLayout:
     length: int
 
     @classmethod
-    def from_axes(cls, axes: Sequence[SweepAxis]) -> "ChainLayout | None":
+    def from_axes(cls, axes: Sequence[SweepAxisIn]) -> "ChainLayout | None":
         """Choose the chain axis: the one with labels, else the one over datasets, else the first.
 
         The values of the other axes give parallel chains. None without axes.
@@ -55,7 +55,7 @@ class ChainLayout:
         return range(first, first + self.stride * self.length, self.stride)
 
 
-def _rank_axes(axes: Sequence[SweepAxis]) -> int:
+def _rank_axes(axes: Sequence[SweepAxisIn]) -> int:
     if any(axis.labels for axis in axes):
         return 0
     return 1 if any(axis.path == "/datasets" for axis in axes) else 2

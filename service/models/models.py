@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, NotFound, to_field_errors
-from service.core.wire import FieldProblem, Page
+from service.core.wire import FaultOut, Page
 from service.models.schemas import CheckOut, ModelOut
 from service.repositories.models import ModelRepository
 from service.storage import errors
@@ -68,11 +68,11 @@ def check_model(document: Any) -> CheckOut:
     """Check a model document and report every fault in it."""
     if not isinstance(document, Mapping):
         message = f"found {document!r:.60}; need an object with 'equations' and other fields"
-        return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=message)])
+        return CheckOut(valid=False, errors=[FaultOut(pointer="", detail=message)])
     try:
         model = parse_model(document)
     except SysidError as error:
-        problems = [FieldProblem(**fault.to_dict()) for fault in to_field_errors(error)]
+        problems = [FaultOut(**fault.to_dict()) for fault in to_field_errors(error)]
         return CheckOut(valid=False, errors=problems)
     return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from service.core.wire import Answer, FieldProblem
+from service.core.wire import Answer, FaultOut
 
 
 class ModelOut(Answer):
@@ -23,5 +23,5 @@ class CheckOut(Answer):
     """Result of a check: whether a model document is valid, and every error in it."""
 
     valid: bool
-    errors: list[FieldProblem]
+    errors: list[FaultOut]
     normal_form: dict[str, Any] | None = None

@@ -70,16 +70,12 @@ def load_run_figure(
             return plotly.empty_figure()
         _check_experiment(choice.experiment, len(tested.experiments))
         return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
-    evidence = read_run_figure_data(session, stored)
+    data = read_run_figure_data(session, stored)
     if name == "history":
-        return plotly.plot_history(evidence, choice.abscissa)
+        return plotly.plot_history(data, choice.abscissa)
     if name == "convergence":
-        return plotly.plot_convergence(evidence, choice.columns)
-    return (
-        plotly.plot_correlation(evidence)
-        if name == "correlation"
-        else plotly.plot_waterfall(evidence)
-    )
+        return plotly.plot_convergence(data, choice.columns)
+    return plotly.plot_correlation(data) if name == "correlation" else plotly.plot_waterfall(data)
 
 
 def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:

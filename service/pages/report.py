@@ -152,14 +152,14 @@ def _overview_drawings(
 def _build_section(
     session: Session, store: ObjectStore, stored: StoredRun, why: str
 ) -> _ReportSection:
-    evidence = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", plotly.plot_history(evidence))]
+    data = read_run_figure_data(session, stored)
+    titled = [("Progress of every island", plotly.plot_history(data))]
     experiments = read_run_experiments(session, store, stored)[:1]
     titled += [
         ("Measured against identified", signals.plot_response(experiment))
         for experiment in experiments
     ]
-    titled.append(("Convergence of the parameters", plotly.plot_convergence(evidence)))
+    titled.append(("Convergence of the parameters", plotly.plot_convergence(data)))
     return _ReportSection(why, load_full_run(session, stored), _draw_figures(titled))
 
 
@@ -237,8 +237,8 @@ def _run_figures(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures that have data."""
-    evidence = read_run_figure_data(session, stored)
-    titled = [("Progress of every island", plotly.plot_history(evidence))]
+    data = read_run_figure_data(session, stored)
+    titled = [("Progress of every island", plotly.plot_history(data))]
     for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
         title = f"Measured against identified: {experiment.name}"
         titled.append((title, signals.plot_response(experiment)))
@@ -249,9 +249,9 @@ def _run_figures(
             for number, name in enumerate(tested.experiments[:MAX_EXPERIMENTS])
         ]
     titled += [
-        ("Convergence of the parameters", plotly.plot_convergence(evidence)),
-        ("Correlation of the estimates", plotly.plot_correlation(evidence)),
-        ("What each island found", plotly.plot_waterfall(evidence)),
+        ("Convergence of the parameters", plotly.plot_convergence(data)),
+        ("Correlation of the estimates", plotly.plot_correlation(data)),
+        ("What each island found", plotly.plot_waterfall(data)),
     ]
     return [
         (title, figure["layout"]["height"], to_script_json(strip_template(figure)))

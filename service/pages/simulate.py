@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from service.control import simulate
-from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
+from service.control.schemas import RunSimulationIn, RunSimulationOut, StepMetricsOut
 from service.core.errors import (
     FieldError,
     InvalidRequest,
@@ -273,7 +273,7 @@ def _simulate_query(
             "dataset_name": name,
             "records": MAX_LISTED_RECORDS,
         }
-    body = _validate_body(RunSimulateIn, wanted.body)
+    body = _validate_body(RunSimulationIn, wanted.body)
     simulation = simulate.simulate_run(database, store, form.run, body, MAX_POINTS)
     with_units = apply_units(simulation, form.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None

@@ -77,7 +77,7 @@ def to_trend_view(trend: TrendOut) -> TrendView:
 
 
 def _suggest_run(trend: TrendOut) -> str:
-    runs = {point.x: point.runs[0] for point in trend.places if point.runs}
+    runs = {point.x: point.runs[0] for point in trend.labels if point.runs}
     middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
     at_reference = None if trend.reference_x is None else runs.get(trend.reference_x)
     return at_reference or next(iter(middle), "")

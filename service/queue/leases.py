@@ -272,7 +272,9 @@ class LeaseQueue:
         held = select(Job.id).where(Job.lease_owner == owner, Job.state == JobState.RUNNING)
         return bool(self._session.scalar(select(held.where(_has_progressed()).exists())))
 
-    def release_job(self, lease: Lease, *, lost: bool = False, others_progressed: bool = False) -> None:
+    def release_job(
+        self, lease: Lease, *, lost: bool = False, others_progressed: bool = False
+    ) -> None:
         """Give a job back when the dispatcher shuts down, or has `lost` its workers.
 
         Parameters
@@ -326,7 +328,9 @@ class LeaseQueue:
         busy = {owner for owner in lost_owners if self.has_progressed(owner)}
         fates: dict[JobState, list[str]] = {state: [] for state in JobState}
         for job in lost:
-            fates[self._fail_or_retry(job, others_progressed=job.lease_owner in busy)].append(job.id)
+            fates[self._fail_or_retry(job, others_progressed=job.lease_owner in busy)].append(
+                job.id
+            )
         queued, failed, cancelled = (
             tuple(fates[state]) for state in (JobState.QUEUED, JobState.FAILED, JobState.CANCELLED)
         )

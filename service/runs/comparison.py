@@ -10,7 +10,12 @@ from service.core.errors import FieldError, InvalidRequest
 from service.core.text import plain_estimate, plain_unit
 from service.jobs.results import read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
-from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
+from service.runs.schemas import (
+    ComparedParameterOut,
+    ComparedRunOut,
+    ComparedValueOut,
+    ComparisonOut,
+)
 from service.storage.errors import RowNotFound
 
 ResultDocument = Mapping[str, Any]
@@ -111,10 +116,10 @@ def _build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     }
 
 
-def _to_compared_run(stored: StoredRun, title: str) -> ComparedRun:
+def _to_compared_run(stored: StoredRun, title: str) -> ComparedRunOut:
     result = stored.result
     criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
-    return ComparedRun(
+    return ComparedRunOut(
         run=stored.run.id,
         job=stored.job.id,
         number=stored.run.number,
@@ -137,7 +142,7 @@ def _to_compared_run(stored: StoredRun, title: str) -> ComparedRun:
 
 def _compare_parameters(
     ordered: Sequence[StoredRun], titles: Mapping[str, str]
-) -> Iterator[ComparedParameter]:
+) -> Iterator[ComparedParameterOut]:
     """Compare parameters that have the same name and unit in at least two runs."""
     entries: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
     for stored in ordered:
@@ -156,13 +161,13 @@ def _compare_parameters(
                 same_model=len({stored.model.name for stored, _ in values}) == 1,
             )
         n_intervals = sum(_has_ends(estimate["interval95"]) for _, estimate in values)
-        yield ComparedParameter(
+        yield ComparedParameterOut(
             name=name,
             unit=unit,
             differs=None if n_intervals < 2 else pair is not None,
             note=note,
             values=[
-                ComparedValue.model_validate({**e, "run": stored.run.id}) for stored, e in values
+                ComparedValueOut.model_validate({**e, "run": stored.run.id}) for stored, e in values
             ],
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from service.core.errors import Conflict, InvalidRequest
 from service.jobs.stored_run import StoredRun, load_estimated_run
-from service.runs.schemas import ProfileIn, ProfileOut, Profiles
+from service.runs.schemas import ProfileIn, ProfileOut, RunProfilesOut
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from sysid.core.errors import suggest_name
@@ -34,7 +34,7 @@ _profile_lock = Lock()
 
 def compute_profiles(
     database: Database, store: ObjectStore, run_id: str, body: ProfileIn
-) -> Profiles:
+) -> RunProfilesOut:
     """Compute the profiles of some parameters of a run, by default of all free ones.
 
     Raises
@@ -66,7 +66,7 @@ def compute_profiles(
         profiles = list(_profile_parameters(problem, theta, names, body.points))
     finally:
         _profile_lock.release()
-    return Profiles(id=run_id, threshold=CHI_SQUARED_95, profiles=profiles)
+    return RunProfilesOut(id=run_id, threshold=CHI_SQUARED_95, profiles=profiles)
 
 
 def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:

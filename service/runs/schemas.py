@@ -166,7 +166,7 @@ class ProfileOut(Answer):
     evaluations: int
 
 
-class Profiles(Answer):
+class RunProfilesOut(Answer):
     """Profiles of a run, and the likelihood ratio at the ends of their intervals."""
 
     id: str
@@ -174,7 +174,7 @@ class Profiles(Answer):
     profiles: list[ProfileOut]
 
 
-class ProfilesOut(Profiles):
+class ProfilesOut(RunProfilesOut):
     """Profiles of a run, and their figure as Plotly JSON."""
 
     figure: dict[str, Any]
@@ -186,7 +186,7 @@ class CompareIn(Body):
     runs: list[str] = Field(min_length=2, max_length=50)
 
 
-class ComparedRun(Answer):
+class ComparedRunOut(Answer):
     """Candidate of a comparison; `parameters` counts the free ones. Low AIC and BIC are better."""
 
     run: str
@@ -208,7 +208,7 @@ class ComparedRun(Answer):
     evaluations: int
 
 
-class ComparedValue(Answer):
+class ComparedValueOut(Answer):
     """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
 
     run: str
@@ -218,7 +218,7 @@ class ComparedValue(Answer):
     status: str
 
 
-class ComparedParameter(Answer):
+class ComparedParameterOut(Answer):
     """Parameter that at least two runs have.
 
     `differs` is true if two of its 95 % intervals do not overlap. It is null if fewer than two have
@@ -227,7 +227,7 @@ class ComparedParameter(Answer):
 
     name: str
     unit: str
-    values: list[ComparedValue]
+    values: list[ComparedValueOut]
     differs: bool | None
     note: str
 
@@ -239,8 +239,8 @@ class ComparisonOut(Answer):
     """
 
     unit: str
-    runs: list[ComparedRun]
-    parameters: list[ComparedParameter]
+    runs: list[ComparedRunOut]
+    parameters: list[ComparedParameterOut]
     notes: list[str]
 
 

@@ -64,7 +64,7 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     reference = _to_job_reference(body.reference)
     trend = {
         "x": body.label,
-        "parameters": body.look_at,
+        "parameters": body.trend_parameters,
         "predict": body.predict,
         "reference": reference,
     }
@@ -118,7 +118,7 @@ def _move_pointer(pointer: str, order: list[int]) -> str:
     if pointer.startswith("/datasets"):
         return "/".join([f"/batch/{order[0]}", *parts[1:]])
     for job_pointer, body_pointer in (
-        ("/trend/parameters", "/look_at"),
+        ("/trend/parameters", "/trend_parameters"),
         ("/trend/reference", "/reference"),
         ("/trend/predict", "/predict"),
         ("/trend/x", "/label"),

@@ -84,15 +84,15 @@ class ReidentifyIn(IdentificationIn):
     batch with. `warm_start` selects where runs begin: at the reference (the default if there is
     one), or at the previous result.
 
-    `look_at` are the parameters of the trend, `predict` the values of x to predict at. The other
-    fields are those of a job.
+    `trend_parameters` are the parameters of the trend; empty: all free ones. `predict` lists values
+    of x to predict at. The other fields are those of a job.
     """
 
     label: str = Field(min_length=1, max_length=64)
     batch: list[BatchEntryIn] = Field(min_length=1, max_length=5000)
     reference: str | None = Field(default=None, min_length=1, max_length=200)
     warm_start: Literal["reference", "previous", "none"] | None = None
-    look_at: list[str] = Field(default=[], max_length=100)
+    trend_parameters: list[str] = Field(default=[], max_length=100)
     predict: list[TrendX] = Field(default=[], max_length=100)
     validation: ValidationIn | None = None
     seed: Seed = 1

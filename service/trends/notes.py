@@ -21,7 +21,7 @@ def describe_quantity(quantity: TrendQuantity, fitted: Trend) -> list[str]:
 
 
 def describe_noise_models(
-    x: str, places: Mapping[float, Sequence[TrendRow]], reference: str
+    x: str, rows_by_label: Mapping[float, Sequence[TrendRow]], reference: str
 ) -> str:
     """Report that estimates use different noise models; empty if all use one.
 
@@ -34,7 +34,7 @@ def describe_noise_models(
     """
     models_by_x = {
         x_value: {read_noise_model(row._asdict()) for row in rows}
-        for x_value, rows in places.items()
+        for x_value, rows in rows_by_label.items()
     }
     if len({reference, *(model for models in models_by_x.values() for model in models)} - {""}) < 2:
         return ""

@@ -88,11 +88,11 @@ def _rank_rms(row: TrendRow) -> float:
 
 
 def build_quantities(
-    places: Mapping[float, Sequence[TrendRow]], names: Sequence[str]
+    rows_by_label: Mapping[float, Sequence[TrendRow]], names: Sequence[str]
 ) -> list[TrendQuantity]:
     """Build the named parameters (by default all estimated ones), then the onset delays."""
     columns: dict[str, _QuantityEstimates] = {}
-    for x, rows in places.items():
+    for x, rows in rows_by_label.items():
         for row in rows:
             for estimate in row.parameters:
                 if estimate["name"] in names or (not names and is_free(estimate)):
@@ -142,7 +142,7 @@ def _average_onsets(
         name = "onset delay" if len(pairs) == 1 else f"onset delay {first} → {then}"
         if not measured:
             averages.append(
-                (name, experiments[0]["unit"], _RunEstimate(run, None, None, "not told"))
+                (name, experiments[0]["unit"], _RunEstimate(run, None, None, "not measured"))
             )
             continue
         n = len(measured)

@@ -122,7 +122,7 @@ class TrendOut(Answer):
     reference: str | None = Field(default=None, description="run that the batch is compared with")
     reference_x: float | None = None
     reference_names: list[str] = Field(default=[], description="names under which it was accepted")
-    places: list[BatchLabelOut]
+    labels: list[BatchLabelOut]
     quantities: list[QuantityOut]
     missing: int = Field(default=0, description="runs that failed or have not ended")
     notes: list[str] = Field(default=[])

@@ -18,7 +18,7 @@ from service.core.text import (
 
 QuantityDocument = dict[str, Any]
 
-USUAL_STATUSES = ("identified", "group", "measured", "not told")
+USUAL_STATUSES = ("identified", "group", "measured", "not measured")
 """Statuses that need no attention."""
 
 
@@ -90,7 +90,7 @@ def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
     ]
     return TrendTables(
         headings=[append_unit(quantity["name"], quantity["unit"]) for quantity in shown],
-        rows=[_place_row(label_runs, shown, style) for label_runs in trend["places"]],
+        rows=[_label_row(label_runs, shown, style) for label_runs in trend["labels"]],
         laws=[
             LawRow(
                 quantity["name"],
@@ -113,7 +113,7 @@ def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
     )
 
 
-def _place_row(
+def _label_row(
     label_runs: dict[str, Any], quantities: list[QuantityDocument], style: Style
 ) -> PlaceRow:
     points = [
@@ -214,7 +214,7 @@ def list_notes(trend: dict[str, Any]) -> list[str]:
         for text in quantity["notes"]
     ]
     by_text: dict[str, list[str]] = {}
-    for label_runs in trend["places"]:
+    for label_runs in trend["labels"]:
         for text in label_runs["warnings"]:
             by_text.setdefault(text, []).append(f"{label_runs['x']:g}")
     notes += [f"{trend['x']} {', '.join(values)}: {text}" for text, values in by_text.items()]

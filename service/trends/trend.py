@@ -59,9 +59,11 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
             f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
     request = job.spec["trend"]
-    places, quantities = _collect_quantities(session, job)
+    rows_by_label, quantities = _collect_quantities(session, job)
     bodies = {
-        row.id: build_run_body(job.spec, row.cell) for rows in places.values() for row in rows
+        row.id: build_run_body(job.spec, row.cell)
+        for rows in rows_by_label.values()
+        for row in rows
     }
     datasets = {run: body["datasets"] for run, body in bodies.items()}
     channels = read_channels(session, {dataset for many in datasets.values() for dataset in many})
@@ -73,10 +75,10 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
     reference_noise_model = (
         "" if reference is None else read_noise_model(reference.run.result or {})
     )
-    notes = [describe_noise_models(request["x"], places, reference_noise_model)]
+    notes = [describe_noise_models(request["x"], rows_by_label, reference_noise_model)]
     if reference is not None:
         notes += [
-            reference.explain_gaps(request["x"], places),
+            reference.explain_gaps(request["x"], rows_by_label),
             describe_differences(session, reference.run, list(bodies.values()), channels),
         ]
     return TrendOut(
@@ -85,9 +87,9 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
         reference=None if reference is None else reference.run.id,
         reference_x=None if reference is None else reference.x,
         reference_names=[] if reference is None else list(reference.names),
-        places=[
+        labels=[
             to_label_out(x, rows, datasets, channels, bodies[rows[0].id]["channels"])
-            for x, rows in places.items()
+            for x, rows in rows_by_label.items()
         ],
         quantities=answers,
         missing=job.n_runs - count_succeeded(session, job.id),
@@ -103,8 +105,8 @@ def _collect_quantities(
             "", f"{job.id} has {job.n_runs} runs; a trend may have at most {MOST_RUNS}"
         )
     request = job.spec["trend"]
-    places = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), request["x"])
-    return places, build_quantities(places, request["parameters"])
+    rows_by_label = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), request["x"])
+    return rows_by_label, build_quantities(rows_by_label, request["parameters"])
 
 
 def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchReference | None:

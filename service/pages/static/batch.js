@@ -46,7 +46,7 @@ function body() {
     batch,
     reference: field('reference').value || null,
     warm_start: field('warm_start').value || null,
-    look_at: words(field('look_at').value),
+    trend_parameters: words(field('trend_parameters').value),
     predict: numbers(field('predict').value),
     channels: channelsOf(form),
     parameters: overrides(),

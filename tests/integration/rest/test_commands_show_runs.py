@@ -166,7 +166,7 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
             "reference": None,
             "reference_x": None,
             "reference_names": [],
-            "places": [place],
+            "labels": [place],
             "quantities": [one],
             "missing": 0,
             "notes": ["use loss: {noise_model: ar1}"],

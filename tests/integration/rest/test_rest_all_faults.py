@@ -197,9 +197,9 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
     server: TestClient, dataset: str
 ) -> None:
     batch = [{"x": 5, "datasets": [dataset]}]
-    body = {"model": "fopdt", "label": "n", "batch": batch, "look_at": ["LL"], "seed": "x"}
+    body = {"model": "fopdt", "label": "n", "batch": batch, "trend_parameters": ["LL"], "seed": "x"}
     assert set(faults(server.post("/v1/recipes/reidentify", json=body))) == {"/seed"}
-    body = {"model": "fopdt", "batch": 3, "look_at": ["LL"], "warm_start": "reference"}
+    body = {"model": "fopdt", "batch": 3, "trend_parameters": ["LL"], "warm_start": "reference"}
     found = faults(server.post("/v1/recipes/reidentify", json=body))
     assert set(found) == {"/label", "/batch"}
     body = {
@@ -207,11 +207,11 @@ def test_a_batch_is_told_its_faults_of_types_else_all_others(
         "label": "n",
         "batch": batch,
         "warm_start": "reference",
-        "look_at": ["LL"],
+        "trend_parameters": ["LL"],
         "parameters": {"LL": {"upper": 1}},
     }
     found = faults(server.post("/v1/recipes/reidentify", json=body))
-    assert set(found) == {"/warm_start", "/look_at/0", "/parameters/LL"}
+    assert set(found) == {"/warm_start", "/trend_parameters/0", "/parameters/LL"}
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/recipes/noise-sweep", "/v1/datasets:simulate"])

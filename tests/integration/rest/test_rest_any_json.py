@@ -60,7 +60,7 @@ BODIES: list[tuple[str, dict[str, Any]]] = [
         {
             "model": "fopdt",
             "label": "n",
-            "look_at": ["L"],
+            "trend_parameters": ["L"],
             "batch": [{"x": 1, "datasets": ["steps"]}],
         },
     ),

@@ -114,7 +114,7 @@ def fopdt_run(served: Served) -> str:
         served.server,
         served.parts,
         model="fopdt",
-        look_at=["L"],
+        trend_parameters=["L"],
         batch=[{"x": 8.0, "datasets": served.datasets[8.0][:1]}],
     )
     return run_at(served, job, 8.0)

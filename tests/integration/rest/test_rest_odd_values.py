@@ -53,7 +53,7 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(
             {
                 "model": HALF,
                 "label": "n",
-                "look_at": ["L"],
+                "trend_parameters": ["L"],
                 "batch": [{"x": 1, "datasets": ["steps"]}],
             },
         ),
@@ -62,7 +62,7 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(
             {
                 "model": {"name": HALF},
                 "label": "n",
-                "look_at": ["L"],
+                "trend_parameters": ["L"],
                 "batch": [{"x": 1, "datasets": ["steps"]}],
             },
         ),

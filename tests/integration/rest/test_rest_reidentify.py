@@ -28,7 +28,7 @@ BODY: dict[str, Any] = {
     "model": "tube",
     "label": "length_m",
     "algorithm": QUICK,
-    "look_at": ["L", "T"],
+    "trend_parameters": ["L", "T"],
 }
 
 
@@ -102,20 +102,20 @@ def chosen(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_at(served: Served, job: str, x: float) -> str:
-    place = next(one for one in trend(served, job)["places"] if one["x"] == x)
+    place = next(one for one in trend(served, job)["labels"] if one["x"] == x)
     return str(place["runs"][0])
 
 
 def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: Served) -> None:
     found = trend(served, served.job)
-    assert [one["x"] for one in found["places"]] == list(LENGTHS)
+    assert [one["x"] for one in found["labels"]] == list(LENGTHS)
     assert [one["name"] for one in found["quantities"]] == ["L", "T", "onset delay"]
     for point in quantity(found, "L")["points"]:
         true = 0.02 + HALF_A_SAMPLE + 0.01 * point["x"]
         assert abs(point["value"] - true) < 5 * point["stderr"]
         assert point["stderr"] > 0
         assert point["status"] == "identified"
-    for place in found["places"]:
+    for place in found["labels"]:
         (span,) = place["spans"]
         assert (span["channel"], span["unit"]) == ("y", "bar")
         assert span["lower"] == pytest.approx(1, abs=0.1)
@@ -270,7 +270,7 @@ def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
         ({"batch": []}, "/batch", "at least 1"),
         ({"reference": "nobody"}, "/reference", "there is no reference 'nobody'"),
         ({"warm_start": "reference"}, "/warm_start", "needs the field 'reference'"),
-        ({"look_at": ["Q"]}, "/look_at/0", "no parameter 'Q'"),
+        ({"trend_parameters": ["Q"]}, "/trend_parameters/0", "no parameter 'Q'"),
         ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets/0", "ds_none"),
         ({"label": 'a"b'}, "/label", "quotation marks"),
         ({"batch": [{"x": 1e300, "datasets": ["ds_none"]}]}, "/batch/0/x", "1e-100 to 1e100"),
@@ -325,7 +325,7 @@ def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: Ser
     recordings = [served.datasets[x][:1] for x in LENGTHS]
     batch = [{"x": x, "datasets": one} for x, one in zip(sizes, recordings, strict=True)]
     job = batch_of(served.server, served.parts, batch=batch)
-    assert [one["x"] for one in trend(served, job)["places"]] == list(sizes)
+    assert [one["x"] for one in trend(served, job)["labels"]] == list(sizes)
     assert served.server.get(f"/jobs/{job}").status_code == 200
 
 
@@ -397,7 +397,7 @@ def test_the_command_uploads_prints_and_accepts(
     assert "L = (" in told.output
     assert "predicted" in told.output
     trend = json.loads(out.read_text())
-    accepted = next(one["runs"][0] for one in trend["places"] if one["x"] == 4)
+    accepted = next(one["runs"][0] for one in trend["labels"] if one["x"] == 4)
     assert f"own: {accepted}" in told.output
     shown = command.invoke(lagid, ["references", "show", "own"])
     assert accepted in shown.output

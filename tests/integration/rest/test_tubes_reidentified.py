@@ -43,4 +43,4 @@ def test_a_warm_batch_finds_the_known_time_constants_and_lags(tmp_path: Path) ->
     assert onset["coefficients"][1]["value"] == pytest.approx(3.1e-3, rel=0.15)
     (prediction,) = found["T"]["predictions"]
     assert prediction["lower"] < 0.23 < prediction["upper"]
-    assert trend["places"][2]["spans"][0]["upper"] == pytest.approx(482_000, rel=0.01)
+    assert trend["labels"][2]["spans"][0]["upper"] == pytest.approx(482_000, rel=0.01)

@@ -5,12 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.jobs.axes import AxisPosition, SweepCell, expand_values, group_axes, iterate_cells
-from service.jobs.schemas import SweepAxis
+from service.jobs.schemas import SweepAxisIn
 from service.jobs.warm_start_order import ChainLayout
 
-DATA = SweepAxis(path="/datasets", values=["a", "b", "c"])
-SEEDS = SweepAxis(path="/seed", range=[0, 4])
-LABELLED = SweepAxis(path="/noise/sigma", values=[0, 1], labels=[{"x": 1}, {"x": 2}])
+DATA = SweepAxisIn(path="/datasets", values=["a", "b", "c"])
+SEEDS = SweepAxisIn(path="/seed", range=[0, 4])
+LABELLED = SweepAxisIn(path="/noise/sigma", values=[0, 1], labels=[{"x": 1}, {"x": 2}])
 
 
 def test_without_axes_there_is_no_chain() -> None:
@@ -27,7 +27,7 @@ def test_without_axes_there_is_no_chain() -> None:
     ],
 )
 def test_the_run_before_differs_in_that_axis_only_by_one_step(
-    axes: list[SweepAxis], along: str
+    axes: list[SweepAxisIn], along: str
 ) -> None:
     chain = ChainLayout.from_axes(axes)
     assert chain is not None
@@ -47,7 +47,7 @@ def test_the_run_before_differs_in_that_axis_only_by_one_step(
             assert cells[before] == {**cell, along: order[place - 1]}
 
 
-def _cells(axis: SweepAxis) -> list[SweepCell]:
+def _cells(axis: SweepAxisIn) -> list[SweepCell]:
     return [SweepCell({axis.path: value}) for value in expand_values(axis)]
 
 

@@ -4,7 +4,7 @@ import pytest
 import typer
 
 from service.cli.sweeps import build_sweep_tables, parse_sigma_grid
-from service.figures.noise import NORMAL_95, noise_group_keys, plot_noise_sweep
+from service.figures.noise import QUANTILE_95, noise_group_keys, plot_noise_sweep
 from service.figures.theme import SERIES_DASHES
 from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
@@ -193,7 +193,7 @@ def test_the_floor_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
     (response,) = lines(figure, "x", "dash")
     assert response["y"] == pytest.approx([0.2 * s for s in SIGMAS])
     below, above = lines(figure, "x2", "dash")
-    expected = [NORMAL_95 * 0.25 * s for s in SIGMAS]
+    expected = [QUANTILE_95 * 0.25 * s for s in SIGMAS]
     assert above["y"] == pytest.approx(expected)
     assert below["y"] == pytest.approx([-one for one in expected])
 

@@ -5,7 +5,7 @@ import re
 import pytest
 import yaml
 
-from service.control.schemas import ControlIn, RunSimulateIn
+from service.control.schemas import ControlIn, RunSimulationIn
 from tests.repository import ROOT
 
 PAGE = (ROOT / "docs/control.md").read_text(encoding="utf-8")
@@ -21,7 +21,7 @@ def test_the_python_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_the_document_of_the_page_is_one() -> None:
     [document] = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    body = RunSimulateIn.model_validate(yaml.safe_load(document))
+    body = RunSimulationIn.model_validate(yaml.safe_load(document))
     assert body.control is not None
     assert body.control.integral_time == 1.0
 
