@@ -94,7 +94,7 @@ class ClosedLoop:
         """Compute the rest position of the derivative's filter, before the first step."""
         if self.derivative_filter is None:
             return {}
-        name, followed, lag = self.derivative_filter
+        name, followed, time_constant = self.derivative_filter
         is_sampled = self.model.form != "differential"
         begins = [times[0]] if is_sampled else [times[0], *(channel.times[0] for channel in inputs)]
         start = float(min(begins))
@@ -102,7 +102,7 @@ class ClosedLoop:
         if is_sampled:  # its first value is that after the first step
             period = float(times[1] - times[0]) / self.model.solver.substeps
             now = self._evaluate_start(followed, inputs, values, start, "right")
-            before += period / (lag + period) * (now - before)
+            before += period / (time_constant + period) * (now - before)
         return {name_initial_state(name, 0): before if isfinite(before) else 0.0}
 
     def _evaluate_start(

@@ -115,9 +115,9 @@ class _ControlLawBuilder:
             integral = PastValue(self.choose_state_name("integral"), "state", 0, None)
             wanted = Binary("+", wanted, integral)
         if self.control.has_derivative_action:
-            action, lag, filter_ = self._build_derivative()
+            action, filter_state, filter_ = self._build_derivative()
             wanted = Binary("+", wanted, action)
-            states.append(lag)
+            states.append(filter_state)
         if integral is not None:
             states.insert(0, self._build_integral(integral, wanted))
         return ControlLaw(self._limit_signal(wanted), tuple(states), filter_)
@@ -138,14 +138,14 @@ class _ControlLawBuilder:
         followed = self.error if is_of_error else Unary("-", self.output)
         z = PastValue(self.choose_state_name("filtered"), "state", 0, None)
         action = Binary("*", Binary("*", self.gain, divisor), Binary("-", followed, z))
-        lag = Binary("/", time, divisor)
+        time_constant = Binary("/", time, divisor)
         equation: Expression
         if self.is_sampled:
             before = PastValue(z.name, "state", 1, None)
-            part = Binary("/", _PERIOD_SYMBOL, Binary("+", lag, _PERIOD_SYMBOL))
+            part = Binary("/", _PERIOD_SYMBOL, Binary("+", time_constant, _PERIOD_SYMBOL))
             equation = Binary("+", before, Binary("*", part, Binary("-", followed, before)))
         else:
-            equation = Binary("/", Binary("-", followed, z), lag)
+            equation = Binary("/", Binary("-", followed, z), time_constant)
         filter_ = DerivativeFilter(z.name, followed, control.filter_time)
         return action, ControllerState(z.name, False, equation), filter_
 

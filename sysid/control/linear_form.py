@@ -179,8 +179,12 @@ class _AffineReader:
         if not self._has_signals(tree):
             return AffineForm({}, self._evaluate_constant(tree))
         match tree:
-            case PastValue(name, kind, offset, lag):
-                delay = offset + (0.0 if lag is None else max(self._evaluate_constant(lag), 0.0))
+            case PastValue(name, kind, offset, unknown_delay):
+                delay = offset + (
+                    0.0
+                    if unknown_delay is None
+                    else max(self._evaluate_constant(unknown_delay), 0.0)
+                )
                 return AffineForm({DelayedSignal(name, kind, float(delay)): 1.0})
             case Unary("-", operand):
                 return self.to_affine(operand).scale_by(-1.0)

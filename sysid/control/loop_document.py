@@ -131,23 +131,23 @@ class LoopDocumentBuilder:
             return 0, self.delay
         return 1, self._add_parameter("transport_steps", whole - 1 + max(steps - whole, 0.0))
 
-    def _build_plant_input(self, steps: int, lag: Expression | None) -> Expression:
+    def _build_plant_input(self, steps: int, delay: Expression | None) -> Expression:
         """Build the delayed signal after the transport's gain, without its time constant."""
-        command = self._build_command(steps, lag)
+        command = self._build_command(steps, delay)
         gain = self.transport_gain
         return command if gain is None else Binary("*", gain, command)
 
-    def _build_command(self, steps: int, lag: Expression | None) -> Expression:
+    def _build_command(self, steps: int, delay: Expression | None) -> Expression:
         """Build the controller's signal, delayed by some steps and a time lag."""
-        return shift_expression(self.law.command, steps, lag, counts=self.clock == "k")
+        return shift_expression(self.law.command, steps, delay, counts=self.clock == "k")
 
     def _replace_plant_input(self, node: Expression) -> Expression | None:
         """Replace a read of the plant's input by the controller's signal."""
         match node:
             case PastValue(self.input.name, "input", offset, own):
-                lag = add_delays(self.delay, own)
+                delay = add_delays(self.delay, own)
                 return self._build_plant_input(
-                    offset + self.steps + self.controller_delay_steps, lag
+                    offset + self.steps + self.controller_delay_steps, delay
                 )
             case _:
                 return None
@@ -160,8 +160,10 @@ class LoopDocumentBuilder:
         waiting = [self.output.expression]
         while waiting:
             for past in collect_past_values(waiting.pop()):
-                lag = past.delay
-                is_now = past.offset == 0 and (lag is None or bound_expression(lag, spans)[0] < 1)
+                delay = past.delay
+                is_now = past.offset == 0 and (
+                    delay is None or bound_expression(delay, spans)[0] < 1
+                )
                 if is_now and past.name == self.input.name:
                     return True
                 if is_now and past.kind == "state" and past.name not in reached:

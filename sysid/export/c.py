@@ -85,7 +85,7 @@ class CLanguage(TargetLanguage):
         """Write a whole number as floating-point number."""
         return f"(double){index}"
 
-    def lag(self, text: str, *, is_whole: bool) -> str:
+    def write_delay(self, text: str, *, is_whole: bool) -> str:
         """Write a time lag that is not negative."""
         least = f"fmax({text}, 0.0)"
         return f"floor({least} + 0.5)" if is_whole else least
@@ -262,9 +262,9 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
 
 def _write_delays(program: GeneratedProgram) -> list[str]:
     lines = []
-    for lag, name in program.delay_names.items():
+    for delay, name in program.delay_names.items():
         lines += [
-            f"const double {name} = {write_delay_steps(program, lag)}; /* integration steps */",
+            f"const double {name} = {write_delay_steps(program, delay)}; /* integration steps */",
             f"if (!({name} < 1e9))",
             "    return 1;",
         ]
@@ -433,20 +433,20 @@ static double sample(const double *array, double before, long step)
 }
 """
 _PAST = """\
-/* Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start. */
-static double past(const double *array, double before, long step, double lag)
+/* Value `delay` >= 0 steps before a finished step, linear; `before` the start. */
+static double past(const double *array, double before, long step, double delay)
 {
-    const double whole = floor(-lag);
+    const double whole = floor(-delay);
     const double older = sample(array, before, step + (long)whole);
     const double newer = sample(array, before, step + (long)fmin(whole + 1.0, 0.0));
-    return older + (-lag - whole)*(newer - older);
+    return older + (-delay - whole)*(newer - older);
 }
 """
 _PAST_CUBIC = """\
-/* Value `lag` >= 0 steps before a finished step, on a cubic through four (the last: three). */
-static double past(const double *array, double before, long step, double lag)
+/* Value `delay` >= 0 steps before a finished step, on a cubic of four (last: three). */
+static double past(const double *array, double before, long step, double delay)
 {
-    const double whole = floor(-lag), part = -lag - whole;
+    const double whole = floor(-delay), part = -delay - whole;
     const int last = whole <= -2.0 ? 2 : 1;
     double value = 0.0;
     for (int a = -1; a <= last; ++a) {
@@ -460,13 +460,13 @@ static double past(const double *array, double before, long step, double lag)
 }
 """
 _LATELY = """\
-/* Value `lag` steps before the place `part` of a step after it began, where it is `there`. */
+/* Value `delay` steps before the place `part` of a step after it began, where it is `there`. */
 static double lately(const double *array, double before, long step, double part, double there,
-                     double lag)
+                     double delay)
 {
-    if (lag < part)
-        return array[step] + (part - lag)/part*(there - array[step]);
-    return past(array, before, step, lag - part);
+    if (delay < part)
+        return array[step] + (part - delay)/part*(there - array[step]);
+    return past(array, before, step, delay - part);
 }
 """
 _SIGN = """\

@@ -52,7 +52,7 @@ class TargetLanguage(Protocol):
     def write_float(self, index: str) -> str:
         """Write a whole number as floating-point number."""
 
-    def lag(self, text: str, *, is_whole: bool) -> str:
+    def write_delay(self, text: str, *, is_whole: bool) -> str:
         """Write a time lag that is not negative; `is_whole`: rounded to whole steps."""
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:

@@ -128,7 +128,7 @@ class GeneratedProgram:
         """Name the variable of a time lag in integration steps."""
         if expression not in self.delay_names:
             self.delay_names[expression] = self.identifiers.make_identifier(
-                f"lag_{len(self.delay_names) + 1}"
+                f"delay_{len(self.delay_names) + 1}"
             )
         return self.delay_names[expression]
 
@@ -184,9 +184,11 @@ class LoopScope(ExportScope):
 
     def _write_position(self, past: PastValue) -> str:
         offset = f"-{past.offset}" if past.offset else ""
-        lag = f" - {self.program.name_delay(past.delay)}" if past.delay is not None else ""
+        delay = f" - {self.program.name_delay(past.delay)}" if past.delay is not None else ""
         return (
-            ("step + part" if self.stage == "slope" else self.program.loop_variable) + offset + lag
+            ("step + part" if self.stage == "slope" else self.program.loop_variable)
+            + offset
+            + delay
         )
 
     # ---- inputs ---------------------------------------------------------------------------
@@ -238,31 +240,35 @@ class LoopScope(ExportScope):
         if self.stage == "recursion":
             return self._write_earlier_state(past)
         every, before = program.array_names[past.name], program.write_history(past.name)
-        lag = self._write_state_delay(past)
+        delay = self._write_state_delay(past)
         if self.stage == "slope":
             present = self._write_present_state(past.name)
-            return program.write_helper_call("lately", every, before, "step", "part", present, lag)
+            return program.write_helper_call(
+                "lately", every, before, "step", "part", present, delay
+            )
         if self.stage == "update" and self._is_updated(past.name):
             following = program.next_names[past.name]
-            return program.write_helper_call("lately", every, before, "step", "1.0", following, lag)
-        return program.write_helper_call("past", every, before, program.loop_variable, lag)
+            return program.write_helper_call(
+                "lately", every, before, "step", "1.0", following, delay
+            )
+        return program.write_helper_call("past", every, before, program.loop_variable, delay)
 
     def _write_earlier_state(self, past: PastValue) -> str:
         program = self.program
         every, before = program.array_names[past.name], program.write_history(past.name)
         if past.delay is None:
             return f"{every}[k-{past.offset}]"
-        lag = program.name_delay(past.delay)
+        delay = program.name_delay(past.delay)
         if past.offset == 0:
             present = self._write_present_state(past.name)
-            return program.write_helper_call("lately", every, before, "k-1", "1.0", present, lag)
+            return program.write_helper_call("lately", every, before, "k-1", "1.0", present, delay)
         whole = f"{write_number(past.offset - 1)} + " if past.offset > 1 else ""
-        return program.write_helper_call("past", every, before, "k-1", whole + lag)
+        return program.write_helper_call("past", every, before, "k-1", whole + delay)
 
     def _write_state_delay(self, past: PastValue) -> str:
         offset = write_number(past.offset) if past.offset else ""
-        lag = self.program.name_delay(past.delay) if past.delay is not None else ""
-        return " + ".join(part for part in (offset, lag) if part)
+        delay = self.program.name_delay(past.delay) if past.delay is not None else ""
+        return " + ".join(part for part in (offset, delay) if part)
 
     def _write_present_state(self, name: str) -> str:
         program = self.program
@@ -299,15 +305,15 @@ class DelayScope(ExportScope):
         raise AssertionError(f"a time lag contains no signal such as {past.name}")
 
 
-def write_delay_steps(program: GeneratedProgram, lag: Expression) -> str:
+def write_delay_steps(program: GeneratedProgram, delay: Expression) -> str:
     """Write a time lag in integration steps."""
     if program.is_recursion:
-        text = write_expression(lag, program.language, DelayScope(program))
+        text = write_expression(delay, program.language, DelayScope(program))
     else:
-        seconds = write_expression(lag, program.language, DelayScope(program), Level.SIGN)
+        seconds = write_expression(delay, program.language, DelayScope(program), Level.SIGN)
         text = f"{seconds}/{program.step_variable}"
     is_whole = program.identified.model.solver.interpolation == "nearest"
-    return program.language.lag(text, is_whole=is_whole)
+    return program.language.write_delay(text, is_whole=is_whole)
 
 
 # ---- common to both languages ---------------------------------------------------------------

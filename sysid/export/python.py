@@ -28,7 +28,7 @@ _RESERVED_WORDS = (
     "False None True and as assert async await break class continue def del elif else except "
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
-    "slope_4 every points ratio ramp half averaged sample_time lag range zip map max min int float "
+    "slope_4 every points ratio ramp half averaged sample_time range zip map max min int float "
     "abs len y before between held past lately sign signal array grid print math ValueError"
 )
 _LINE_WIDTH = 96
@@ -79,7 +79,7 @@ class PythonLanguage(TargetLanguage):
         """Write a whole number as floating-point number."""
         return f"np.float64({index})"
 
-    def lag(self, text: str, *, is_whole: bool) -> str:
+    def write_delay(self, text: str, *, is_whole: bool) -> str:
         """Write a time lag that is not negative."""
         least = f"max({text}, 0.0)"
         return f"np.floor({least} + 0.5)" if is_whole else least
@@ -232,9 +232,10 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
 
 
 def _write_delays(program: GeneratedProgram) -> list[str]:
-    lags = program.delay_names.items()
+    delays = program.delay_names.items()
     return [
-        f"{name} = {write_delay_steps(program, lag)}  # integration steps" for lag, name in lags
+        f"{name} = {write_delay_steps(program, delay)}  # integration steps"
+        for delay, name in delays
     ]
 
 
@@ -346,19 +347,19 @@ _AVERAGED = '''def averaged(signal, place, half):
         total += width*signal[min(max(k, 0), signal.size - 1)]
     return total/(2*half)
 '''
-_PAST = '''def past(array, before, step, lag):
-    """Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start."""
-    i = int(np.floor(-lag))
-    part = -lag - i
+_PAST = '''def past(array, before, step, delay):
+    """Value `delay` >= 0 steps before a finished step, linear; `before` the start."""
+    i = int(np.floor(-delay))
+    part = -delay - i
     older, newer = (
         array[step + j] if step + j >= 0 else before for j in (i, min(i + 1, 0))
     )
     return older + part*(newer - older)
 '''
-_PAST_CUBIC = '''def past(array, before, step, lag):
-    """Value `lag` >= 0 steps before a finished step, on a cubic through four (the last: three)."""
-    i = int(np.floor(-lag))
-    part = -lag - i
+_PAST_CUBIC = '''def past(array, before, step, delay):
+    """Value `delay` >= 0 steps before a finished step, on a cubic of four (last: three)."""
+    i = int(np.floor(-delay))
+    part = -delay - i
     nodes = (-1, 0, 1, 2) if i <= -2 else (-1, 0, 1)
     value = 0.0
     for a in nodes:
@@ -367,11 +368,11 @@ _PAST_CUBIC = '''def past(array, before, step, lag):
         value += weight*(array[j] if j >= 0 else before)
     return value
 '''
-_LATELY = '''def lately(array, before, step, part, there, lag):
-    """Value `lag` steps before the place `part` of a step after it began, where it is `there`."""
-    if lag < part:
-        return array[step] + (part - lag)/part*(there - array[step])
-    return past(array, before, step, lag - part)
+_LATELY = '''def lately(array, before, step, part, there, delay):
+    """Value `delay` steps before the place `part` of a step after it began, where it is `there`."""
+    if delay < part:
+        return array[step] + (part - delay)/part*(there - array[step])
+    return past(array, before, step, delay - part)
 '''
 HELPERS: Mapping[str, str] = {
     "between": _BETWEEN,
