@@ -151,7 +151,7 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
                 "texts": texts,
             }
         )
-    return render_template("compare.html", found=comparison, parameters=rows)
+    return render_template("compare.html", comparison=comparison, parameters=rows)
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:

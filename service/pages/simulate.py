@@ -140,7 +140,7 @@ def simulate_page(
         status = error.status if isinstance(error, Unavailable) else 422
     page = render_template(
         "simulate.html",
-        known=form,
+        form=form,
         kind=kind,
         kinds=SIMULATION_KINDS,
         tunings=TUNINGS,

@@ -87,3 +87,47 @@ def test_sentences_of_messages_are_short() -> None:
         if len(sentence.split()) > MOST_WORDS
     ]
     assert long == []
+
+
+def comments(script: str) -> list[str]:
+    """Comments of a JavaScript file. Neighbouring lines that begin with ``//`` are one text."""
+    blocks = [text.replace("*", " ") for text in re.findall(r"/\*(.*?)\*/", script, re.DOTALL)]
+    lines = re.findall(r"((?:^[ \t]*// .*\n)+)", script, re.MULTILINE)
+    ends = re.findall(r"^[ \t]*[^\s/].*?[;,{})] // (.*)$", script, re.MULTILINE)
+    return [*blocks, *(text.replace("//", " ") for text in lines), *ends]
+
+
+def visible_texts(template: str) -> list[str]:
+    """Texts that a template shows, hints included; a value that is filled in counts as a word."""
+    source = re.sub(r"{{.*?}}", "X", re.sub(r"{#.*?#}", "", template, flags=re.DOTALL))
+    hints = re.findall(r'(?:title|placeholder|aria-label|data-empty)="([^"]*)"', source)
+    prose = re.sub(r"</?(?:a|abbr|b|code|em|i|small|span|sub|sup)\b[^>]*>", "", source)
+    return [*hints, *re.split(r"<[^>]*>|{%.*?%}", prose)]
+
+
+def test_a_long_sentence_of_a_page_is_seen() -> None:
+    long = " ".join(["word"] * 26)
+    script = f"const a = 1; // {long}\n  // one\n  // {long}\n/** {long}.\n * Short one here. */\n"
+    assert sorted(len(text.split()) for text in comments(script)) == [26, 27, 29]
+    page = f'<p>a <b>{long}</b></p>{{# {long} #}}<i title="{long} b">{{{{ x }}}}{{% if x %}} a'
+    assert sorted(len(text.split()) for text in visible_texts(page) if text) == [1, 1, 27, 27]
+
+
+def test_sentences_of_pages_are_short() -> None:
+    pages = ROOT / "service" / "pages"
+    texts = [
+        *((path, text) for path in pages.rglob("*.js") for text in comments(path.read_text())),
+        *(
+            (path, text)
+            for path in pages.rglob("*.html")
+            for text in visible_texts(path.read_text())
+        ),
+    ]
+    long = [
+        f"{path.name}: {sentence}"
+        for path, text in texts
+        for sentence in re.split(r"(?<=[.!?:])\s+", text)
+        if len(sentence.split()) > MOST_WORDS
+    ]
+    assert texts
+    assert long == []

@@ -1,42 +1,42 @@
 // The form of a re-identification: recordings with labels, and one POST to /v1/recipes/reidentify.
 
-import { overrides, shown, submits } from './fields.js';
-import { algorithmOf, channelsOf, chosenModel, drawChannels, number, numbers } from './recipes.js';
+import { readOverrides, withFaults, onSubmit } from './fields.js';
+import { readAlgorithm, readChannels, loadChosenModel, drawChannels, parseNumber, parseNumbers } from './recipes.js';
 
 const form = document.getElementById('batch-form');
 const field = (name) => form.elements.namedItem(name);
-const labels = () => [...form.querySelectorAll('[data-dataset]')];
+const listLabels = () => [...form.querySelectorAll('[data-dataset]')];
 let model = null;
-let drawnFor = null;
+let drawnChoice = null;
 
-const chosen = () => labels().filter((one) => one.value.trim() !== '');
-const recorded = () => (chosen()[0]?.dataset.channels ?? '').split('\n').filter(Boolean);
+const listChosen = () => listLabels().filter((input) => input.value.trim() !== '');
+const listRecordedChannels = () => (listChosen()[0]?.dataset.channels ?? '').split('\n').filter(Boolean);
 
-function channels() {
-  const names = recorded();
+function updateChannels() {
+  const names = listRecordedChannels();
   const now = JSON.stringify([model?.name, names]);
-  if (!model || now === drawnFor) return;
-  drawnFor = now;
+  if (!model || now === drawnChoice) return;
+  drawnChoice = now;
   drawChannels(model, names);
 }
 
-function count() {
-  const runs = chosen().length;
-  const values = new Set(chosen().map((one) => number(one.value))).size;
+function showRunCount() {
+  const runs = listChosen().length;
+  const values = new Set(listChosen().map((input) => parseNumber(input.value))).size;
   document.getElementById('runs-count').textContent =
     `${runs} run${runs === 1 ? '' : 's'} at ${values} value${values === 1 ? '' : 's'} of ${field('label').value.trim() || 'the label'}`;
 }
 
-function filter() {
+function filterRows() {
   const text = field('filter').value.trim().toLowerCase();
   for (const row of form.querySelectorAll('tr[data-name]'))
     row.hidden = !row.dataset.name.toLowerCase().includes(text) && row.querySelector('input').value.trim() === '';
 }
 
-function body() {
-  const batch = chosen().map((one, place) => {
-    one.dataset.pointer = `/batch/${place}`;
-    return { x: number(one.value), datasets: [one.dataset.dataset] };
+function buildBody() {
+  const batch = listChosen().map((input, place) => {
+    input.dataset.pointer = `/batch/${place}`;
+    return { x: parseNumber(input.value), datasets: [input.dataset.dataset] };
   });
   const words = (text) => text.split(/[,;\s]+/).filter(Boolean);
   return {
@@ -47,28 +47,28 @@ function body() {
     reference: field('reference').value || null,
     warm_start: field('warm_start').value || null,
     trend_parameters: words(field('trend_parameters').value),
-    predict: numbers(field('predict').value),
-    channels: channelsOf(form),
-    parameters: overrides(),
-    algorithm: algorithmOf(form),
-    seed: number(field('seed').value) ?? 1,
+    predict: parseNumbers(field('predict').value),
+    channels: readChannels(form),
+    parameters: readOverrides(),
+    algorithm: readAlgorithm(form),
+    seed: parseNumber(field('seed').value) ?? 1,
   };
 }
 
-async function modelChosen() {
+async function loadModel() {
   model = null;
-  const found = await chosenModel(form);
-  if (!found) return;
-  model = found;
-  channels();
+  const chosen = await loadChosenModel(form);
+  if (!chosen) return;
+  model = chosen;
+  updateChannels();
 }
 
-field('model').addEventListener('change', shown(form, modelChosen));
-field('filter').addEventListener('input', filter);
+field('model').addEventListener('change', withFaults(form, loadModel));
+field('filter').addEventListener('input', filterRows);
 form.addEventListener('input', () => {
-  channels();
-  count();
+  updateChannels();
+  showRunCount();
 });
-submits(form, '/v1/recipes/reidentify', body);
-count();
-shown(form, modelChosen)();
+onSubmit(form, '/v1/recipes/reidentify', buildBody);
+showRunCount();
+withFaults(form, loadModel)();

@@ -1,5 +1,5 @@
 // A dataset's page: its signals.
 
-import { begin } from './figures.js';
+import { start } from './figures.js';
 
-begin();
+start();

@@ -1,32 +1,35 @@
-// What all forms share: the table of bounds, submission, problem documents beside the fields they are about.
+// Shared by all forms: the table of bounds, submission, and faults next to their fields.
 
-import { Problem, element, post } from './live.js';
+import { Problem, makeElement, post } from './live.js';
 
 const COLUMNS = ['lower', 'upper', 'fixed'];
 const rows = document.getElementById('parameters');
-let kept = {}; // what was asked for and has no field
+let hiddenChanges = {}; // requested changes without a field
 
-/** What has bounds: parameters, and the starts that are estimated, of the first experiment. */
-function bounded(model) {
+/** List what has bounds: parameters, and the estimated initial values of the first experiment. */
+function listBounded(model) {
   const starts = Object.entries(model.initial ?? {}).filter(([, start]) => start?.upper !== undefined);
   const unit = (state) => model.states?.[state] ?? '–';
   return { ...model.parameters, ...Object.fromEntries(starts.map(([state, start]) => [`${state}(0)`, { ...start, unit: unit(state) }])) };
 }
 
-/** Scales, ties, and starts of later experiments, as x(0)[2]: an earlier job may ask for them. */
-function withoutField(known, changes) {
-  const asked = Object.entries(changes).filter(([name]) => name.replace(/\[\d+\]$/, '') in known);
-  const left = asked.map(([name, fields]) => [name, Object.entries(fields).filter(([key]) => !(name in known && COLUMNS.includes(key)))]);
-  return Object.fromEntries(left.filter(([, fields]) => fields.length).map(([name, fields]) => [name, Object.fromEntries(fields)]));
+/**
+ * Select the changes that have no field: scales, ties, and initial values of later experiments.
+ * The latter have names such as x(0)[2]. A cloned job may contain them.
+ */
+function selectHiddenChanges(bounded, changes) {
+  const requested = Object.entries(changes).filter(([name]) => name.replace(/\[\d+\]$/, '') in bounded);
+  const hidden = requested.map(([name, fields]) => [name, Object.entries(fields).filter(([key]) => !(name in bounded && COLUMNS.includes(key)))]);
+  return Object.fromEntries(hidden.filter(([, fields]) => fields.length).map(([name, fields]) => [name, Object.fromEntries(fields)]));
 }
 
-/** One row per parameter of the model, with the bounds of the model or those that were asked for. */
+/** Fill the table: one row per parameter, with the model's bounds or the requested ones. */
 export function fillTable(model, changes) {
-  const known = bounded(model);
-  kept = withoutField(known, changes);
-  const made = Object.entries(known).map(([name, own]) => {
+  const boundsByName = listBounded(model);
+  hiddenChanges = selectHiddenChanges(boundsByName, changes);
+  const tableRows = Object.entries(boundsByName).map(([name, bounds]) => {
     const row = document.createElement('tr');
-    row.append(element('th', name));
+    row.append(makeElement('th', name));
     for (const column of COLUMNS) {
       const input = document.createElement('input');
       input.inputMode = 'decimal';
@@ -34,47 +37,48 @@ export function fillTable(model, changes) {
       input.dataset.parameter = name;
       input.dataset.column = column;
       input.dataset.pointer = `/parameters/${name}/${column}`;
-      input.dataset.known = own?.[column] ?? '';
-      input.value = changes[name]?.[column] ?? input.dataset.known;
+      input.dataset.bound = bounds?.[column] ?? '';
+      input.value = changes[name]?.[column] ?? input.dataset.bound;
       row.append(document.createElement('td'));
       row.lastChild.append(input);
     }
-    row.append(element('td', own?.unit ?? '–', 'muted'));
+    row.append(makeElement('td', bounds?.unit ?? '–', 'muted'));
     return row;
   });
-  rows.replaceChildren(...made);
+  rows.replaceChildren(...tableRows);
 }
 
-/** What differs from the model, as the job body wants it. */
-export function overrides() {
-  const found = structuredClone(kept);
+/** Read what differs from the model, as the job body has it. */
+export function readOverrides() {
+  const changes = structuredClone(hiddenChanges);
   for (const input of rows.querySelectorAll('input')) {
     const text = input.value.trim();
-    if (text === '' || text === input.dataset.known) continue;
+    if (text === '' || text === input.dataset.bound) continue;
     const value = Number.isNaN(Number(text)) ? text : Number(text);
-    (found[input.dataset.parameter] ??= {})[input.dataset.column] = value;
+    (changes[input.dataset.parameter] ??= {})[input.dataset.column] = value;
   }
-  return found;
+  return changes;
 }
 
-/** Put every fault beside the field that its pointer names, or the nearest above it. */
+/** Show every fault next to the field of its pointer, or of the nearest pointer above. */
 export function showFaults(form, problem) {
   const top = form.querySelector('#form-fault');
-  problem.errors.forEach((fault) => beside(form, fault));
+  problem.errors.forEach((fault) => markFault(form, fault));
   const summary = problem.errors.length ? 'The request is invalid:' : problem.document.title;
-  top.replaceChildren(element('b', summary));
+  top.replaceChildren(makeElement('b', summary));
   const list = document.createElement('ul');
-  const texts = problem.errors.length ? problem.errors.map(said) : [problem.message];
-  texts.forEach((text) => list.append(element('li', text)));
+  const texts = problem.errors.length ? problem.errors.map(formatFault) : [problem.message];
+  texts.forEach((text) => list.append(makeElement('li', text)));
   top.append(list);
   top.hidden = false;
   (form.querySelector('[aria-invalid="true"]') ?? top).focus();
 }
 
-const said = ({ pointer, detail, column }) =>
+const formatFault = ({ pointer, detail, column }) =>
   `${pointer ? `${pointer}: ` : ''}${detail}${column ? ` (column ${column})` : ''}`;
 
-function beside(form, fault) {
+/** Mark the field of a fault, and write the fault below it. */
+function markFault(form, fault) {
   const parts = (fault.pointer ?? '').split('/');
   for (; parts.length > 1; parts.pop()) {
     const pointer = parts.join('/');
@@ -82,7 +86,7 @@ function beside(form, fault) {
     const place = form.querySelector(`[data-fault="/${CSS.escape(parts[1])}"]`);
     if (input) input.ariaInvalid = 'true';
     if ((input || parts.length === 2) && place) {
-      place.textContent = [place.textContent, said(fault)].filter(Boolean).join('; ');
+      place.textContent = [place.textContent, formatFault(fault)].filter(Boolean).join('; ');
       return true;
     }
   }
@@ -90,53 +94,53 @@ function beside(form, fault) {
 }
 
 export function clearFaults(form) {
-  form.querySelectorAll('.fault[data-fault]').forEach((one) => (one.textContent = ''));
-  form.querySelectorAll('[aria-invalid]').forEach((one) => one.removeAttribute('aria-invalid'));
+  form.querySelectorAll('.fault[data-fault]').forEach((field) => (field.textContent = ''));
+  form.querySelectorAll('[aria-invalid]').forEach((field) => field.removeAttribute('aria-invalid'));
   form.querySelector('#form-fault').hidden = true;
 }
 
-/** What the form is about to do, or why it does not. */
-export const say = (form, text) => (form.querySelector('#form-state').textContent = text);
+/** Show what the form does, or why it does nothing. */
+export const showState = (form, text) => (form.querySelector('#form-state').textContent = text);
 
-/** Choices whose answers are still on their way: without them a request would lack what they bring. */
-let going = null;
+/** Choices that await an answer. A request must wait for them, because it needs their values. */
+let pendingChoices = null;
 
-async function settled() {
-  for (let seen; seen !== going; ) {
-    seen = going;
+async function awaitChoices() {
+  for (let seen; seen !== pendingChoices; ) {
+    seen = pendingChoices;
     await seen;
   }
 }
 
-/** Send the body that `make` gives when a form that is ready is submitted; faults go to their fields. */
-export function submits(form, url, make, isReady = async () => true) {
+/** Send the body when a form that is ready is submitted. Faults are shown at their fields. */
+export function onSubmit(form, url, buildBody, isReady = async () => true) {
   form.addEventListener('submit', async (event) => {
     event.preventDefault();
     clearFaults(form);
     const button = form.querySelector('[type="submit"]');
     button.disabled = true;
-    say(form, 'submitting…');
+    showState(form, 'submitting…');
     try {
-      await settled();
+      await awaitChoices();
       if (!(await isReady())) {
         button.disabled = false;
         return;
       }
-      const job = await post(url, make());
+      const job = await post(url, buildBody());
       location.assign(`/jobs/${encodeURIComponent(job.id)}`);
     } catch (error) {
       if (!(error instanceof Problem)) throw error;
-      say(form, '');
+      showState(form, '');
       showFaults(form, error);
       button.disabled = false;
     }
   });
 }
 
-/** What a choice sets going may be refused; the refusal is shown, never lost. */
-export const shown = (form, work) => async (...given) => {
-  const done = work(...given);
-  going = Promise.allSettled([going, done]);
+/** Wrap a handler of a choice, so that its faults are shown in the form. */
+export const withFaults = (form, work) => async (...args) => {
+  const done = work(...args);
+  pendingChoices = Promise.allSettled([pendingChoices, done]);
   try {
     await done;
   } catch (error) {

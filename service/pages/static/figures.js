@@ -1,6 +1,6 @@
 // Draws the figures that the server defines. Only what is on the screen is fetched and drawn.
 
-import { Problem, ask, element, post } from './live.js';
+import { Problem, ask, makeElement, post } from './live.js';
 
 const dark = matchMedia('(prefers-color-scheme: dark)');
 const CONFIG = {
@@ -12,31 +12,31 @@ const CONFIG = {
 const seen = new WeakSet();
 const latest = new WeakMap();
 
-export const plots = () => [...document.querySelectorAll('[data-figure]')];
+export const listPlots = () => [...document.querySelectorAll('[data-figure]')];
 
-/** Address of a plot's figure, with what the user chose. */
-function address(plot, extra = {}) {
+/** Build the address of a plot's figure, with what the user chose. */
+function buildAddress(plot, extra = {}) {
   const url = new URL(plot.dataset.url, location.href);
   const query = new URLSearchParams(plot.dataset.query ?? '');
   query.set('theme', dark.matches ? 'dark' : 'light');
-  if (['convergence', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', columns(plot));
+  if (['convergence', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', countColumns(plot));
   for (const [name, value] of Object.entries(extra)) query.set(name, value);
   url.search = query;
   return url;
 }
 
-const columns = (plot) => (plot.clientWidth < 520 ? 1 : plot.clientWidth < 860 ? 2 : 3);
+const countColumns = (plot) => (plot.clientWidth < 520 ? 1 : plot.clientWidth < 860 ? 2 : 3);
 
-/** Fetch and draw one plot; a figure that is overtaken by a later one is dropped. */
+/** Fetch and draw one plot. A figure is dropped if a later one was requested. */
 export async function draw(plot, extra = {}) {
-  const turn = (latest.get(plot) ?? 0) + 1;
-  latest.set(plot, turn);
+  const request = (latest.get(plot) ?? 0) + 1;
+  latest.set(plot, request);
   try {
-    const figure = await ask(address(plot, extra));
-    if (latest.get(plot) !== turn) return;
+    const figure = await ask(buildAddress(plot, extra));
+    if (latest.get(plot) !== request) return;
     if (!figure.data.length) {
-      if (!document.querySelector('[data-live="chip"][data-open="1"]')) plot.style.height = ''; // nothing comes
-      return tell(plot, plot.dataset.empty ?? 'nothing to show yet');
+      if (!document.querySelector('[data-live="chip"][data-open="1"]')) plot.style.height = ''; // no figure will follow
+      return showMessage(plot, plot.dataset.empty ?? 'nothing to show yet');
     }
     plot.querySelector('.plot-empty')?.remove();
     plot.style.height = `${figure.layout.height}px`;
@@ -44,19 +44,19 @@ export async function draw(plot, extra = {}) {
     await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
     plot.dataset.thinned = figure.layout.meta?.thinned ?? '';
     plot.dispatchEvent(new CustomEvent('drawn', { bubbles: true, detail: figure.layout }));
-    if (first) plot.on('plotly_relayout', (change) => zoomed(plot, change));
+    if (first) plot.on('plotly_relayout', (change) => onZoom(plot, change));
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    if (latest.get(plot) === turn && !plot.classList.contains('js-plotly-plot')) tell(plot, error.message);
+    if (latest.get(plot) === request && !plot.classList.contains('js-plotly-plot')) showMessage(plot, error.message);
   }
 }
 
-/** Have the profiles of a run computed, and draw them. */
-export async function profile(button) {
+/** Request the profiles of a run, and draw them. */
+export async function drawProfiles(button) {
   const plot = button.closest('section').querySelector('[data-profile-plot]');
   const url = `${button.dataset.profile}?theme=${dark.matches ? 'dark' : 'light'}`;
   button.disabled = true;
-  tell(plot, '…');
+  showMessage(plot, '…');
   try {
     const { figure } = await post(url, {});
     plot.querySelector('.plot-empty')?.remove();
@@ -64,18 +64,18 @@ export async function profile(button) {
     await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    tell(plot, error.message);
+    showMessage(plot, error.message);
     button.disabled = false;
   }
 }
 
-function tell(plot, text) {
-  const place = plot.querySelector('.plot-empty') ?? plot.appendChild(element('span', '', 'plot-empty'));
+function showMessage(plot, text) {
+  const place = plot.querySelector('.plot-empty') ?? plot.appendChild(makeElement('span', '', 'plot-empty'));
   place.textContent = text;
 }
 
-/** A zoom into a thinned signal fetches the stretch anew, with more of its samples. */
-function zoomed(plot, change) {
+/** Fetch the visible part of a thinned signal again, with more of its samples. */
+function onZoom(plot, change) {
   if (!['response', 'signals'].includes(plot.dataset.figure)) return;
   if (change['xaxis.autorange']) {
     if (plot.dataset.zoomed) draw(plot);
@@ -87,7 +87,7 @@ function zoomed(plot, change) {
 }
 
 /** Change a plot's query (its abscissa, its experiment) and draw it again. */
-export function choose(plot, name, value) {
+export function setQuery(plot, name, value) {
   const query = new URLSearchParams(plot.dataset.query ?? '');
   query.set(name, value);
   plot.dataset.query = query;
@@ -100,9 +100,9 @@ export function choose(plot, name, value) {
   if (seen.has(plot)) draw(plot);
 }
 
-/** Draw again those that are or were on the screen. */
+/** Draw the plots again that are or were on the screen. */
 export const redraw = (names) =>
-  Promise.all(plots().filter((p) => seen.has(p) && (!names || names.includes(p.dataset.figure))).map((p) => draw(p)));
+  Promise.all(listPlots().filter((p) => seen.has(p) && (!names || names.includes(p.dataset.figure))).map((p) => draw(p)));
 
 const watcher = new IntersectionObserver(
   (entries) => {
@@ -116,10 +116,10 @@ const watcher = new IntersectionObserver(
   { rootMargin: '300px' },
 );
 
-/** Draw every plot once it is on the screen, those too that have come to the page since. */
-export const watch = () => plots().filter((plot) => !seen.has(plot)).forEach((plot) => watcher.observe(plot));
+/** Draw every plot once it is on the screen, including plots added since. */
+export const watch = () => listPlots().filter((plot) => !seen.has(plot)).forEach((plot) => watcher.observe(plot));
 
-export function begin() {
+export function start() {
   watch();
   dark.addEventListener('change', () => redraw());
 }

@@ -1,8 +1,8 @@
 // New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
 
-import { Problem, ask, element, latest } from './live.js';
+import { Problem, ask, makeElement, keepLatest } from './live.js';
 import * as forms from './fields.js';
-import { clearFaults, fillTable, overrides, showFaults } from './fields.js';
+import { clearFaults, fillTable, readOverrides } from './fields.js';
 
 const panel = document.getElementById('new');
 const form = document.getElementById('job-form');
@@ -13,7 +13,7 @@ const query = new URLSearchParams(location.search);
 async function start() {
   if (state.started) return;
   state.started = true;
-  form.inert = true; // what was typed or sent before all is there would be lost, or lack what is taken over
+  form.inert = true; // until all choices are loaded, because they replace what was typed
   try {
     await fill();
   } finally {
@@ -23,19 +23,19 @@ async function start() {
 
 async function fill() {
   const [datasets, models] = await Promise.all([ask('/v1/datasets?limit=200'), ask('/v1/models')]);
-  for (const one of datasets.items) {
-    field('dataset').append(new Option(one.name, one.id));
-    field('validation').append(new Option(`recording ${one.name}`, one.id));
+  for (const { name, id } of datasets.items) {
+    field('dataset').append(new Option(name, id));
+    field('validation').append(new Option(`recording ${name}`, id));
   }
-  for (const one of models.items) field('model').append(new Option(one.title ? `${one.name} – ${one.title}` : one.name, one.name));
+  for (const { name, title } of models.items) field('model').append(new Option(title ? `${name} – ${title}` : name, name));
   if (query.get('clone')) await fillFrom(query.get('clone'));
   else {
-    if (query.get('dataset')) await choose(query.get('dataset'));
-    await listed();
+    if (query.get('dataset')) await selectDataset(query.get('dataset'));
+    await showListedModel();
   }
 }
 
-/** Take over the request of an earlier job; what the form has no field for goes along. */
+/** Fill the form from an earlier job. Settings without a field are sent unchanged. */
 async function fillFrom(job) {
   const { request, name } = await ask(`/v1/jobs/${encodeURIComponent(job)}`);
   const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
@@ -50,44 +50,44 @@ async function fillFrom(job) {
   set('noise_model', request.loss?.noise_model);
   const fraction = request.validation?.fraction;
   if (fraction) {
-    const known = [...field('validation').options].some((one) => one.value === String(fraction));
-    if (!known) field('validation').append(new Option(`the last ${100 * fraction} %`, String(fraction)));
+    const isListed = [...field('validation').options].some((option) => option.value === String(fraction));
+    if (!isListed) field('validation').append(new Option(`the last ${100 * fraction} %`, String(fraction)));
     set('validation', String(fraction));
   } else if (request.validation) {
     field('validation').append(new Option('as in the cloned job', 'clone'));
     set('validation', 'clone');
   }
-  await choose(request.datasets[0]);
+  await selectDataset(request.datasets[0]);
   if (typeof request.model === 'string') {
     set('model', request.model);
-    await listed(request.parameters);
+    await showListedModel(request.parameters);
   } else {
     field('source').value = 'own';
     const text = await ask(`/pages/jobs/${encodeURIComponent(job)}/model.yaml`);
     state.cloned = { text, model: request.model };
-    await own(text, request.parameters);
+    await showOwnModel(text, request.parameters);
   }
   mapChannels(request.channels, request.hold);
 }
 
-async function choose(id) {
-  if (![...field('dataset').options].some((one) => one.value === id)) {
-    const found = await ask(`/v1/datasets/${encodeURIComponent(id)}`);
-    field('dataset').append(new Option(found.name, found.id));
+async function selectDataset(id) {
+  if (![...field('dataset').options].some((option) => option.value === id)) {
+    const dataset = await ask(`/v1/datasets/${encodeURIComponent(id)}`);
+    field('dataset').append(new Option(dataset.name, dataset.id));
   }
   field('dataset').value = id;
-  await chosen();
+  await showDataset();
 }
 
-const recordingOf = latest(async (id) => ({ dataset: id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null }));
+const fetchDataset = keepLatest(async (id) => ({ dataset: id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null }));
 
-async function chosen() {
-  const found = await recordingOf(field('dataset').value);
-  if (!found) return;
-  state.dataset = found.dataset;
+async function showDataset() {
+  const answer = await fetchDataset(field('dataset').value);
+  if (!answer) return;
+  state.dataset = answer.dataset;
   const facts = document.getElementById('dataset-facts');
   const channels = state.dataset?.channels ?? [];
-  facts.textContent = channels.map((one) => (one.unit && one.unit !== '1' ? `${one.name} [${one.unit}]` : one.name)).join(' · ');
+  facts.textContent = channels.map(({ name, unit }) => (unit && unit !== '1' ? `${name} [${unit}]` : name)).join(' · ');
   mapChannels();
 }
 
@@ -95,84 +95,84 @@ async function upload() {
   const [file] = field('upload').files;
   if (!file) return;
   clearFaults(form);
-  say(`storing ${file.name}…`);
+  showState(`storing ${file.name}…`);
   const type = file.name.toLowerCase().endsWith('.mcap') ? 'application/x-mcap' : 'text/csv';
   try {
     const stored = await ask(`/v1/datasets?name=${encodeURIComponent(file.name)}`, {
       method: 'POST', headers: { 'Content-Type': type }, body: file,
     });
-    await choose(stored.id);
-    say(`${file.name} is stored`);
+    await selectDataset(stored.id);
+    showState(`${file.name} is stored`);
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     form.querySelector('[data-fault="/datasets"]').textContent = error.message;
-    say('');
+    showState('');
   }
 }
 
-/** A model of the list, or the check of a text: only what was asked for last is shown. */
-const about = latest((question) => question());
+/** Ask for a model of the list or for the check of a text. Only the last answer is shown. */
+const askModel = keepLatest((question) => question());
 
-/** Show a model of the list; its text is there to be read, and to be changed with "own equations". */
-async function listed(changes) {
+/** Show a model of the list. Its text becomes editable with "own equations". */
+async function showListedModel(changes) {
   const name = encodeURIComponent(field('model').value);
-  const found = await about(() => Promise.all([ask(`/v1/models/${name}`), ask(`/pages/models/${name}.yaml`)]));
-  if (!found) return;
-  const [model, text] = found;
+  const answers = await askModel(() => Promise.all([ask(`/v1/models/${name}`), ask(`/pages/models/${name}.yaml`)]));
+  if (!answers) return;
+  const [model, text] = answers;
   field('equations').value = text;
   field('equations').readOnly = true;
-  take(model.document, changes);
-  verdict({ valid: true });
+  applyModel(model.document, changes);
+  showVerdict({ valid: true });
 }
 
-async function own(text, changes) {
+async function showOwnModel(text, changes) {
   if (text !== undefined) field('equations').value = text;
   field('equations').readOnly = false;
-  await check(changes);
+  await checkModel(changes);
 }
 
-/** Whether the text can be used; null where something else was asked for meanwhile. */
-async function check(changes) {
+/** Return whether the text is valid; null if another model was requested meanwhile. */
+async function checkModel(changes) {
   const text = field('equations').value;
-  const found = await about(() =>
+  const result = await askModel(() =>
     ask('/v1/models:check', { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
-  if (!found) return null;
-  verdict(found);
-  if (found.valid) take(found.normal_form, changes);
-  return found.valid;
+  if (!result) return null;
+  showVerdict(result);
+  if (result.valid) applyModel(result.normal_form, changes);
+  return result.valid;
 }
 
-function verdict(found) {
+function showVerdict(result) {
   const place = document.getElementById('check');
-  field('equations').ariaInvalid = String(!found.valid);
-  if (found.valid) return place.replaceChildren(element('span', 'the model is valid', 'status identified'));
+  field('equations').ariaInvalid = String(!result.valid);
+  if (result.valid) return place.replaceChildren(makeElement('span', 'the model is valid', 'status identified'));
   const list = document.createElement('ul');
-  for (const one of found.errors) {
-    const where = [one.pointer, one.column && `column ${one.column}`].filter(Boolean).join(', ');
-    const item = element('li', '', 'fault');
-    item.append(element('b', where), ` ${one.detail}`);
+  for (const error of result.errors) {
+    const where = [error.pointer, error.column && `column ${error.column}`].filter(Boolean).join(', ');
+    const item = makeElement('li', '', 'fault');
+    item.append(makeElement('b', where), ` ${error.detail}`);
     list.append(item);
   }
-  place.replaceChildren(element('span', 'the model is not valid yet', 'fault'), list);
+  place.replaceChildren(makeElement('span', 'the model is not valid yet', 'fault'), list);
 }
 
-function take(document, changes) {
+function applyModel(document, changes) {
   const same = JSON.stringify(state.model) === JSON.stringify(document);
   state.model = document;
   if (same && !changes) return;
-  fillTable(document, changes ?? overrides());
+  fillTable(document, changes ?? readOverrides());
   mapChannels();
 }
 
-/** One choice per signal of the model; an equal name is taken, else the one at the same place. */
-function mapChannels(wanted = {}, held = holds()) {
+/** Draw one choice per signal of the model: the channel of the same name, else of the same place. */
+function mapChannels(wanted = {}, held = readHolds()) {
   if (!state.model || !state.dataset) return;
-  const recorded = state.dataset.channels.map((one) => one.name);
+  const recorded = state.dataset.channels.map((channel) => channel.name);
   const inputs = Object.keys(state.model.inputs ?? {});
   const outputs = Object.keys(state.model.outputs ?? (state.model.output ? { [state.model.output]: 0 } : {}));
-  const before = channels();
+  const before = readChannels();
   const choices = [...inputs, ...outputs].map((signal, place) => {
-    const label = element('label', inputs.includes(signal) ? `input ${signal}` : `output ${signal}`);
+    const label = makeElement('label', inputs.includes(signal) ? `input ${signal}` : `output ${signal}`);
     const select = document.createElement('select');
     select.dataset.signal = signal;
     select.dataset.pointer = `/channels/${signal}`;
@@ -182,12 +182,12 @@ function mapChannels(wanted = {}, held = holds()) {
     label.append(select);
     return label;
   });
-  document.getElementById('channels').replaceChildren(...choices, ...inputs.map((signal) => betweenSamples(signal, held[signal])));
+  document.getElementById('channels').replaceChildren(...choices, ...inputs.map((signal) => makeHoldChoice(signal, held[signal])));
 }
 
-/** What an input does between its samples; read wrongly, it moves a lag by half a sample. */
-function betweenSamples(signal, hold) {
-  const label = element('label', `${signal} between samples`);
+/** Make the choice of an input's hold. A wrong hold moves a time lag by half a sample. */
+function makeHoldChoice(signal, hold) {
+  const label = makeElement('label', `${signal} between samples`);
   const select = document.createElement('select');
   select.dataset.hold = signal;
   select.dataset.pointer = `/hold/${signal}`;
@@ -197,50 +197,50 @@ function betweenSamples(signal, hold) {
   return label;
 }
 
-/** The inputs for which something else is chosen than what the recording says. */
-const holds = () =>
-  Object.fromEntries([...form.querySelectorAll('[data-hold]')].filter((one) => one.value).map((one) => [one.dataset.hold, one.value]));
+/** Read the holds that were chosen. Other inputs have the hold of the recording. */
+const readHolds = () =>
+  Object.fromEntries([...form.querySelectorAll('[data-hold]')].filter((select) => select.value).map((select) => [select.dataset.hold, select.value]));
 
-const channels = () =>
-  Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((one) => [one.dataset.signal, one.value]));
+const readChannels = () =>
+  Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((select) => [select.dataset.signal, select.value]));
 
-/** A number as typed; text that is none goes to the server, which says what would be right. */
-const number = (name) => {
+/** Read a number. Other text is sent as typed, so that the server reports the fault. */
+const readNumber = (name) => {
   const text = field(name).value.trim();
   return text === '' ? null : Number.isNaN(Number(text)) ? text : Number(text);
 };
 
 const isOwn = () => field('source').value === 'own';
-/** A cloned document that was not changed goes out as it was; any other in its normal form. */
-const ownModel = () => (field('equations').value === state.cloned?.text ? state.cloned.model : state.model);
+/** Return the own model. An unchanged cloned document is sent as it was, others in normal form. */
+const getOwnModel = () => (field('equations').value === state.cloned?.text ? state.cloned.model : state.model);
 
-function body() {
-  const { sweep, ...kept } = state.extra;
-  const algorithm = { ...kept.algorithm, method: field('method').value };
-  for (const key of ['population', 'generations']) if (number(key) !== null) algorithm[key] = number(key);
-  if (!Array.isArray(kept.algorithm?.islands) || number('islands') !== null) algorithm.islands = number('islands');
-  algorithm.stop = { ...kept.algorithm?.stop, evaluations: number('evaluations') };
+function buildBody() {
+  const { sweep, ...extra } = state.extra;
+  const algorithm = { ...extra.algorithm, method: field('method').value };
+  for (const key of ['population', 'generations']) if (readNumber(key) !== null) algorithm[key] = readNumber(key);
+  if (!Array.isArray(extra.algorithm?.islands) || readNumber('islands') !== null) algorithm.islands = readNumber('islands');
+  algorithm.stop = { ...extra.algorithm?.stop, evaluations: readNumber('evaluations') };
   const validation = field('validation').value;
-  const datasets = kept.datasets?.[0] === field('dataset').value ? kept.datasets : [field('dataset').value];
+  const datasets = extra.datasets?.[0] === field('dataset').value ? extra.datasets : [field('dataset').value];
   return {
-    ...kept,
+    ...extra,
     ...(sweep?.axes?.length ? { sweep } : {}),
     name: field('name').value.trim() || null,
-    model: isOwn() ? ownModel() : field('model').value,
+    model: isOwn() ? getOwnModel() : field('model').value,
     datasets: datasets.filter(Boolean),
-    channels: channels(),
-    hold: holds(),
-    validation: validation === 'clone' ? kept.validation : chosenValidation(validation),
-    parameters: overrides(),
+    channels: readChannels(),
+    hold: readHolds(),
+    validation: validation === 'clone' ? extra.validation : buildValidation(validation),
+    parameters: readOverrides(),
     prediction: field('prediction').value,
-    loss: { ...kept.loss, kind: field('loss').value, noise_model: field('noise_model').value },
+    loss: { ...extra.loss, kind: field('loss').value, noise_model: field('noise_model').value },
     algorithm,
-    seed: number('seed') ?? 1,
+    seed: readNumber('seed') ?? 1,
   };
 }
 
-/** None, the last part of the recording, or another recording. */
-function chosenValidation(value) {
+/** Build the validation: null, the last part of the recording, or another recording. */
+function buildValidation(value) {
   if (!value) return null;
   return value.startsWith('ds_') ? { datasets: [value] } : { fraction: Number(value) };
 }
@@ -248,20 +248,20 @@ function chosenValidation(value) {
 /** Own equations are checked before they are sent. */
 async function isReady() {
   while (isOwn()) {
-    const usable = await check();
+    const usable = await checkModel();
     if (usable) return true;
     if (usable === null) continue;
-    say('the model is not valid yet');
+    showState('the model is not valid yet');
     field('equations').focus();
     return false;
   }
   return true;
 }
 
-const say = (text) => forms.say(form, text);
-const shown = (work) => forms.shown(form, work);
+const showState = (text) => forms.showState(form, text);
+const withFaults = (work) => forms.withFaults(form, work);
 
-function delayed(work, ms) {
+function debounce(work, ms) {
   let timer = 0;
   return () => {
     clearTimeout(timer);
@@ -269,28 +269,28 @@ function delayed(work, ms) {
   };
 }
 
-function open() {
+function openPanel() {
   if (location.hash === '#new') panel.open = true;
 }
 
-field('dataset').addEventListener('change', shown(chosen));
-field('upload').addEventListener('change', shown(upload));
-field('model').addEventListener('change', shown(() => {
+field('dataset').addEventListener('change', withFaults(showDataset));
+field('upload').addEventListener('change', withFaults(upload));
+field('model').addEventListener('change', withFaults(() => {
   field('source').value = 'listed';
-  // What was typed into the table of the model before would be lost.
+  // Clear the old model's table at once, so that no typed value is lost.
   state.model = null;
   fillTable({}, {});
-  return listed();
+  return showListedModel();
 }));
-for (const one of field('source'))
-  one.addEventListener('change', shown(() => (isOwn() ? own() : listed())));
+for (const button of field('source'))
+  button.addEventListener('change', withFaults(() => (isOwn() ? showOwnModel() : showListedModel())));
 field('equations').addEventListener('input', () => {
-  about(async () => null); // an answer about the text before this one says nothing any more
-  document.getElementById('check').replaceChildren(element('span', 'checking…', 'muted'));
+  askModel(async () => null); // drops the answer about the previous text
+  document.getElementById('check').replaceChildren(makeElement('span', 'checking…', 'muted'));
 });
-field('equations').addEventListener('input', delayed(shown(() => check()), 300));
-forms.submits(form, '/v1/jobs', body, isReady);
-panel.addEventListener('toggle', shown(() => panel.open && start()));
-addEventListener('hashchange', open);
-open();
-if (panel.open) shown(start)();
+field('equations').addEventListener('input', debounce(withFaults(() => checkModel()), 300));
+forms.onSubmit(form, '/v1/jobs', buildBody, isReady);
+panel.addEventListener('toggle', withFaults(() => panel.open && start()));
+addEventListener('hashchange', openPanel);
+openPanel();
+if (panel.open) withFaults(start)();

@@ -1,36 +1,36 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
-import { begin, choose, plots, profile, redraw, watch } from './figures.js';
-import { Problem, element, post, put, refresh, throttled } from './live.js';
+import { start, setQuery, listPlots, drawProfiles, redraw, watch } from './figures.js';
+import { Problem, post, put, refresh, throttle } from './live.js';
 
 const { job, runs } = document.getElementById('job').dataset;
 const isOpen = () => document.querySelector('[data-live="chip"]').dataset.open === '1';
 const NOT_FOUND = 404;
 let stream = null;
 
-// An event only says that something is new; the page and the figures themselves say what.
-const renew = throttled(async () => {
+// An event only reports that something changed. The page and the figures are fetched to show what.
+const renew = throttle(async () => {
   try {
     await refresh();
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    if (error.document.status === NOT_FOUND) close(); // it was deleted
-    else renew(); // the server is away: asked again
+    if (error.document.status === NOT_FOUND) close(); // the job was deleted
+    else renew(); // no answer: retry
     return;
   }
   watch();
   if (isOpen()) listen();
   else close();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
-}, 1000 + Number(runs) / 10); // the database looks at all runs of a sweep for its page
+}, 1000 + Number(runs) / 10); // the page of a sweep reads all of its runs
 
 function listen() {
   if (!isOpen() || (stream && stream.readyState !== EventSource.CLOSED)) return; // a finished job opens no stream
   const opened = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
   stream = opened;
-  // Of a resumed job the stream tells its earlier end, too: whether it is over, the page says.
+  // A resumed job's stream repeats its earlier end. The page decides whether the job is over.
   for (const kind of ['message', 'state', 'progress', 'log', 'end']) opened.addEventListener(kind, renew);
-  // It comes again by itself, unless it was refused: the job is over, or the server is away.
+  // The browser reconnects by itself, unless it was refused: the job is over, or the server is down.
   opened.addEventListener('error', () => opened.readyState === EventSource.CLOSED && renew());
 }
 
@@ -46,8 +46,8 @@ document.addEventListener('click', async ({ target }) => {
   else if (button.dataset.dialog) document.getElementById(button.dataset.dialog).showModal();
   else if ('close' in button.dataset) button.closest('dialog').close();
   else if ('copy' in button.dataset) await copy(button);
-  else if (button.dataset.abscissa) abscissa(button);
-  else if (button.dataset.profile) await profile(button);
+  else if (button.dataset.abscissa) chooseAbscissa(button);
+  else if (button.dataset.profile) await drawProfiles(button);
 });
 
 async function act(button) {
@@ -70,15 +70,15 @@ document.addEventListener('submit', async (event) => {
   if (!('accept' in event.target.dataset)) return;
   event.preventDefault();
   const { run, name } = event.target.elements;
-  const told = event.target.querySelector('[data-accepted]');
+  const status = event.target.querySelector('[data-accepted]');
   try {
-    const found = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
-    const before = found.history[0];
-    told.textContent = `The reference ${found.name} is now ${found.run}. `
+    const reference = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
+    const before = reference.history[0];
+    status.textContent = `The reference ${reference.name} is now ${reference.run}. `
       + (before ? `Before: ${before.run}.` : 'It is the first of this name.');
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    told.textContent = error.message;
+    status.textContent = error.message;
   }
 });
 
@@ -92,12 +92,12 @@ async function copy(button) {
   }
 }
 
-function abscissa(button) {
-  for (const one of button.parentElement.children) one.ariaPressed = String(one === button);
-  choose(plots().find((p) => p.dataset.figure === 'history'), 'abscissa', button.dataset.abscissa);
+function chooseAbscissa(button) {
+  for (const choice of button.parentElement.children) choice.ariaPressed = String(choice === button);
+  setQuery(listPlots().find((p) => p.dataset.figure === 'history'), 'abscissa', button.dataset.abscissa);
 }
 
-// Which records there are, the figure itself tells.
+// The figure lists its experiments.
 document.addEventListener('drawn', ({ target, detail }) => {
   const names = detail.meta?.experiments ?? [];
   const choice = document.querySelector(`[data-experiment="${target.dataset.figure}"]`);
@@ -107,10 +107,10 @@ document.addEventListener('drawn', ({ target, detail }) => {
 });
 document.addEventListener('change', ({ target }) => {
   const name = target.dataset.experiment;
-  if (name) choose(plots().find((p) => p.dataset.figure === name), 'experiment', target.value);
+  if (name) setQuery(listPlots().find((p) => p.dataset.figure === name), 'experiment', target.value);
 });
 
 addEventListener('pagehide', close);
 addEventListener('pageshow', (event) => event.persisted && listen());
-begin();
+start();
 listen();

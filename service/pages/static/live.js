@@ -1,42 +1,42 @@
-// Regions marked data-live are taken anew from the page itself, so that one template draws them.
+// Regions marked data-live are replaced from the page itself, so that one template draws them.
 
 const PROBLEM = 'application/problem+json';
 
-/** The best run of a sweep has become another one: all that is shown of a run is taken from it. */
-function takeRun(fresh) {
-  const [shown, next] = [document, fresh].map((one) => one.getElementById('run'));
-  if (shown && next && shown.dataset.run !== next.dataset.run) shown.replaceWith(document.adoptNode(next.cloneNode(true)));
+/** Replace the shown run if another run of the sweep is now the best. */
+function replaceRun(fresh) {
+  const [current, next] = [document, fresh].map((root) => root.getElementById('run'));
+  if (current && next && current.dataset.run !== next.dataset.run) current.replaceWith(document.adoptNode(next.cloneNode(true)));
 }
 
-const pageNow = latest(() => ask(location.href, { headers: { Accept: 'text/html' } }));
+const fetchPage = keepLatest(() => ask(location.href, { headers: { Accept: 'text/html' } }));
 
 /**
  * Replace every live region whose content has changed; nothing else of the page moves.
- * Of calls at once the answer to the last counts: an older one would bring back what was.
+ * If calls overlap, only the answer to the last one is used. An earlier answer may be outdated.
  */
 export async function refresh() {
-  const text = await pageNow();
+  const text = await fetchPage();
   if (text === null) return;
   const fresh = new DOMParser().parseFromString(text, 'text/html');
-  takeRun(fresh);
+  replaceRun(fresh);
   for (const region of document.querySelectorAll('[data-live]')) {
     const next = fresh.querySelector(`[data-live="${region.dataset.live}"]`);
     if (!next) continue;
     region.dataset.open = next.dataset.open ?? '';
     if (next.innerHTML === region.innerHTML) continue;
-    const focused = region.contains(document.activeElement) ? place(region) : -1;
+    const focused = region.contains(document.activeElement) ? findFocus(region) : -1;
     const scrolled = region.scrollTop;
     region.replaceChildren(...document.adoptNode(next).childNodes);
     region.scrollTop = scrolled;
-    if (focused >= 0) focusable(region)[focused]?.focus({ preventScroll: true });
+    if (focused >= 0) listFocusable(region)[focused]?.focus({ preventScroll: true });
   }
 }
 
-const focusable = (region) => [...region.querySelectorAll('a[href], button, select, input')];
-const place = (region) => focusable(region).indexOf(document.activeElement);
+const listFocusable = (region) => [...region.querySelectorAll('a[href], button, select, input')];
+const findFocus = (region) => listFocusable(region).indexOf(document.activeElement);
 
-/** Call `work` at once, then at most once in `interval` ms; the last of many calls is not lost. */
-export function throttled(work, interval) {
+/** Call `work` at once, then at most once per `interval` ms. The last of several calls is not lost. */
+export function throttle(work, interval) {
   let busy = false;
   let again = false;
   return async function call() {
@@ -61,7 +61,7 @@ export function throttled(work, interval) {
   };
 }
 
-/** A request whose refusal becomes a Problem with the document's title, detail and errors. */
+/** Send a request. A refusal becomes a Problem with the document's title, detail and errors. */
 export async function ask(url, options = {}) {
   let answer;
   let text;
@@ -82,16 +82,16 @@ export async function ask(url, options = {}) {
   );
 }
 
-/** Of several answers the one to the last question counts; to one before it, or a refusal of it, null is heard. */
-export function latest(question) {
-  let last = 0;
-  return async (...given) => {
-    const mine = ++last;
+/** Wrap `question`: if calls overlap, only the last one gets its answer, and earlier ones get null. */
+export function keepLatest(question) {
+  let latest = 0;
+  return async (...args) => {
+    const number = ++latest;
     try {
-      const found = await question(...given);
-      return mine === last ? found : null;
+      const answer = await question(...args);
+      return number === latest ? answer : null;
     } catch (error) {
-      if (mine !== last) return null;
+      if (number !== latest) return null;
       throw error;
     }
   };
@@ -115,10 +115,10 @@ export class Problem extends Error {
   }
 }
 
-/** An element with a class and a text; text never becomes markup. */
-export function element(tag, text = '', className = '') {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  if (className) made.className = className;
-  return made;
+/** Make an element with a class and a text. Text never becomes markup. */
+export function makeElement(tag, text = '', className = '') {
+  const node = document.createElement(tag);
+  node.textContent = text;
+  if (className) node.className = className;
+  return node;
 }

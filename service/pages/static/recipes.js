@@ -1,30 +1,30 @@
-// What the forms of recipes (noise sweep, re-identification) share: models, channels, numbers.
+// Shared by the forms of recipes (noise sweep, re-identification): models, channels, numbers.
 
-import { ask, element, latest } from './live.js';
+import { ask, makeElement, keepLatest } from './live.js';
 import { fillTable } from './fields.js';
 
-const modelOf = latest((name) => ask(`/v1/models/${encodeURIComponent(name)}`));
+const fetchModel = keepLatest((name) => ask(`/v1/models/${encodeURIComponent(name)}`));
 
 /**
- * The document of the chosen model, with its table of bounds drawn anew; null where another was chosen meanwhile.
- * The table of the model before goes at once: what was typed into it now would be lost.
+ * Load the chosen model and fill its table of bounds. Return its document, or null if another
+ * model was chosen meanwhile. The old table is cleared at once, so that no typed value is lost.
  */
-export async function chosenModel(form) {
+export async function loadChosenModel(form) {
   fillTable({}, {});
-  const found = await modelOf(form.elements.model.value);
-  if (!found) return null;
-  fillTable(found.document, {});
-  return found.document;
+  const answer = await fetchModel(form.elements.model.value);
+  if (!answer) return null;
+  fillTable(answer.document, {});
+  return answer.document;
 }
 
-export const inputsOf = (model) => Object.keys(model.inputs ?? {});
-const outputsOf = (model) => Object.keys(model.outputs ?? (model.output ? { [model.output]: 0 } : {}));
+export const listInputs = (model) => Object.keys(model.inputs ?? {});
+const listOutputs = (model) => Object.keys(model.outputs ?? (model.output ? { [model.output]: 0 } : {}));
 
-/** One choice per signal of the model: a channel of the same name, else the one at the same place. */
+/** Draw one choice per signal of the model: the channel of the same name, else the one at the same place. */
 export function drawChannels(model, recorded) {
-  const signals = [...inputsOf(model), ...outputsOf(model)];
+  const signals = [...listInputs(model), ...listOutputs(model)];
   const choices = signals.map((signal, place) => {
-    const label = element('label', `${place < inputsOf(model).length ? 'input' : 'output'} ${signal}`);
+    const label = makeElement('label', `${place < listInputs(model).length ? 'input' : 'output'} ${signal}`);
     const select = document.createElement('select');
     select.dataset.signal = signal;
     select.dataset.pointer = `/channels/${signal}`;
@@ -33,37 +33,37 @@ export function drawChannels(model, recorded) {
     label.append(select);
     return label;
   });
-  const hint = element('small', 'choose a recording first', 'muted');
+  const hint = makeElement('small', 'choose a recording first', 'muted');
   document.getElementById('channels').replaceChildren(...(recorded.length ? choices : [hint]));
 }
 
-export const channelsOf = (form) =>
-  Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((one) => [one.dataset.signal, one.value]));
+export const readChannels = (form) =>
+  Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((select) => [select.dataset.signal, select.value]));
 
-/** A number as typed; text that is none goes to the server, which says what would be right. */
-export function number(text) {
+/** Parse a number. Other text is sent as typed, so that the server reports the fault. */
+export function parseNumber(text) {
   const trimmed = String(text).trim();
   return trimmed === '' ? null : Number.isNaN(Number(trimmed)) ? trimmed : Number(trimmed);
 }
 
-/** Numbers between commas, or `start:stop:step` with both ends. */
-export function numbers(text) {
+/** Parse numbers between commas, or `start:stop:step` with both ends. */
+export function parseNumbers(text) {
   const parts = text.split(':').map(Number);
   if (parts.length === 3 && parts.every(Number.isFinite) && parts[2] > 0 && parts[1] >= parts[0]) {
     const [start, stop, step] = parts;
     const count = Math.min(Math.floor((stop - start) / step + 1e-9) + 1, 100_001);
     return Array.from({ length: count }, (_, k) => Number((start + k * step).toPrecision(12)));
   }
-  return text.split(/[,;\s]+/).filter(Boolean).map(number);
+  return text.split(/[,;\s]+/).filter(Boolean).map(parseNumber);
 }
 
-/** Only the settings of the search that were typed. */
-export function algorithmOf(form) {
-  const found = {};
+/** Read the settings of the search that were typed. */
+export function readAlgorithm(form) {
+  const settings = {};
   for (const key of ['population', 'generations']) {
-    const value = number(form.elements[key].value);
-    if (value !== null) found[key] = value;
+    const value = parseNumber(form.elements[key].value);
+    if (value !== null) settings[key] = value;
   }
-  const evaluations = number(form.elements.evaluations.value);
-  return evaluations === null ? found : { ...found, stop: { evaluations } };
+  const evaluations = parseNumber(form.elements.evaluations.value);
+  return evaluations === null ? settings : { ...settings, stop: { evaluations } };
 }

@@ -1,19 +1,19 @@
 // The form of a noise sweep: how many runs it makes, and one POST to /v1/recipes/noise-sweep.
 
-import { element } from './live.js';
-import { overrides, shown, submits } from './fields.js';
-import { algorithmOf, channelsOf, chosenModel, drawChannels, inputsOf, number, numbers } from './recipes.js';
+import { makeElement } from './live.js';
+import { readOverrides, withFaults, onSubmit } from './fields.js';
+import { readAlgorithm, readChannels, loadChosenModel, drawChannels, listInputs, parseNumber, parseNumbers } from './recipes.js';
 
 const form = document.getElementById('sweep-form');
 const field = (name) => form.elements.namedItem(name);
 let model = null;
 
 const isTruth = () => field('source').value === 'truth';
-const methods = () => [...form.querySelectorAll('[name="methods"]:checked')].map((one) => one.value);
+const listMethods = () => [...form.querySelectorAll('[name="methods"]:checked')].map((box) => box.value);
 
-/** A text field with a label, for one place of the body. */
-function typed(text, pointer, data, hint = '') {
-  const label = element('label', text);
+/** Make a text field with a label, for one pointer of the body. */
+function makeField(text, pointer, data, hint = '') {
+  const label = makeElement('label', text);
   const input = document.createElement('input');
   Object.assign(input.dataset, { pointer, ...data });
   input.placeholder = hint;
@@ -22,90 +22,90 @@ function typed(text, pointer, data, hint = '') {
 }
 
 function drawTruth() {
-  const bracketed = (unit) => (unit && unit !== '1' ? ` [${unit}]` : '');
+  const formatUnit = (unit) => (unit && unit !== '1' ? ` [${unit}]` : '');
   const parameters = Object.entries(model.parameters ?? {})
-    .filter(([, one]) => one?.tied === undefined)
-    .map(([name, one]) => typed(`true ${name}${bracketed(one?.unit)}`, `/truth/parameters/${name}`, { truth: name }));
-  const inputs = inputsOf(model).map((name) =>
-    typed(`input ${name}${bracketed(model.inputs[name])}`, `/truth/inputs/${name}`, { input: name }, 'such as 10*cos(5*t)'));
+    .filter(([, parameter]) => parameter?.tied === undefined)
+    .map(([name, parameter]) => makeField(`true ${name}${formatUnit(parameter?.unit)}`, `/truth/parameters/${name}`, { truth: name }));
+  const inputs = listInputs(model).map((name) =>
+    makeField(`input ${name}${formatUnit(model.inputs[name])}`, `/truth/inputs/${name}`, { input: name }, 'such as 10*cos(5*t)'));
   document.getElementById('truth-values').replaceChildren(...parameters, ...inputs);
 }
 
 function drawSource() {
   document.getElementById('truth').hidden = !isTruth();
   document.getElementById('recording').hidden = isTruth();
-  count();
+  showRunCount();
 }
 
-const recorded = () => (field('dataset').selectedOptions[0]?.dataset.channels ?? '').split('\n').filter(Boolean);
+const listRecordedChannels = () => (field('dataset').selectedOptions[0]?.dataset.channels ?? '').split('\n').filter(Boolean);
 
-async function modelChosen() {
+async function loadModel() {
   model = null;
   document.getElementById('truth-values').replaceChildren();
-  const found = await chosenModel(form);
-  if (!found) return;
-  model = found;
+  const chosen = await loadChosenModel(form);
+  if (!chosen) return;
+  model = chosen;
   drawTruth();
-  drawChannels(model, recorded());
+  drawChannels(model, listRecordedChannels());
 }
 
-/** How many runs the job will have, before it is sent. */
-function count() {
-  const told = document.getElementById('runs-count');
-  const sigma = new Set(numbers(field('sigma').value));
+/** Show how many runs the job will have. */
+function showRunCount() {
+  const status = document.getElementById('runs-count');
+  const sigma = new Set(parseNumbers(field('sigma').value));
   const replicates = Number(field('replicates').value);
-  const chosen = methods().length;
-  if (!sigma.size || !Number.isInteger(replicates) || replicates < 1 || !chosen) {
-    told.textContent = 'σ, replicates or methods are missing';
+  const nMethods = listMethods().length;
+  if (!sigma.size || !Number.isInteger(replicates) || replicates < 1 || !nMethods) {
+    status.textContent = 'σ, replicates or methods are missing';
     return;
   }
-  const runs = (n) => (n * replicates * chosen).toLocaleString('en').replaceAll(',', '\u202f');
-  const product = `${sigma.size} σ × ${replicates} replicates × ${chosen} method${chosen > 1 ? 's' : ''} = ${runs(sigma.size)} runs`;
-  const isKnown = isTruth() || sigma.has(0) || field('dataset').selectedOptions[0]?.dataset.truth === '1';
-  told.textContent = isKnown ? product : `${product}, and ${runs(1)} at σ = 0 as the reference of the errors`;
+  const runs = (n) => (n * replicates * nMethods).toLocaleString('en').replaceAll(',', '\u202f');
+  const product = `${sigma.size} σ × ${replicates} replicates × ${nMethods} method${nMethods > 1 ? 's' : ''} = ${runs(sigma.size)} runs`;
+  const hasReference = isTruth() || sigma.has(0) || field('dataset').selectedOptions[0]?.dataset.truth === '1';
+  status.textContent = hasReference ? product : `${product}, and ${runs(1)} at σ = 0 as the reference of the errors`;
 }
 
-function truth() {
-  const found = { parameters: {}, inputs: {}, samples: number(field('samples').value), sample_time: number(field('sample_time').value) };
-  for (const one of form.querySelectorAll('input[data-truth]')) {
-    const value = number(one.value);
-    if (value !== null) found.parameters[one.dataset.truth] = value;
+function readTruth() {
+  const values = { parameters: {}, inputs: {}, samples: parseNumber(field('samples').value), sample_time: parseNumber(field('sample_time').value) };
+  for (const input of form.querySelectorAll('input[data-truth]')) {
+    const value = parseNumber(input.value);
+    if (value !== null) values.parameters[input.dataset.truth] = value;
   }
-  for (const one of form.querySelectorAll('[data-input]'))
-    if (one.value.trim()) found.inputs[one.dataset.input] = { kind: 'expression', expression: one.value.trim() };
-  return found;
+  for (const input of form.querySelectorAll('[data-input]'))
+    if (input.value.trim()) values.inputs[input.dataset.input] = { kind: 'expression', expression: input.value.trim() };
+  return values;
 }
 
-function body() {
+function buildBody() {
   const source = isTruth()
-    ? { truth: truth() }
-    : { datasets: [field('dataset').value].filter(Boolean), channels: channelsOf(form) };
+    ? { truth: readTruth() }
+    : { datasets: [field('dataset').value].filter(Boolean), channels: readChannels(form) };
   return {
     name: field('name').value.trim() || null,
     model: field('model').value,
     ...source,
-    sigma: numbers(field('sigma').value),
+    sigma: parseNumbers(field('sigma').value),
     relative: field('relative').checked,
-    replicates: number(field('replicates').value),
-    methods: methods(),
-    seed: number(field('seed').value) ?? 1,
-    parameters: overrides(),
-    algorithm: algorithmOf(form),
+    replicates: parseNumber(field('replicates').value),
+    methods: listMethods(),
+    seed: parseNumber(field('seed').value) ?? 1,
+    parameters: readOverrides(),
+    algorithm: readAlgorithm(form),
   };
 }
 
-field('model').addEventListener('change', shown(form, modelChosen));
+field('model').addEventListener('change', withFaults(form, loadModel));
 field('dataset').addEventListener('change', () => {
-  if (model) drawChannels(model, recorded());
-  count();
+  if (model) drawChannels(model, listRecordedChannels());
+  showRunCount();
 });
-for (const one of field('source')) one.addEventListener('change', drawSource);
-form.addEventListener('input', count);
-submits(form, '/v1/recipes/noise-sweep', body);
+for (const button of field('source')) button.addEventListener('change', drawSource);
+form.addEventListener('input', showRunCount);
+onSubmit(form, '/v1/recipes/noise-sweep', buildBody);
 const wanted = new URLSearchParams(location.search).get('dataset');
-if (wanted && [...field('dataset').options].some((one) => one.value === wanted)) {
+if (wanted && [...field('dataset').options].some((option) => option.value === wanted)) {
   field('dataset').value = wanted;
   field('source').value = 'dataset';
 }
 drawSource();
-shown(form, modelChosen)();
+withFaults(form, loadModel)();
