@@ -27,7 +27,7 @@ MAX_SAVED_SECONDS = 2 * HEADSTART_SECONDS
 MAX_ABSENT_PROJECTS = 256
 """Largest number of stored accounts of projects without jobs: those furthest ahead."""
 
-LONGEST_WAIT_INTERVAL = 16
+WAIT_TURN_INTERVAL = 16
 """Of this many packs, one goes to the job that has waited longest."""
 
 Key = TypeVar("Key", bound=Hashable)
@@ -147,7 +147,7 @@ class FairShare(Generic[Key]):
             )
 
         ordered = sorted(in_flight, key=sort_key)
-        if ordered and self._n_packs % LONGEST_WAIT_INTERVAL == LONGEST_WAIT_INTERVAL - 1:
+        if ordered and self._n_packs % WAIT_TURN_INTERVAL == WAIT_TURN_INTERVAL - 1:
             patient = min(ordered, key=lambda job: self._jobs[job].last_pack)
             ordered.remove(patient)
             ordered.insert(0, patient)

@@ -299,7 +299,7 @@ def _describe_fault(entry: Mapping[str, Any]) -> str:
 DEFAULT_RETRIES = 4
 FIRST_PAUSE_SECONDS = 0.5
 """Pause before the second attempt, if the server names none; it doubles with each attempt."""
-LONGEST_PAUSE_SECONDS = 30.0
+MAX_PAUSE_SECONDS = 30.0
 """Longest pause. If the server asks for a longer one, the call is not repeated."""
 REPEATABLE_METHODS = frozenset({"GET", "HEAD", "PUT"})
 
@@ -332,7 +332,7 @@ def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float
         return None
     requested = _parse_retry_after(response.headers.get("Retry-After"))
     pause = pause if requested is None else requested
-    return pause if pause <= LONGEST_PAUSE_SECONDS else None
+    return pause if pause <= MAX_PAUSE_SECONDS else None
 
 
 def _parse_retry_after(header: str | None) -> float | None:

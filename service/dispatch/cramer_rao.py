@@ -55,12 +55,12 @@ IRRELEVANT_FIELDS = (
     "/prediction",
     "/warm_start",
 )
-MOST_PROBLEMS = 64
+MAX_PROBLEMS = 64
 LEFT_OUT_NOTE = (
-    f"the sweep has more than {MOST_PROBLEMS} different problems. Only the first {MOST_PROBLEMS} "
+    f"the sweep has more than {MAX_PROBLEMS} different problems. Only the first {MAX_PROBLEMS} "
     "have Cramér–Rao bounds and reference values"
 )
-MOST_WORK = 10_000_000
+MAX_WORK = 10_000_000
 """Samples to simulate for the bounds of one job: below a second for most models."""
 
 
@@ -90,7 +90,7 @@ class _BoundsMaker:
 
     def __init__(self, database: Database, job: Job, source: JobRuns) -> None:
         self._database, self._job, self._source = database, job, source
-        self._left = MOST_WORK
+        self._left = MAX_WORK
 
     def iterate_steps(self) -> Iterator[Document | None]:
         """Yield None after each problem, and the document at the end."""
@@ -100,18 +100,18 @@ class _BoundsMaker:
             if not axis["path"].startswith(IRRELEVANT_FIELDS)
         ]
         groups = retry_transient(partial(self._group_runs, axes))
-        cells = [dict(zip(axes, group.key, strict=True)) for group in groups[:MOST_PROBLEMS]]
+        cells = [dict(zip(axes, group.key, strict=True)) for group in groups[:MAX_PROBLEMS]]
         problems = []
         for cell in cells:
             problems.append(self._describe_problem(cell))
             yield None
-        left_out = len(groups) > MOST_PROBLEMS
+        left_out = len(groups) > MAX_PROBLEMS
         yield {"axes": axes, "problems": problems, "note": LEFT_OUT_NOTE if left_out else ""}
 
     def _group_runs(self, axes: list[str]) -> list[RunGroup]:
         keys = [GroupKey("axis", path) for path in axes]
         with self._database.read_session() as session:
-            return read_groups(session, self._job.id, keys, [], MOST_PROBLEMS, self._job.project_id)
+            return read_groups(session, self._job.id, keys, [], MAX_PROBLEMS, self._job.project_id)
 
     def _describe_problem(self, cell: Mapping[str, Any]) -> Document:
         entry: Document = {

@@ -46,7 +46,7 @@ BUSY_SECONDS = 0.2
 STEP_SECONDS = 0.1
 RELEASE_SECONDS = 5.0
 """Time limit for releasing the jobs once the parent or the workers are gone."""
-MOST_JOBS = 64
+MAX_JOBS = 64
 """Jobs held at a time. They share the workers, and their runs are read when needed. As many again
 may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
 SHORT_RUNS = 8
@@ -137,7 +137,7 @@ class Dispatcher:
             elif lease.job_id in signals.jobs_to_cancel:
                 recorder.is_stopped = True
         self._is_filling = False
-        if signals.has_waiting_job and len(self._recorders) < 2 * MOST_JOBS:
+        if signals.has_waiting_job and len(self._recorders) < 2 * MAX_JOBS:
             claim = retry_transient(partial(self._leases.claim_job, admission))
             if claim is not None:
                 self._take_job(claim)
@@ -146,7 +146,7 @@ class Dispatcher:
 
     def _build_admission(self) -> Admission | None:
         """Return which jobs may still be claimed; None admits every job."""
-        if len(self._recorders) < MOST_JOBS:
+        if len(self._recorders) < MAX_JOBS:
             return None
         return Admission(SHORT_RUNS, min(self._priorities.values()))
 

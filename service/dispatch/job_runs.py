@@ -58,7 +58,7 @@ from workers.tasks import prepare_run_records
 _log = logging.getLogger(__name__)
 
 READ_AHEAD = 200
-MOST_READY_RUNS = 64
+MAX_READY_RUNS = 64
 """Runs of different chains read at a time."""
 CACHED_SAMPLES = 1_000_000
 """Samples that a job caches, 16 bytes each, in addition to the latest records."""
@@ -120,7 +120,7 @@ class JobRuns:
         """Iterate over ready runs of many chains. Yields no rows while all remaining runs wait."""
         n_created = retry_transient(self._count_made_runs)
         while not chains.is_exhausted:
-            numbers = chains.take_ready(MOST_READY_RUNS, n_created)
+            numbers = chains.take_ready(MAX_READY_RUNS, n_created)
             if not numbers and chains.has_ready and retry_transient(self._make_runs):
                 n_created = retry_transient(self._count_made_runs)
             rows = retry_transient(partial(self._read_unfinished, numbers)) if numbers else []

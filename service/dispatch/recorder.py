@@ -32,7 +32,7 @@ RESULTS_SECONDS = 1.0
 """A transaction costs as much as the rows of many runs. After a pause, rows are written at once."""
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
-MOST_REASONS = 3
+MAX_REASONS = 3
 
 SaveSignals = Callable[[str, Identification], StoredSignals | None]
 """Writes the file of a run's fitted signals, ready to be stored."""
@@ -87,7 +87,7 @@ class RunRecorder:
         self._report_failure = report_failure
         self.is_stopped = False
         with database.write_session() as session:
-            before = summarize_attempts(session, claim.lease, MOST_REASONS)
+            before = summarize_attempts(session, claim.lease, MAX_REASONS)
         self._reasons = list(before.failure_reasons)
         # Evaluations of runs that have not continued yet.
         self._checkpoint_evaluations = before.checkpoint_evaluations
@@ -158,7 +158,7 @@ class RunRecorder:
                 run_id=run, state=JobState.FAILED, error=failure.reason, evaluations=evaluations
             )
         )
-        if failure.reason not in self._reasons and len(self._reasons) < MOST_REASONS:
+        if failure.reason not in self._reasons and len(self._reasons) < MAX_REASONS:
             self._reasons.append(failure.reason)
             self._pending.messages.append(f"{run} failed: {failure.reason}")
         self._n_done += 1

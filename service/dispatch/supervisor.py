@@ -21,7 +21,7 @@ from workers.ray_folders import clear_ray_remains, kill_processes
 _log = logging.getLogger(__name__)
 
 FIRST_PAUSE_SECONDS = 0.2
-LONGEST_PAUSE_SECONDS = 5.0
+MAX_PAUSE_SECONDS = 5.0
 STEADY_SECONDS = 60.0
 """After this lifetime a child is restarted with the first pause again."""
 LIVED_SECONDS = 5.0
@@ -105,7 +105,7 @@ class Supervisor:
             was_well = lived > STEADY_SECONDS or (
                 lived > LIVED_SECONDS and (code < 0 or code == RESTART_EXIT_CODE)
             )
-            pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, LONGEST_PAUSE_SECONDS)
+            pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, MAX_PAUSE_SECONDS)
             _log.warning("the dispatcher exited with code %d. It restarts in %.1f s", code, pause)
             self._stopping.wait(pause)
 

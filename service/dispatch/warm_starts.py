@@ -25,7 +25,7 @@ from service.storage.tables import Job, Run
 from sysid.identification.result import Identification
 from workers.protocol import WarmStartValues
 
-MOST_OPEN_CHAINS = 1_000
+MAX_OPEN_CHAINS = 1_000
 """Most open chains. More cores hardly ever work on one job."""
 
 
@@ -126,7 +126,7 @@ class OpenChains:
         return chain.values
 
     def _open_chains(self, n_runs: int) -> None:
-        room = MOST_OPEN_CHAINS - len(self._open)
+        room = MAX_OPEN_CHAINS - len(self._open)
         while len(self._free) < n_runs and room > 0 and self._opened < self._n_chains:
             key, self._opened = self._opened, self._opened + 1
             chain = _OpenChain(self._chain.list_runs(key))

@@ -13,7 +13,7 @@ from sysid.core.units import find_conversion_factor
 SEPARATORS = ("\t", ";", ",")
 TIME_NAMES = ("t", "t_s", "time", "time_s")
 SECOND_NAMES = ("", "s", "sec", "second", "seconds")
-LONGEST_TIME_UNIT = 86_400.0
+MAX_TIME_UNIT = 86_400.0
 """Longest unit of time in s (a day); a longer one is taken for a mistake."""
 
 _UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$")
@@ -159,7 +159,7 @@ def find_unit_seconds(unit: str) -> float | None:
     if unit.lower() in SECOND_NAMES:
         return 1.0
     seconds = find_conversion_factor(unit, "s")
-    return seconds if seconds is not None and 0 < seconds <= LONGEST_TIME_UNIT else None
+    return seconds if seconds is not None and 0 < seconds <= MAX_TIME_UNIT else None
 
 
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:

@@ -69,7 +69,7 @@ def _round_up_step(longest: float) -> float:
 
 
 PEEK_LINES = 200
-LONGEST_LINE = 1_000_000
+MAX_LINE_CHARACTERS = 1_000_000
 EPOCH_THRESHOLD_SECONDS = 1e8
 """Times (s) that begin later than this (three years) are clock times since some epoch."""
 
@@ -133,10 +133,12 @@ def _open_text(source: Path | str | bytes) -> Iterator[TextIOWrapper]:
 def _iterate_lines(stream: TextIOWrapper) -> Iterator[str]:
     number = 0
     try:
-        while line := stream.readline(LONGEST_LINE + 1):
+        while line := stream.readline(MAX_LINE_CHARACTERS + 1):
             number += 1
-            if len(line) > LONGEST_LINE:
-                raise InvalidUpload(f"the row is longer than {LONGEST_LINE} characters", row=number)
+            if len(line) > MAX_LINE_CHARACTERS:
+                raise InvalidUpload(
+                    f"the row is longer than {MAX_LINE_CHARACTERS} characters", row=number
+                )
             yield line
     except UnicodeDecodeError as error:
         invalid_byte = error.object[error.start]
@@ -149,7 +151,7 @@ def _iterate_lines(stream: TextIOWrapper) -> Iterator[str]:
 def _find_undecodable_row(binary: BinaryIO) -> int | None:
     # The decoder works on blocks of many rows, so the row is searched here.
     binary.seek(0)
-    for number, raw in enumerate(iter(lambda: binary.readline(LONGEST_LINE), b""), 1):
+    for number, raw in enumerate(iter(lambda: binary.readline(MAX_LINE_CHARACTERS), b""), 1):
         try:
             raw.decode()
         except UnicodeDecodeError:

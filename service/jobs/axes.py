@@ -12,7 +12,7 @@ from sysid.core.errors import split_pointer, suggest_name
 # Fields of the job as a whole. A cell cannot change them.
 UNSWEPT_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
 
-MOST_LABEL_CHARACTERS = 64
+MAX_LABEL_CHARACTERS = 64
 """Longest name of a label in characters."""
 
 
@@ -168,13 +168,13 @@ def _find_axis_label_faults(axis: SweepAxisIn, pointer: str) -> Iterator[FieldEr
     for position, labels in enumerate(axis.labels or ()):
         for name in labels:
             if (
-                not 1 <= len(name) <= MOST_LABEL_CHARACTERS
+                not 1 <= len(name) <= MAX_LABEL_CHARACTERS
                 or not name.isprintable()
                 or set(name) & {*'"\\'}
             ):
                 yield FieldError(
                     f"{pointer}/labels/{position}",
-                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable "
+                    f"found the name {name!r:.80}; need 1 to {MAX_LABEL_CHARACTERS} printable "
                     "characters without quotation marks and backslashes",
                 )
                 return  # the other positions usually have the same names

@@ -33,8 +33,8 @@ from sysid.models.polynomial import check_candidate_count
 from sysid.models.ties import apply_ties, resolve_ties
 
 JobBody = dict[str, Any]
-MOST_NAMED_EXPERIMENTS = 1000  # experiments assumed while datasets are missing
-MOST_GENES = 10_000_000  # individuals × parameters: 80 MB for each copy of a population
+MAX_NAMED_EXPERIMENTS = 1000  # experiments assumed while datasets are missing
+MAX_GENES = 10_000_000  # individuals × parameters: 80 MB for each copy of a population
 
 
 class JobChecker:
@@ -129,7 +129,7 @@ class JobChecker:
         )
         if not all(isinstance(dataset, Dataset) for dataset in datasets):
             pieces = max(
-                pieces, min(count_named_experiments(body["parameters"]), MOST_NAMED_EXPERIMENTS)
+                pieces, min(count_named_experiments(body["parameters"]), MAX_NAMED_EXPERIMENTS)
             )
         return (*model.parameters, *build_initial_parameters(model, pieces))
 
@@ -137,7 +137,7 @@ class JobChecker:
         """Count the samples of all estimation datasets. A missing dataset counts as very long."""
         datasets = [self.get_dataset(reference) for reference in body["datasets"]]
         if not all(isinstance(dataset, Dataset) for dataset in datasets):
-            return MOST_GENES
+            return MAX_GENES
         return sum(dataset.n_samples for dataset in datasets if isinstance(dataset, Dataset))
 
     def _count_scored_samples(self, body: JobBody, model: Model) -> int:
@@ -261,11 +261,11 @@ def _find_freedom_faults(
     free = [parameter for parameter in parameters if parameter.is_free]
     if not free:
         yield FieldError("/parameters", "every parameter is fixed. Leave at least one free")
-    if population * len(free) > MOST_GENES:
+    if population * len(free) > MAX_GENES:
         yield FieldError(
             "/algorithm/population",
             f"found {population} individuals with {len(free)} free parameters. At most "
-            f"{MOST_GENES // len(free)} individuals fit into memory",
+            f"{MAX_GENES // len(free)} individuals fit into memory",
         )
 
 

@@ -14,7 +14,7 @@ from service.storage.errors import RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
 
-MOST_NAME_CHARACTERS = 100
+MAX_NAME_CHARACTERS = 100
 
 
 def accept_reference(session: Session, name: str, body: ReferenceIn) -> ReferenceOut:
@@ -77,8 +77,8 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
 
 def _check_name(name: str) -> None:
     """Refuse names that look like a run's id or like parts of a path."""
-    if not 1 <= len(name) <= MOST_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        requirement = f"1 to {MOST_NAME_CHARACTERS} printable characters without outer blanks"
+    if not 1 <= len(name) <= MAX_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
+        requirement = f"1 to {MAX_NAME_CHARACTERS} printable characters without outer blanks"
     elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
         requirement = (
             f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"

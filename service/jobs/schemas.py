@@ -37,7 +37,7 @@ PositiveCount = Annotated[int, Field(ge=1, le=MAX_GENERATIONS)]
 EvaluationLimit = Annotated[int, Field(ge=1, le=MAX_EVALUATIONS)]
 GenerationNumber = Annotated[int, Field(ge=0, le=MAX_GENERATIONS)]
 Bits = Annotated[int, Field(ge=1, le=MAX_BITS)]
-MOST_INDIVIDUALS = 100_000
+MAX_INDIVIDUALS = 100_000
 MutationSchedule = Annotated[
     list[tuple[GenerationNumber, float]], Field(min_length=1, max_length=1000)
 ]
@@ -91,7 +91,7 @@ class MigrationIn(Body):
 
     every: PositiveCount = SEARCH.migration.every
     topology: TopologyName = SEARCH.migration.topology
-    migrants: int = Field(default=SEARCH.migration.migrants, ge=0, le=MOST_INDIVIDUALS)
+    migrants: int = Field(default=SEARCH.migration.migrants, ge=0, le=MAX_INDIVIDUALS)
 
 
 class StopIn(Body):
@@ -122,7 +122,7 @@ class AlgorithmIn(Body):
     """Settings of the search."""
 
     method: SearchMethod = SEARCH.method
-    population: int = Field(default=SEARCH.population, ge=MIN_POPULATION, le=MOST_INDIVIDUALS)
+    population: int = Field(default=SEARCH.population, ge=MIN_POPULATION, le=MAX_INDIVIDUALS)
     generations: int = Field(default=SEARCH.generations, ge=1, le=10_000_000)
     bits: Bits = SEARCH.bits
     selection_rate: float = Field(default=SEARCH.selection_rate, gt=0, lt=1)
@@ -136,7 +136,7 @@ class AlgorithmIn(Body):
     stop: StopIn = StopIn()
 
 
-MOST_AXIS_VALUES = 1_000_000
+MAX_AXIS_VALUES = 1_000_000
 AxisLabels = Annotated[dict[str, float | str], Field(max_length=32)]
 
 
@@ -149,11 +149,11 @@ class SweepAxisIn(Body):
     """
 
     path: Pointer
-    values: list[Any] | None = Field(default=None, min_length=1, max_length=MOST_AXIS_VALUES)
+    values: list[Any] | None = Field(default=None, min_length=1, max_length=MAX_AXIS_VALUES)
     range: list[WholeNumber] | None = Field(default=None, min_length=2, max_length=3)
     log: tuple[float, float, int] | None = None
     zip: str | None = Field(default=None, max_length=100)
-    labels: list[AxisLabels] | None = Field(default=None, max_length=MOST_AXIS_VALUES)
+    labels: list[AxisLabels] | None = Field(default=None, max_length=MAX_AXIS_VALUES)
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
@@ -191,13 +191,13 @@ def _check_reference(value: str) -> str:
     return _check_warm_start(value)
 
 
-LEAST_X, MOST_X = 1e-100, 1e100
+MIN_X, MAX_X = 1e-100, 1e100
 """Magnitudes of x in a trend. Their squares must be finite."""
 
 
 def is_valid_x(value: float) -> bool:
     """Test whether a number can be the x of a trend."""
-    return value == 0 or LEAST_X <= abs(value) <= MOST_X
+    return value == 0 or MIN_X <= abs(value) <= MAX_X
 
 
 def _check_x(value: float) -> float:

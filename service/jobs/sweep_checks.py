@@ -22,7 +22,7 @@ from service.jobs.axes import (
     group_axes,
 )
 from service.jobs.checks import JobChecker, find_type_faults
-from service.jobs.schemas import LEAST_X, MOST_X, PREVIOUS, JobIn, is_valid_x
+from service.jobs.schemas import MAX_X, MIN_X, PREVIOUS, JobIn, is_valid_x
 from sysid.core.errors import suggest_name
 from sysid.models.model import Model
 
@@ -69,7 +69,7 @@ def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
                 needed = "a number"
             elif not is_valid_x(value):
                 problem = f"found {value!r}"
-                needed = f"0, or a magnitude from {LEAST_X:g} to {MOST_X:g}"
+                needed = f"0, or a magnitude from {MIN_X:g} to {MAX_X:g}"
             else:
                 continue
             yield FieldError(
@@ -84,7 +84,7 @@ INDEPENDENT_FIELDS: Mapping[str, TypeAdapter[Any]] = {
     "/noise/seed": TypeAdapter(Seed),
     "/noise/sigma": TypeAdapter(Sigma),
 }
-MOST_FAULTY_VALUES = 200
+MAX_FAULTY_VALUES = 200
 """Faulty values after which the check ends. Some checks take 2 ms per value."""
 
 
@@ -112,7 +112,7 @@ def find_job_faults(
             steps = build_axis_groups(body.sweep.axes, groups)
             wrong = list(_find_value_faults(checker, document, steps, frozenset(base_faults)))
             faults += wrong
-            if len(wrong) < MOST_FAULTY_VALUES:
+            if len(wrong) < MAX_FAULTY_VALUES:
                 faults += _find_repeated_recordings(checker, body)
     model = checker.resolve_model(body.model)
     faults += find_trend_faults(session, body, None if isinstance(model, list) else model[0])
@@ -159,9 +159,9 @@ def _find_value_faults(
     for step in (step for group in groups for step in group):
         if step.pointer in reported or _is_valid_alone(step.cell):
             continue
-        if n_wrong == MOST_FAULTY_VALUES:
+        if n_wrong == MAX_FAULTY_VALUES:
             yield FieldError(
-                "", f"{MOST_FAULTY_VALUES} faulty axis values are reported. The rest is not checked"
+                "", f"{MAX_FAULTY_VALUES} faulty axis values are reported. The rest is not checked"
             )
             return
         faults = list(_find_position_faults(checker, document, step, base_faults))

@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
 
-MOST_SAMPLES = 1_000_000
-MOST_RECORDS = 2000
-MOST_STEPS = 1_000_000_000
+MAX_SAMPLES = 1_000_000
+MAX_RECORDS = 2000
+MAX_STEPS = 1_000_000_000
 """Integration or recursion steps in a search for initial states: about ten seconds."""
-LEAST_SIMULATIONS = 100
-MOST_WORK = 30_000_000
+MIN_SIMULATIONS = 100
+MAX_WORK = 30_000_000
 """Measured values × initial states searched together. Their derivatives are held in memory."""
 
 
@@ -127,11 +127,11 @@ def _find_channel_faults(
                 f"{row.name!r} has no channel {recorded_name!r}"
                 f"{suggest_name(recorded_name, recorded)}. It has {', '.join(recorded)}",
             )
-    if row.n_samples > MOST_SAMPLES:
+    if row.n_samples > MAX_SAMPLES:
         yield FieldError(
             "/dataset",
             f"{row.name!r} has {row.n_samples} samples; a request may have at most "
-            f"{MOST_SAMPLES}. Derive a shorter dataset with 'trim' or 'resample'",
+            f"{MAX_SAMPLES}. Derive a shorter dataset with 'trim' or 'resample'",
         )
 
 
@@ -162,11 +162,11 @@ def _read_records(store: ObjectStore, row: Dataset, channels: SignalChannels) ->
         records = read_records(store, [row], channels)
     except InvalidRecord as error:
         raise InvalidRequest.from_fault("/dataset", str(error)) from None
-    if len(records) > MOST_RECORDS:
+    if len(records) > MAX_RECORDS:
         raise InvalidRequest.from_fault(
             "/dataset",
             f"{row.name!r} has {len(records)} segments; a request may have at most "
-            f"{MOST_RECORDS}. Derive a dataset with fewer segments with 'select' or 'trim'",
+            f"{MAX_RECORDS}. Derive a dataset with fewer segments with 'select' or 'trim'",
         )
     return records
 
@@ -210,7 +210,7 @@ def _search_starts(problem: "Problem") -> FloatArray:
     Initial states affect their own record only, so each record is searched alone. A joint search
     would cost the cube of their number.
     """
-    most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
+    most = max(MIN_SIMULATIONS, MAX_STEPS // problem.n_steps)
     changes = problem.settings.parameters
     if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
         return _refine_starts(problem, most)
@@ -244,12 +244,12 @@ def _refine_starts(problem: "Problem", simulations: int) -> FloatArray:
     if not problem.free_parameters:
         return np.zeros(0)
     work = problem.evaluator.n_measured * len(problem.free_parameters)
-    if work > MOST_WORK:
+    if work > MAX_WORK:
         raise InvalidRequest.from_fault(
             "/dataset",
             f"{len(problem.free_parameters)} initial states are free on "
             f"{problem.evaluator.n_measured} measured values. Their product may be at most "
-            f"{MOST_WORK:.3g}. Derive a shorter recording",
+            f"{MAX_WORK:.3g}. Derive a shorter recording",
         )
     middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
     refined = refine_candidates(problem, [middle], simulations)[0]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
 
-MOST_WORK = 300_000_000  # measured values × parameters × points × profiles
+MAX_WORK = 300_000_000  # measured values × parameters × points × profiles
 LIMIT_SECONDS = 45.0  # a client waits a minute
 CHI_SQUARED_95 = (
     3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
@@ -52,12 +52,12 @@ def compute_profiles(
     theta = _read_estimate(problem, stored)
     names = _choose_parameters(problem, body)
     work = problem.evaluator.n_measured * len(problem.free_parameters) * body.points * len(names)
-    if work > MOST_WORK:
+    if work > MAX_WORK:
         raise InvalidRequest.from_fault(
             "/parameters",
             f"{len(names)} profiles of {body.points} points are too much work for this run. "
             f"Samples × parameters × points × profiles is {work:.3g}; need at most "
-            f"{MOST_WORK:.3g}. "
+            f"{MAX_WORK:.3g}. "
             "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
     if not _profile_lock.acquire(blocking=False):

@@ -20,7 +20,7 @@ from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, Migrati
 from service.storage.tables import Job, Run
 from sysid.models.parameters import Parameter
 
-MOST_OPEN_PROGRESS = 0.99  # of an unfinished run: refinement is still to come
+MAX_OPEN_PROGRESS = 0.99  # of an unfinished run: refinement is still to come
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ def _compute_progress(run: Run, job: Job, written: WrittenProgress | None) -> fl
     of_job = job.generation if job.n_runs == 1 else 0
     reached_so_far = max(of_job, written.generation if written is not None else 0)
     generations: int = build_run_body(job.spec, run.cell)["algorithm"]["generations"]
-    return min(reached_so_far / generations, MOST_OPEN_PROGRESS)
+    return min(reached_so_far / generations, MAX_OPEN_PROGRESS)
 
 
 def parse_filters(name: str, filters: Sequence[str]) -> Mapping[str, Any]:

@@ -147,7 +147,7 @@ def _build_empty_group(part: PendingGroup, keys: Sequence[GroupKey]) -> RunGroup
 
 
 CACHE_SIZE = 32
-MOST_CACHED_GROUPS = 2_000
+MAX_CACHED_GROUPS = 2_000
 """Larger results are not cached."""
 
 
@@ -191,6 +191,6 @@ def get_groups(
     groups = _cache.get(key)
     if groups is None:
         groups = group_all_runs(session, job, keys, quantities, limit)
-        if len(groups) <= MOST_CACHED_GROUPS:
+        if len(groups) <= MAX_CACHED_GROUPS:
             _cache.put(key, groups)
     return groups

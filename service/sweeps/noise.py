@@ -22,7 +22,7 @@ from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from service.sweeps.output_spread import compute_spread, relative_faults
-from service.sweeps.schemas import MOST_REPLICATES, NoiseSweepIn
+from service.sweeps.schemas import MAX_REPLICATES, NoiseSweepIn
 from service.sweeps.true_parameters import find_true_parameters
 from sysid.core.errors import InvalidModel, SysidError, UnknownModel
 
@@ -171,7 +171,7 @@ def _build_job(
         sigma["values"] = [unit * sigma_value for sigma_value in plain.sigmas]
         sigma["labels"] = [{"relative": sigma_value} for sigma_value in plain.sigmas]
     together = {
-        "range": [body.seed * MOST_REPLICATES, body.seed * MOST_REPLICATES + body.replicates],
+        "range": [body.seed * MAX_REPLICATES, body.seed * MAX_REPLICATES + body.replicates],
         "zip": "replicate",
     }
     axes = [

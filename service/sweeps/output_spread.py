@@ -11,7 +11,7 @@ from service.storage.tables import Dataset
 from sysid.data.records import Recording
 from sysid.models.model import Model
 
-MOST_READ_VALUES = 10_000_000
+MAX_READ_VALUES = 10_000_000
 """Most values to read, over all channels, so that a request does not take minutes."""
 
 
@@ -25,10 +25,10 @@ def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldErro
             "Give σ in their unit, with relative: false",
         )
     count = sum(row.n_samples * row.n_channels for row in rows)
-    if count > MOST_READ_VALUES:
+    if count > MAX_READ_VALUES:
         yield FieldError(
             "/relative",
-            f"the datasets have {count} values; at most {MOST_READ_VALUES} are read to compute "
+            f"the datasets have {count} values; at most {MAX_READ_VALUES} are read to compute "
             "the output's standard deviation. Give σ in the output's unit, with relative: false",
         )
 

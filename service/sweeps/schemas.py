@@ -10,7 +10,7 @@ from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
 
-MOST_REPLICATES = 1_000_000
+MAX_REPLICATES = 1_000_000
 """The seed of replicate r is `seed` times this plus r, so that sweeps share no seed by chance."""
 
 
@@ -48,7 +48,7 @@ class NoiseSweepIn(IdentificationIn):
         list[Sigma], Field(min_length=1, max_length=100_000), AfterValidator(_check_distinct)
     ]
     relative: bool = False
-    replicates: int = Field(default=20, ge=1, lt=MOST_REPLICATES)
+    replicates: int = Field(default=20, ge=1, lt=MAX_REPLICATES)
     methods: Annotated[list[SearchMethod], AfterValidator(_check_distinct)] = Field(
         default=["simple", "improved"], min_length=1
     )

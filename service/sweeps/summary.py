@@ -23,7 +23,7 @@ from service.sweeps.groups import get_groups
 from service.sweeps.schemas import ErrorReferenceOut, GroupOut, ParameterSummaryOut, SummaryOut
 from sysid.core.errors import suggest_name
 
-MOST_GROUPS = 2_000
+MAX_GROUPS = 2_000
 MEDIAN = QUANTILES_PER_MILLE.index(500)
 RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
     SummaryQuantity("rms"),
@@ -65,10 +65,10 @@ def summarise_job(
     if not errors_only:
         quantities += [RMS, FIT_ESTIMATION, FIT_VALIDATION]
         quantities += [SummaryQuantity("stderr", name) for name in units]
-    groups = get_groups(session, job, keys, quantities, MOST_GROUPS)
-    if len(groups) > MOST_GROUPS:
+    groups = get_groups(session, job, keys, quantities, MAX_GROUPS)
+    if len(groups) > MAX_GROUPS:
         raise InvalidRequest.from_fault(
-            "?by", f"gives more than {MOST_GROUPS} groups. Name fewer axes, for example no seed"
+            "?by", f"gives more than {MAX_GROUPS} groups. Name fewer axes, for example no seed"
         )
     return SummaryOut(
         job=job.id,
@@ -126,7 +126,7 @@ def _read_units(session: Session, job: Job) -> dict[str, str]:
     runs = RunRepository(session)
     heads: list[Run] = list(runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED]).items)
     if any(axis["path"] == "/model" for axis in job.spec["sweep"]["axes"]):
-        for group in read_groups(session, job.id, [GroupKey("axis", "/model")], [], MOST_GROUPS):
+        for group in read_groups(session, job.id, [GroupKey("axis", "/model")], [], MAX_GROUPS):
             cell = {"/model": group.key[0]}
             heads += runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED], cell=cell).items
     return {

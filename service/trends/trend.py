@@ -33,7 +33,7 @@ from service.trends.schemas import (
 from sysid.trends.laws import FORMULAS, TrendLaw
 from sysid.trends.trend import Influence, Trend, fit_trend
 
-MOST_RUNS = 5_000
+MAX_RUNS = 5_000
 
 
 def has_trend(job: Job) -> bool:
@@ -100,12 +100,12 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
 def _collect_quantities(
     session: Session, job: Job
 ) -> tuple[dict[float, list[TrendRow]], list[TrendQuantity]]:
-    if job.n_runs > MOST_RUNS:
+    if job.n_runs > MAX_RUNS:
         raise InvalidRequest.from_fault(
-            "", f"{job.id} has {job.n_runs} runs; a trend may have at most {MOST_RUNS}"
+            "", f"{job.id} has {job.n_runs} runs; a trend may have at most {MAX_RUNS}"
         )
     request = job.spec["trend"]
-    rows_by_label = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), request["x"])
+    rows_by_label = group_by_label(read_trend_rows(session, job.id, MAX_RUNS), request["x"])
     return rows_by_label, build_quantities(rows_by_label, request["parameters"])
 
 
@@ -133,10 +133,10 @@ def _explain_missing_trend(reference_job: Job, x: str) -> str:
         return "its job has no trend"
     if reference_job.spec["trend"]["x"] != x:
         return f"the trend of its job is over {reference_job.spec['trend']['x']!r}"
-    if reference_job.n_runs > MOST_RUNS:
+    if reference_job.n_runs > MAX_RUNS:
         return (
             f"the reference batch {reference_job.id} has {reference_job.n_runs} runs (a trend may "
-            f"have at most {MOST_RUNS})"
+            f"have at most {MAX_RUNS})"
         )
     return ""
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 from sysid.core.errors import InvalidSettings
 
-LARGEST_NUMBER = 1e300
+MAX_NUMBER = 1e300
 """Larger numbers are not allowed in a model; a larger time counts as infinite."""
 
 DerivativeOn = Literal["measurement", "error"]
@@ -127,7 +127,7 @@ class PidControl:
     @property
     def has_integral_action(self) -> bool:
         """Whether there is integral action."""
-        return self.integral_time is not None and self.integral_time < LARGEST_NUMBER
+        return self.integral_time is not None and self.integral_time < MAX_NUMBER
 
     @property
     def has_derivative_action(self) -> bool:
@@ -161,8 +161,8 @@ class PidControl:
 
 
 def _describe_not_finite(value: float) -> str:
-    return f"{value!r} is not a finite number between ±{LARGEST_NUMBER:g}"
+    return f"{value!r} is not a finite number between ±{MAX_NUMBER:g}"
 
 
 def _is_number(value: float) -> bool:
-    return -LARGEST_NUMBER < value < LARGEST_NUMBER
+    return -MAX_NUMBER < value < MAX_NUMBER

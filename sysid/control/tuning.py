@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from sysid.control.controllers import LARGEST_NUMBER, Transport
+from sysid.control.controllers import MAX_NUMBER, Transport
 from sysid.control.linear_form import IdentifiedModel, NotLinear
 from sysid.control.transfer import (
     QuasiPolynomial,
@@ -139,7 +139,7 @@ def tune_controller(
         )
     except ZeroDivisionError:  # a product of small numbers underflows
         raise _make_refusal(_describe_impossible_gain(inf, process)) from None
-    if not 0.0 < abs(tuning.gain) < LARGEST_NUMBER:
+    if not 0.0 < abs(tuning.gain) < MAX_NUMBER:
         raise _make_refusal(_describe_impossible_gain(tuning.gain, process))
     return tuning
 

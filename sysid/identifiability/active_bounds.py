@@ -16,10 +16,10 @@ from sysid.core.units import format_unit
 from sysid.models.parameters import Parameter
 from sysid.simulation.scaling import is_at_bounds
 
-_LEAST_SHARE = 0.05  # of the squared error: the release of a bound must remove as much
-_LEAST_SIGNIFICANCE = 16.0  # times the gain of a parameter without effect: four standard errors
+_MIN_SHARE = 0.05  # of the squared error: the release of a bound must remove as much
+_MIN_SIGNIFICANCE = 16.0  # times the gain of a parameter without effect: four standard errors
 _TIE_TOLERANCE = 1e-9  # of the squared error: smaller differences are rounding, the first wins
-_LEAST_ROOM = 0.01  # of the interval: a bound with less room is at its limit
+_MIN_ROOM = 0.01  # of the interval: a bound with less room is at its limit
 
 
 class ActiveBound(NamedTuple):
@@ -69,7 +69,7 @@ def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
     share = downhill**2 / np.where(size > 0, size * total, np.inf)
     low, high = is_at_bounds(place)
     out = (low & (downhill < 0)) | (high & (downhill > 0))
-    return np.asarray(out & (share > _LEAST_SHARE) & (share * influence.size > _LEAST_SIGNIFICANCE))
+    return np.asarray(out & (share > _MIN_SHARE) & (share * influence.size > _MIN_SIGNIFICANCE))
 
 
 def rank_active_bounds(
@@ -91,7 +91,7 @@ def rank_active_bounds(
     step = _LinearStep.from_place(space, limits, influence, columns, place)
     low, high = is_at_bounds(place)
     room = np.where(low, -step.outer_moves[0] - place, step.outer_moves[1] - (1.0 - place))
-    candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _LEAST_ROOM))]
+    candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _MIN_ROOM))]
     shares: dict[int, float] = {}
     loss, total = step.solve_released(())[1], float(influence @ influence)
     while remaining := [d for d in candidates if d not in shares]:
@@ -99,7 +99,7 @@ def rank_active_bounds(
         least = min(trials)[0] + _TIE_TOLERANCE * total
         reached, best = next(trial for trial in trials if trial[0] <= least)
         share = (loss - reached) / total
-        if not (share > _LEAST_SHARE and share * influence.size > _LEAST_SIGNIFICANCE):
+        if not (share > _MIN_SHARE and share * influence.size > _MIN_SIGNIFICANCE):
             break
         shares[best], loss = share, reached
     moved = place + step.solve_released(tuple(shares))[0]

@@ -45,7 +45,7 @@ class IdentifiableCombination:
 
 _LINK_TOLERANCE = 1e-4  # parameters with a weaker link are not moved together: it is rounding
 _PIVOT_TOLERANCE = 1e-3  # of the largest entry of its column
-_FRACTION_TOLERANCE, _LARGEST_DENOMINATOR, _LARGEST_FRACTION = 1e-3, 4, 6
+_FRACTION_TOLERANCE, _MAX_DENOMINATOR, _MAX_FRACTION = 1e-3, 4, 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,10 +210,7 @@ def _round_to_fractions(
     the sum.
     """
     nearest = np.array(
-        [
-            [float(Fraction(v).limit_denominator(_LARGEST_DENOMINATOR)) for v in row]
-            for row in entries
-        ]
+        [[float(Fraction(v).limit_denominator(_MAX_DENOMINATOR)) for v in row] for row in entries]
     )
     if np.any((nearest == 0.0) & ~small):
         return None
@@ -224,7 +221,7 @@ def _round_to_fractions(
     error = float(np.max(errors))
     return (
         (nearest, error)
-        if error < _FRACTION_TOLERANCE and np.max(np.abs(nearest)) <= _LARGEST_FRACTION
+        if error < _FRACTION_TOLERANCE and np.max(np.abs(nearest)) <= _MAX_FRACTION
         else None
     )
 

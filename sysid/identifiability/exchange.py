@@ -31,8 +31,8 @@ ExchangeGroup = tuple[ExchangeUnit, ...]
 
 ExchangeGroups = tuple[ExchangeGroup, ...]
 
-_LEAST_DISTANCE = 0.05  # of their size: least distance of the two in the test
-_LEAST_SIZE = 1e-3  # of the range: values nearer 0 count as of this size
+_MIN_DISTANCE = 0.05  # of their size: least distance of the two in the test
+_MIN_SIZE = 1e-3  # of the range: values nearer 0 count as of this size
 _MOVE_SHARES = 0.02, 0.05  # of their size: the moves of the other parameters
 _SAME_TOLERANCE = 1e-9  # of the output's size: rounding
 _BATCH_SIZE = 8  # simulations
@@ -240,7 +240,7 @@ def _simulate_perturbed(
 ) -> dict[int, FloatArray]:
     """Simulate, for each member, all members at one value and this one slightly above."""
     value = float(np.median(theta[members]))
-    increase = _LEAST_DISTANCE * float(_scale_values(np.array(value), high - low))
+    increase = _MIN_DISTANCE * float(_scale_values(np.array(value), high - low))
     value = min(max(value, low), high - increase)
     perturbed: dict[int, FloatArray] = {}
     for first in range(0, len(members), _BATCH_SIZE):  # a long record leaves no room for all
@@ -263,7 +263,7 @@ def _test_exchange(
     """
     evaluator, pair = problem.evaluator, np.array([first, second])
     low, high = evaluator.lower[pair].max(axis=0), evaluator.upper[pair].min(axis=0)
-    least_half = 0.5 * _LEAST_DISTANCE * _scale_values(theta[pair], high - low).max(axis=0)
+    least_half = 0.5 * _MIN_DISTANCE * _scale_values(theta[pair], high - low).max(axis=0)
     half = np.minimum(
         np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least_half), 0.5 * (high - low)
     )
@@ -290,7 +290,7 @@ def _is_same_output(first: FloatArray, second: FloatArray) -> bool:
 
 def _scale_values(values: FloatArray, span: FloatArray | float) -> FloatArray:
     """Compute the size of values: their own, or a small part of the range if that is larger."""
-    return np.asarray(np.minimum(np.maximum(np.abs(values), _LEAST_SIZE * span), span))
+    return np.asarray(np.minimum(np.maximum(np.abs(values), _MIN_SIZE * span), span))
 
 
 def _move_inward(problem: Problem, theta: FloatArray) -> FloatArray:

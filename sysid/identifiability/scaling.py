@@ -37,7 +37,7 @@ _ARITHMETIC: Mapping[str, Callable[[Fraction, Fraction], Fraction]] = {
     "*": mul,
     "/": truediv,
 }
-_LARGEST_DENOMINATOR, _FRACTION_TOLERANCE = 1000, 1e-14
+_MAX_DENOMINATOR, _FRACTION_TOLERANCE = 1000, 1e-14
 
 ScalingWeight = Mapping[str, Fraction]
 """Coefficients of a linear form in the powers of parameters and states; empty: weight 0."""
@@ -229,7 +229,7 @@ def _evaluate_fraction(tree: Expression, fixed: Mapping[str, float]) -> Fraction
 
 def _to_fraction(value: float) -> Fraction:
     """Convert a number to the intended fraction: 0.1 to 1/10, 0.3333333333333333 to 1/3."""
-    near = Fraction(value).limit_denominator(_LARGEST_DENOMINATOR)
+    near = Fraction(value).limit_denominator(_MAX_DENOMINATOR)
     return near if abs(float(near) - value) <= _FRACTION_TOLERANCE * abs(value) else Fraction(value)
 
 

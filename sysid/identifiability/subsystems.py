@@ -27,7 +27,7 @@ _COMMUTATIVE = ("binary", "+"), ("binary", "*")
 
 _Renaming = Mapping[str, str]  # each name and its replacement, both ways
 
-_MOST_NODES = 4000
+_MAX_NODES = 4000
 """Limit on the nodes examined for two states.
 
 Subsystems need some hundreds. If nothing fits, each sum of names doubles the number of orders."""
@@ -50,7 +50,7 @@ def _match_states(model: Model, first: str, second: str) -> _Renaming | None:
     equations = dict(zip((state.name for state in model.states), model.equations, strict=True))
     names: _Renaming = {first: second, second: first}
     waiting, seen = [(first, second)], {first, second}
-    nodes_left = iter(range(_MOST_NODES))
+    nodes_left = iter(range(_MAX_NODES))
     while waiting:
         state, counterpart = waiting.pop()
         renaming = next(

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.simulation.problem import Problem
 
-_LEAST_SHARE = 0.02  # of a direction (squared) from which a parameter may belong to it
+_MIN_SHARE = 0.02  # of a direction (squared) from which a parameter may belong to it
 _UNCERTAIN_RATIO = 0.1  # of the largest singular value: directions above are certain enough
 _RATIO_DENOMINATOR = 2  # ratios are rounded to halves
 _MOVE_SHARE = 0.02  # of the range, for the parameter that moves most
@@ -62,7 +62,7 @@ def find_translations(
 
 def _round_direction(row: FloatArray, scale: FloatArray) -> FloatArray:
     """Round a direction in the parameters' units: largest entry 1, the others simple ratios."""
-    physical = np.where(row**2 > _LEAST_SHARE, row * scale, 0.0)
+    physical = np.where(row**2 > _MIN_SHARE, row * scale, 0.0)
     largest = np.argmax(np.abs(physical))
     return np.asarray(
         np.round(_RATIO_DENOMINATOR * physical / physical[largest]) / _RATIO_DENOMINATOR

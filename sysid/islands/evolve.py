@@ -32,7 +32,7 @@ from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.problem import Problem, compute_record_progress
 
 _CHECK_INTERVAL = 5  # generations between two checks of the target RMS, or of a warm start
-_MOST_BORDERS, _MOST_MIGRANTS = 100, 100_000
+_MAX_BORDERS, _MAX_MIGRANTS = 100, 100_000
 """Limits of one call: the borders it passes, and the migrants it has room for."""
 
 
@@ -156,9 +156,9 @@ def _make_shared_search_plan(
     routes = make_routes(
         [plan.bits for plan in island_plans], algorithm.migration, algorithm.population
     )
-    room = _MOST_MIGRANTS // max(1, len(routes.edges) * routes.most_migrants)
+    room = _MAX_MIGRANTS // max(1, len(routes.edges) * routes.most_migrants)
     borders = (
-        1 if is_warm else max(1, min(_MOST_BORDERS, room))
+        1 if is_warm else max(1, min(_MAX_BORDERS, room))
     )  # the history of a warm run is checked at each border
     return SearchPlan(
         plans,

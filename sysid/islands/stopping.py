@@ -9,7 +9,7 @@ from sysid.core.types import FloatArray
 from sysid.search.state import SAME_OPTIMUM, SearchArray
 
 _PARTS_OF_EACH, _EXTRA_AGREEMENTS = 2, 2
-_LEAST_SHARE = 1 / 3  # of all restarts
+_MIN_SHARE = 1 / 3  # of all restarts
 # This share of the random restarts must agree, or there must be so many times the needed number.
 _CONFIRMED_SHARE, _MANY_STARTS = 0.5, 2.5
 _CONFIRMED_SHARE_ROUGH = 2 / 3  # of the random restarts, where the fitness jumps
@@ -130,4 +130,4 @@ def _restarts_agree(settled: int, is_warm: bool, restarts: RestartCounts, is_old
     is_confirmed = restarts.confirmed >= max(enough, _CONFIRMED_SHARE * restarts.independent)
     if not (is_warm or is_confirmed or restarts.independent >= _MANY_STARTS * enough):
         return False
-    return agreed >= max(enough, _LEAST_SHARE * (restarts.independent + restarts.hops))
+    return agreed >= max(enough, _MIN_SHARE * (restarts.independent + restarts.hops))

@@ -6,7 +6,7 @@ from sysid.kernels.vectors import IrValue, VectorBuilder
 from sysid.language.functions import FUNCTIONS, OPERATORS, Level
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
-LARGEST_POWER = 64
+MAX_POWER = 64
 """Largest whole exponent that is expanded to multiplications."""
 
 _ARITHMETIC = {"+": "add", "-": "sub", "*": "mul", "/": "div"}
@@ -79,7 +79,7 @@ def _emit_power(
     value = evaluate_constant(exponent)
     if value == 0.5:
         return lanes.call_intrinsic("sqrt", base)
-    if value is not None and value.is_integer() and abs(value) <= LARGEST_POWER:
+    if value is not None and value.is_integer() and abs(value) <= MAX_POWER:
         whole = _emit_whole_power(lanes, base, int(abs(value)))
         return whole if value >= 0 else lanes.div(lanes.make_number(1.0), whole)
     return lanes.call_intrinsic("pow", base, emit_expression(lanes, exponent, scope))

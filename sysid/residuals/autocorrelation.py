@@ -11,14 +11,14 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.data.records import Channel, Hold, measure_sampling
 
 MAX_LAG = 25
-FEWEST_SAMPLES = 20
+MIN_SAMPLES = 20
 """Least number of samples for a test."""
 
 ROUNDING_SHARE = 1e-9
 """Share of a signal below which a remainder is rounding."""
 
 _GRID_TOLERANCE = 0.05  # of a period: largest distance of a sample from its grid point
-_LEAST_FILLED = 0.5  # of the points of a grid must be filled
+_MIN_FILLED_SHARE = 0.5  # of the points of a grid must be filled
 
 
 class SpacedResiduals(NamedTuple):
@@ -76,7 +76,7 @@ def _find_time_grid(time_bytes: bytes) -> _TimeGrid | None:
     distance = np.abs(exact - np.rint(exact))
     is_regular = bool(np.all(distance <= _GRID_TOLERANCE) and np.all(np.rint(exact[1:]) >= 1))
     n = int(places[-1]) + 1
-    if not (is_regular and times.size >= _LEAST_FILLED * n):
+    if not (is_regular and times.size >= _MIN_FILLED_SHARE * n):
         return None
     indices = places.astype(np.intp)
     grid_times = times[0] + period * np.arange(n)
@@ -171,7 +171,7 @@ def _build_lagged_inputs(
     shifted = _shift_input(spaced, channel, np.frombuffer(lags) * period)
     # All lags use the same samples, so that none has more than another.
     is_used = is_present & np.isfinite(shifted.sum(axis=0))
-    if np.count_nonzero(is_used) < FEWEST_SAMPLES:
+    if np.count_nonzero(is_used) < MIN_SAMPLES:
         return "it overlaps the output too little"
     columns = np.where(is_used, shifted, 0.0)
     columns -= np.outer(columns.sum(axis=1) / np.count_nonzero(is_used), is_used)

@@ -32,7 +32,7 @@ from scipy.special import chdtrc, stdtrit
 
 from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.residuals.autocorrelation import (
-    FEWEST_SAMPLES,
+    MIN_SAMPLES,
     ROUNDING_SHARE,
     SpacedResiduals,
     compute_whiteness,
@@ -41,7 +41,7 @@ from sysid.residuals.autocorrelation import (
     space_residuals,
 )
 from sysid.residuals.past_outputs import reads_outputs
-from sysid.residuals.restricted_likelihood import LARGEST_POLE, NoiseColourModel, fit_noise_colour
+from sysid.residuals.restricted_likelihood import MAX_POLE, NoiseColourModel, fit_noise_colour
 from sysid.simulation.problem import Problem
 
 _SIGNIFICANCE = 1e-3
@@ -56,9 +56,9 @@ CHI_SQUARE_95 = 3.841458820694124
 _SHORT_RECORD = 400
 """Samples: shorter records use a noise model if it fits, longer ones the window."""
 
-_LONGEST_RECURSION = 25  # past values of the autoregression
+_MAX_RECURSION_ORDER = 25  # past values of the autoregression
 
-_LEAST_WIDENING = 1e-3  # of the variance with white residuals: less is rounding
+_MIN_WIDENING = 1e-3  # of the variance with white residuals: less is rounding
 
 _EVEN_TOLERANCE = 1e-3  # of a period: steps that differ by less are equal
 
@@ -106,7 +106,7 @@ class ColouredCovariance(NamedTuple):
             Mean square of the residuals; sum of squares of that combination.
         """
         variance_ratio = max(
-            float(direction @ self.middle @ direction) / (power * norm), _LEAST_WIDENING
+            float(direction @ self.middle @ direction) / (power * norm), _MIN_WIDENING
         )
         quantile_ratio = float(stdtrit(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
         return float(variance_ratio * quantile_ratio * self.equivalent_samples / self.degrees)
@@ -199,7 +199,7 @@ def _combine_series(series: Sequence[ColouredCovariance], used: FloatArray) -> C
 
 def _have_unequal_variances(series: Sequence[FloatArray]) -> bool:
     """Return whether residual series clearly have unequal variances (Bartlett's test)."""
-    long_series = [values for values in series if values.size >= FEWEST_SAMPLES]
+    long_series = [values for values in series if values.size >= MIN_SAMPLES]
     variances = np.array([np.mean(np.square(values)) for values in long_series])
     if len(long_series) < 2 or not np.min(variances) > 0:
         return False
@@ -246,7 +246,7 @@ def _order_residuals(part: ResidualPart, values: FloatArray) -> SpacedResiduals:
 def _are_spaced_coloured(spaced: SpacedResiduals, size: float) -> bool:
     n = np.count_nonzero(spaced.present)
     if (
-        n < FEWEST_SAMPLES
+        n < MIN_SAMPLES
         or float(np.sqrt(spaced.values @ spaced.values / n)) <= ROUNDING_SHARE * size
     ):
         return False
@@ -266,9 +266,7 @@ def _estimate_series_covariance(
     root, pole = estimate_spectrum_root(spaced)
     is_short = np.count_nonzero(spaced.present) < _SHORT_RECORD
     colour = (
-        fit_noise_colour(spaced, columns)
-        if by_model and is_short and pole <= LARGEST_POLE
-        else None
+        fit_noise_colour(spaced, columns) if by_model and is_short and pole <= MAX_POLE else None
     )
     if colour is not None:
         samples = spaced.present.sum() * colour.sample_share
@@ -276,7 +274,7 @@ def _estimate_series_covariance(
             colour.middle, float(samples), is_drifting=False, models=(colour,)
         )
     transformed = transform_sensitivities(spaced, columns, root)
-    positive_pole = min(max(pole, 0.0), LARGEST_POLE)
+    positive_pole = min(max(pole, 0.0), MAX_POLE)
     share = (1.0 - positive_pole) / (1.0 + positive_pole)
     n = np.count_nonzero(spaced.present)
     # For any colour the share is the mean of the spectrum over its value at frequency 0.
@@ -284,7 +282,7 @@ def _estimate_series_covariance(
     if power_at_zero > 0:
         share = min(share, float(spaced.values @ spaced.values) / n / power_at_zero)
     return ColouredCovariance(
-        np.asarray((transformed @ transformed.conj().T).real), n * share, pole > LARGEST_POLE
+        np.asarray((transformed @ transformed.conj().T).real), n * share, pole > MAX_POLE
     )
 
 
@@ -297,9 +295,9 @@ def estimate_spectrum_root(spaced: SpacedResiduals) -> tuple[FloatArray, float]:
     are_neighbours = spaced.present[1:] & spaced.present[:-1]
     before, after = spaced.values[:-1][are_neighbours], spaced.values[1:][are_neighbours]
     pole = float(before @ after / (before @ before))
-    weights = np.array([min(max(pole, -LARGEST_POLE), LARGEST_POLE)])
+    weights = np.array([min(max(pole, -MAX_POLE), MAX_POLE)])
     if (
-        spaced.present.all() and pole <= LARGEST_POLE
+        spaced.present.all() and pole <= MAX_POLE
     ):  # a higher order would take a drift for oscillations
         higher_order = _fit_recursion(spaced.values)
         weights = weights if higher_order.size < 2 else higher_order
@@ -318,7 +316,7 @@ def _fit_recursion(values: FloatArray) -> FloatArray:
     forward, backward, weights = values[1:], values[:-1], np.zeros(0)
     power, best = float(np.mean(np.square(values))), np.zeros(0)
     least = values.size * np.log(power)
-    for order in range(1, min(_LONGEST_RECURSION, round(values.size ** (1 / 3))) + 1):
+    for order in range(1, min(_MAX_RECURSION_ORDER, round(values.size ** (1 / 3))) + 1):
         power_sum = float(forward @ forward + backward @ backward)
         if not power_sum > 0:
             break
@@ -335,9 +333,7 @@ def _fit_recursion(values: FloatArray) -> FloatArray:
         if criterion < least:
             least, best = criterion, weights
     steepest = float(np.max(np.abs(np.roots(np.append(1.0, -best))), initial=0.0))
-    return best * min(1.0, LARGEST_POLE / max(steepest, LARGEST_POLE)) ** np.arange(
-        1, best.size + 1
-    )
+    return best * min(1.0, MAX_POLE / max(steepest, MAX_POLE)) ** np.arange(1, best.size + 1)
 
 
 def make_white_root(spaced: SpacedResiduals) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from sysid.core.types import FloatArray, IntArray
-from sysid.residuals.autocorrelation import FEWEST_SAMPLES, space_residuals
+from sysid.residuals.autocorrelation import MIN_SAMPLES, space_residuals
 from sysid.residuals.coloured import (
     ColouredCovariance,
     ResidualPart,
@@ -114,7 +114,7 @@ def _correlate_parts(
     part_a: ResidualPart, part_b: ResidualPart, influence: FloatArray
 ) -> _CorrelatedPair | None:
     times, i, j = np.intersect1d(part_a.times, part_b.times, return_indices=True)
-    if times.size < FEWEST_SAMPLES:
+    if times.size < MIN_SAMPLES:
         return None
     first, second = (
         _SharedPart(part._replace(times=times), part.rows.start + indices)

@@ -33,9 +33,9 @@ _CLEAR_SHARE = 0.7
 _PAST_SAMPLES = 25
 _RECENT_RESIDUALS = 4  # including the present one
 _QUIET_QUANTILE = 0.9
-_LEAST_REST = 1e-9  # of the input's variance: less is rounding
+_MIN_REST = 1e-9  # of the input's variance: less is rounding
 _RANK_TOLERANCE = 1e-9
-_MOST_SAMPLES = 5_000
+_MAX_SAMPLES = 5_000
 _SAMPLES_PER_COEFFICIENT = 4  # least number for each coefficient
 
 
@@ -84,8 +84,8 @@ def _describe_causes(channel: Channel, advises_noise_model: bool) -> str:
 def compute_explained_share(series: ResidualSeries, channel: Channel) -> float:
     """Compute the share of the input's innovation that residuals explain; 0 if not testable."""
     times, residual = (
-        series.times[series.scored][-_MOST_SAMPLES:],
-        series.residual[series.scored][-_MOST_SAMPLES:],
+        series.times[series.scored][-_MAX_SAMPLES:],
+        series.residual[series.scored][-_MAX_SAMPLES:],
     )
     if (
         times.size < _SAMPLES_PER_COEFFICIENT * (_PAST_SAMPLES + _RECENT_RESIDUALS)
@@ -112,7 +112,7 @@ def compute_explained_share(series: ResidualSeries, channel: Channel) -> float:
     recent = _stack_lagged(spaced.values / scale, rows, range(_RECENT_RESIDUALS))
     remainder = _project_out(past[usable], np.column_stack([values[rows], recent])[usable])
     unexplained = float(remainder[:, 0] @ remainder[:, 0])
-    if not unexplained > _LEAST_REST * remainder.shape[0]:
+    if not unexplained > _MIN_REST * remainder.shape[0]:
         return 0.0
     unpredicted = _project_out(remainder[:, 1:], remainder[:, :1])[:, 0]
     return 1.0 - float(unpredicted @ unpredicted) / unexplained

@@ -35,14 +35,14 @@ ONSET_SHARE = 0.02
 """Share of the excursion at which a signal has left its level."""
 
 _NOISE_DEVIATIONS = 4.0  # standard deviations: noise may reach so far without an onset
-_LARGEST_ONSET_SHARE = 0.05  # of the excursion: a higher threshold defines no onset
+_MAX_ONSET_SHARE = 0.05  # of the excursion: a higher threshold defines no onset
 _REST_TOLERANCE = 0.01  # of the range: a signal at rest stays within it
 _NOTABLE_STEP = 0.1  # of the input's range: a step that counts
 _REST_SAMPLES = 10  # samples at least
 _LEVEL_SHARE = 0.25  # of a rest: its last part, which defines the level
-_MOST_CREEP = 0.5  # of the threshold: a signal with more drift is not at rest
+_MAX_CREEP = 0.5  # of the threshold: a signal with more drift is not at rest
 _STAY_SAMPLES = 3  # samples beyond the threshold that make an onset
-_MOST_EVENTS = 500  # limit on the events examined
+_MAX_EVENTS = 500  # limit on the events examined
 _GOLDEN_RATIO = 0.5 * (sqrt(5.0) - 1.0)
 
 
@@ -127,7 +127,7 @@ def find_unprompted_output(record: Record) -> tuple[str, float] | None:
             continue
         if _extrapolate_creep(
             times[rest], values[rest], rest_end
-        ) <= _MOST_CREEP * _compute_tolerance(values):
+        ) <= _MAX_CREEP * _compute_tolerance(values):
             early_outputs.append((rest_end, output.name))
     return None if not early_outputs else (min(early_outputs)[1], min(early_outputs)[0])
 
@@ -192,10 +192,10 @@ def _thin_events(events: Sequence[_InputEvent]) -> Sequence[_InputEvent]:
     Multiples of the golden ratio are as even as possible and follow no pattern. Every second event
     of a square wave, for example, would be a rising edge.
     """
-    if len(events) <= _MOST_EVENTS:
+    if len(events) <= _MAX_EVENTS:
         return events
     turns = (_GOLDEN_RATIO * np.arange(len(events))) % 1.0
-    return [events[i] for i in np.sort(np.argsort(turns, kind="stable")[:_MOST_EVENTS])]
+    return [events[i] for i in np.sort(np.argsort(turns, kind="stable")[:_MAX_EVENTS])]
 
 
 def _find_event_onsets(
@@ -234,12 +234,12 @@ def _find_onset(
     distance = np.abs(values[after] - level)
     excursion = float(np.max(distance))
     threshold = max(ONSET_SHARE * excursion, _NOISE_DEVIATIONS * noise)
-    if not 0 < threshold <= _LARGEST_ONSET_SHARE * excursion:
+    if not 0 < threshold <= _MAX_ONSET_SHARE * excursion:
         return None
     onset = _find_crossing(times[after], distance, threshold, excursion, held=held)
     if (
         onset is None
-        or _extrapolate_creep(times[before], rest, onset.time) > _MOST_CREEP * threshold
+        or _extrapolate_creep(times[before], rest, onset.time) > _MAX_CREEP * threshold
     ):
         return None
     return onset

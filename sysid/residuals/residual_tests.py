@@ -35,7 +35,7 @@ from scipy.special import chdtrc
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel
 from sysid.residuals.autocorrelation import (
-    FEWEST_SAMPLES,
+    MIN_SAMPLES,
     ROUNDING_SHARE,
     SpacedResiduals,
     compute_lagged_sums,
@@ -55,7 +55,7 @@ TEST_LEVEL = 0.05
 """Probability that a true model with white noise fails at least one of its tests."""
 
 _BAND95, _BAND99 = 1.959963984540054, 2.5758293035489004
-_MOST_SAMPLES = 20_000  # consecutive samples, enough for any test; limits the computing time
+_MAX_SAMPLES = 20_000  # consecutive samples, enough for any test; limits the computing time
 
 ResidualTestKind = Literal["whiteness", "independence"]
 ResidualTestOutcome = Literal["passed", "failed", "not tested"]
@@ -223,7 +223,7 @@ def make_residual_series(
     with np.errstate(all="ignore"):  # a missing measurement, or a simulation that diverged
         error = measured - simulated
         influence = compute_influence(error, loss_scale)
-    usable_rows = np.flatnonzero(scored & np.isfinite(influence))[-_MOST_SAMPLES:]
+    usable_rows = np.flatnonzero(scored & np.isfinite(influence))[-_MAX_SAMPLES:]
     usable = np.zeros(times.size, dtype=np.bool_)
     usable[usable_rows] = True
     if correlation_time > 0:
@@ -283,8 +283,8 @@ def _correlate_series(
 
 def _explain_untestable(series: ResidualSeries) -> str:
     n = int(np.count_nonzero(series.scored))
-    if n < FEWEST_SAMPLES:
-        return f"{n} samples are too few; need {FEWEST_SAMPLES} or more"
+    if n < MIN_SAMPLES:
+        return f"{n} samples are too few; need {MIN_SAMPLES} or more"
     if (
         float(np.sqrt(np.mean(np.square(series.residual[series.scored]))))
         <= ROUNDING_SHARE * series.size

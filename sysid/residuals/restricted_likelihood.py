@@ -23,15 +23,15 @@ from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
 
-LARGEST_POLE = 0.97
+MAX_POLE = 0.97
 """Limit on an autoregressive pole: beyond, it follows a single drift (Andrews and Monahan 1992)."""
 
 _SEARCH_STARTS = ((0.6, -1.5), (1.5, 0.0))
-_MOST_EVALUATIONS = 80  # of each search
+_MAX_EVALUATIONS = 80  # of each search
 _SEARCH_TOLERANCE = 0.02  # of the likelihood, and of its two arguments
 _DIFFERENCE_STEP = 0.1  # of the two arguments, for finite differences
-_LEAST_CURVATURE = 0.05  # a flatter likelihood counts as having this curvature
-_LEAST_CHANCE = 0.05  # least p-value of the innovations for whiteness
+_MIN_CURVATURE = 0.05  # a flatter likelihood counts as having this curvature
+_MIN_CHANCE = 0.05  # least p-value of the innovations for whiteness
 
 
 class NoiseColourModel(NamedTuple):
@@ -95,7 +95,7 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
             (series,),
             method="Nelder-Mead",
             options={
-                "maxfev": _MOST_EVALUATIONS,
+                "maxfev": _MAX_EVALUATIONS,
                 "xatol": _SEARCH_TOLERANCE,
                 "fatol": _SEARCH_TOLERANCE,
             },
@@ -120,7 +120,7 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
 
 def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
     """Convert the two arguments to the pole and the share of white noise."""
-    return LARGEST_POLE * float(np.tanh(place[0])), float(expit(place[1]))
+    return MAX_POLE * float(np.tanh(place[0])), float(expit(place[1]))
 
 
 def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
@@ -164,7 +164,7 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
 def _are_white(values: FloatArray) -> bool:
     present = np.ones(values.size, dtype=np.bool_)
     spaced = SpacedResiduals(np.arange(float(values.size)), values, present, 1.0, is_regular=True)
-    return float(chdtrc(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _LEAST_CHANCE
+    return float(chdtrc(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _MIN_CHANCE
 
 
 def _compute_middle(
@@ -203,4 +203,4 @@ def _estimate_covariance(place: FloatArray, series: _ObservedSeries) -> FloatArr
     straight = [evaluate(step) - 2.0 * centre + evaluate(-step) for step in (first, second)]
     curvature = np.array([[straight[0], mixed], [mixed, straight[1]]]) / _DIFFERENCE_STEP**2
     size, rows = np.linalg.eigh(curvature)
-    return np.asarray((rows / np.maximum(size, _LEAST_CURVATURE)) @ rows.T)
+    return np.asarray((rows / np.maximum(size, _MIN_CURVATURE)) @ rows.T)

@@ -44,9 +44,9 @@ DAMPING_FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
 EARLY_DAMPING = 1.0  # far from a minimum, where a full step would leave the bounds
 EARLY_PLACES = 4  # random points: an early random search starts from the best of them
-LONGEST_GROWTH = 4.0  # doublings
+MAX_GROWTH_DOUBLINGS = 4.0  # doublings
 N_GROWTHS = 3
-MOST_SEARCH_STEPS = 12
+MAX_SEARCH_STEPS = 12
 ENOUGH_GAIN = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART_GAIN = 1e-2
 EARLY_SEARCHES = 4  # cheap local searches in immediate succession, before the long ones
@@ -112,7 +112,7 @@ def _choose_discontinuous_start(
     ):  # first the champion on the whole record: later points are drawn around it
         return 0
     if is_lost:
-        search.horizon = 0.5 ** (LONGEST_GROWTH * (1.0 + to_uniform(word[0])) / 2.0)
+        search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * (1.0 + to_uniform(word[0])) / 2.0)
         search.horizon_growth = 2.0
         return -1
     if turn % 2 == 1:
@@ -126,7 +126,7 @@ def _choose_discontinuous_start(
         search.hop_kind = UNCOUNTED_HOP + SINGLE_PARAMETER_HOP
         search.horizon = 0.5 ** (SHORT_GROWTH * to_uniform(word[0]))
         return 0
-    search.horizon = 0.5 ** (LONGEST_GROWTH * to_uniform(word[0]))
+    search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * to_uniform(word[0]))
     if to_integer(word[1], 3) > 0:
         return -1
     search.horizon_growth = 2.0 ** (0.5 ** (1 + to_integer(word[3], N_GROWTHS)))
@@ -151,7 +151,7 @@ def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchReco
     if is_settled and (chosen >= size or number % 4 == 1 or number == EARLY_SEARCHES):
         search.hop_kind = COUNTED_HOP
     elif grows:
-        search.horizon = 0.5 ** (LONGEST_GROWTH * to_uniform(word[0]))
+        search.horizon = 0.5 ** (MAX_GROWTH_DOUBLINGS * to_uniform(word[0]))
         doublings = 1.0 if number == EARLY_SEARCHES else 0.5 ** (1 + to_integer(word[3], N_GROWTHS))
         search.horizon_growth = 2.0**doublings
         # Probes fill vector elements that would be idle.
@@ -307,7 +307,7 @@ def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: Island
         if horizon == 1.0:
             search.reached_fitness = reached[best]
             _replace_individual(island, proposals[best], reached[best])
-        if reached[best] > base * (1.0 - enough) or search.step_count >= MOST_SEARCH_STEPS:
+        if reached[best] > base * (1.0 - enough) or search.step_count >= MAX_SEARCH_STEPS:
             _finish_part(evaluator, plan, island, reached[best])
         return
     search.damping *= DAMPING_FACTOR**N_TRIALS

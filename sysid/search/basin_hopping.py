@@ -37,7 +37,7 @@ from sysid.simulation.scaling import from_unit
 LINE_PLACES = 16  # points on a line: one SIMD vector
 LINE_REACH = 5.0  # standard errors to both sides, in a random direction
 _ZOOM_LEVELS = 4  # each examines a fifteenth of the last
-MOST_LINE_SIMULATIONS = _ZOOM_LEVELS * LINE_PLACES
+MAX_LINE_SIMULATIONS = _ZOOM_LEVELS * LINE_PLACES
 _JUMP_REMAINDER = 0.25  # of the difference; a smooth loss leaves less than a tenth
 _HIGH_LOSS = 4.0  # times the loss at the point: jumps to much worse losses do not matter
 
@@ -89,7 +89,7 @@ def has_discontinuity(
 ) -> bool:
     """Return whether the loss jumps on a line through a point (D,).
 
-    It takes at most `MOST_LINE_SIMULATIONS` simulations.
+    It takes at most `MAX_LINE_SIMULATIONS` simulations.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def has_discontinuity(
     return bool(upper_loss < largest_loss)
 
 
-SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
+MIN_HOP, MAX_HOP = 0.3, 50.0  # standard errors
 # Bits of a kind of hop: counted as evidence for the champion, not counted, of one parameter.
 COUNTED_HOP, UNCOUNTED_HOP, SINGLE_PARAMETER_HOP = 1, 2, 4
 SINGLE_HOP_FACTOR = 10.0  # one parameter moves so much farther, in its conditional standard errors
@@ -132,7 +132,7 @@ def hop_from_champion(evaluator: Evaluator, plan: IslandPlan, island: IslandArra
     difference = choose_difference(plan, search)
     matrix, gradient, base = build_normal_equations(evaluator, plan, point, 1.0, difference)
     word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
-    size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** to_uniform(word[0])
+    size = base * MIN_HOP * (MAX_HOP / MIN_HOP) ** to_uniform(word[0])
     factor = factor_damped(matrix, gradient, point, 0.0)
     if search.hop_kind & COUNTED_HOP:
         _probe_discontinuities(evaluator, plan, factor, base, island)
@@ -178,7 +178,7 @@ def _probe_discontinuities(
     point, search = island.point, island.search
     for line in range(1, LINES_PER_HOP + 1):
         if (
-            search.evaluations + MOST_LINE_SIMULATIONS + point.size + 1 > plan.most_evaluations
+            search.evaluations + MAX_LINE_SIMULATIONS + point.size + 1 > plan.most_evaluations
             or not np.isfinite(base)
         ):
             return

@@ -34,8 +34,8 @@ _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
 """Factors of the present damping that one batch tries; 0 means the least damping."""
 N_TRIED = _DAMPINGS.size
 """Simulations of a batch of steps; the Jacobian takes one more for each parameter."""
-_FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-11, 1e12
-_MOST_IDLE_STEPS = 2  # consecutive steps that gain almost nothing
+_FIRST, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-11, 1e12
+_MAX_IDLE_STEPS = 2  # consecutive steps that gain almost nothing
 _STEPS_PER_CALL = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
 
@@ -190,7 +190,7 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
         fill_jacobian(scored, place, descent.error, descent.columns)
         progress.has_jacobian = 1
         progress.evaluations += place.size
-    tried = np.maximum(_DAMPINGS * progress.damping, _LEAST_DAMPING)
+    tried = np.maximum(_DAMPINGS * progress.damping, _MIN_DAMPING)
     places, promised = _propose_places(descent, tried, scale)
     if promised <= tolerance * progress.loss:
         progress.has_ended = 1
@@ -200,15 +200,15 @@ def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance
     best, value = _find_best(errors, progress.loss, scale)
     if best < 0:
         progress.damping *= 1e3
-        progress.has_ended = progress.damping > _MOST_DAMPING  # the rest is rounding
+        progress.has_ended = progress.damping > _MAX_DAMPING  # the rest is rounding
         return
     gained = (progress.loss - value) / progress.loss
     place[:], descent.error[:] = places[best], errors[best]
     progress.loss, progress.has_jacobian = value, 0
     damping = tried[best] if best > 0 else progress.damping * 1e-2
-    progress.damping = min(max(damping, _LEAST_DAMPING), _MOST_DAMPING)
+    progress.damping = min(max(damping, _MIN_DAMPING), _MAX_DAMPING)
     progress.idle_steps = progress.idle_steps + 1 if gained <= tolerance else 0
-    progress.has_ended = progress.idle_steps == _MOST_IDLE_STEPS
+    progress.has_ended = progress.idle_steps == _MAX_IDLE_STEPS
 
 
 @jit_compile

@@ -13,7 +13,7 @@ from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import AT_BOUND, from_unit, to_unit
 
 _SAME_VALLEY = 1e-3  # of the range: nearer champions are in one valley
-_MOST_STEPS = 60
+_MAX_STEPS = 60
 _LONG_RECORD = 2_000_000  # measured values times parameters: above, only two starts
 _END_EVALUATIONS = 3  # simulations of a start and of an end, in addition to the steps
 
@@ -70,7 +70,7 @@ def refine_candidates(
 
 
 def refine_candidate(
-    problem: Problem, start: FloatArray, rms: float, budget: int, steps: int = _MOST_STEPS
+    problem: Problem, start: FloatArray, rms: float, budget: int, steps: int = _MAX_STEPS
 ) -> RefinedCandidate | None:
     """Refine one start (D,) with its RMS; None if `budget` does not suffice for one step."""
     if budget < start.size + N_TRIED + _END_EVALUATIONS:
@@ -97,7 +97,7 @@ def _refine_place(
     scale = max(problem.output_scale, rms)
     unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
     evaluator, rows = problem.evaluator, problem.scored_rows
-    steps = min(_MOST_STEPS, (budget - _END_EVALUATIONS) // (place.size + N_TRIED))
+    steps = min(_MAX_STEPS, (budget - _END_EVALUATIONS) // (place.size + N_TRIED))
     at_once = steps_at_once(place.size, problem.n_steps)
     solved = solve_least_squares(
         ScoredSamples(evaluator, rows, evaluator.weight[rows] / unit),

@@ -20,7 +20,7 @@ from sysid.search.state import IslandArrays, IslandPlan
 from sysid.simulation.evaluator import Evaluator, evaluate_population
 from sysid.simulation.scaling import from_unit, to_unit
 
-_LEAST_STEP_SIZE = 0.01  # of the range: a relative step can leave zero
+_MIN_STEP_SIZE = 0.01  # of the range: a relative step can leave zero
 
 
 @jit_compile
@@ -48,7 +48,7 @@ def _propose_neighbours(
         _draw_signs(plan, generation, p, signs)
         for d in range(champion.size):
             span = evaluator.upper[d] - evaluator.lower[d]
-            size = max(abs(champion[d]), _LEAST_STEP_SIZE * span) if plan.is_relative else span
+            size = max(abs(champion[d]), _MIN_STEP_SIZE * span) if plan.is_relative else span
             theta[p, d] = champion[d] + signs[d] * plan.beta * size
     return theta
 

@@ -27,10 +27,10 @@ from sysid.selection.regression import BLOCK_ROWS, find_lag_parameters, fold_row
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 
-MOST_SLOPES = 40_000_000
+MAX_SLOPES = 40_000_000
 """Limit on samples times candidates: 320 MB."""
 
-_MOST_ROUNDS = 6
+_MAX_ROUNDS = 6
 _BATCH_SIZE = 16  # simulations that a kernel runs in parallel
 _DIFFERENCE_STEP = 1e-6  # of a coefficient's range
 
@@ -62,7 +62,7 @@ def select_by_free_run(
     Raises
     ------
     InvalidSettings
-        If samples times candidates exceed `MOST_SLOPES`.
+        If samples times candidates exceed `MAX_SLOPES`.
     """
     candidates = replace(model, rule=None, selection=Selection((), lags))
     whole = Problem.build(candidates, records, parameters=changes, skip=skip)
@@ -71,7 +71,7 @@ def select_by_free_run(
     best_value: tuple[float, ...] = (np.inf,)
     power = _compute_output_power(whole)
     tried: set[frozenset[int]] = set()
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         if frozenset(chosen) in tried:
             break
         tried.add(frozenset(chosen))
@@ -97,11 +97,11 @@ def _compute_output_power(problem: Problem) -> float:
 
 def _check_size(problem: Problem) -> None:
     terms = len(problem.model.terms)
-    if problem.n_scored * terms > MOST_SLOPES:
+    if problem.n_scored * terms > MAX_SLOPES:
         raise InvalidSettings(
             "/model/terms/error",
             f"{terms} candidates on {problem.n_scored} samples are too many to select by the "
-            f"simulation. Use at most {MOST_SLOPES // terms} samples, or error: one-step",
+            f"simulation. Use at most {MAX_SLOPES // terms} samples, or error: one-step",
         )
 
 

@@ -19,10 +19,10 @@ from sysid.models.model import TermRule
 
 _DEPENDENT_SHARE = 1e-20  # of a column's squares: less is rounding, the column is dependent
 _EXPLAINED_SHARE = 1e-24  # of the output's squares: less is rounding, the output is explained
-_LEAST_GAIN = 1e-6  # of the unexplained squares: an exchange must gain as much
-_MOST_ROUNDS = 20
-_MOST_BACKWARD = 120  # limit on the terms of a backward selection
-_MOST_OPERATIONS = 4e9  # of all exchanges together, about
+_MIN_GAIN = 1e-6  # of the unexplained squares: an exchange must gain as much
+_MAX_ROUNDS = 20
+_MAX_BACKWARD_TERMS = 120  # limit on the terms of a backward selection
+_MAX_OPERATIONS = 4e9  # of all exchanges together, about
 
 
 class ForwardSelection(NamedTuple):
@@ -114,7 +114,7 @@ def exchange_terms(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...
     squares = np.sum(np.square(triangle[:, :-1]), axis=0)
     floor = _EXPLAINED_SHARE * float(triangle[:, -1] @ triangle[:, -1])
     one_round = 4 * max(len(chosen), 1) ** 2 * triangle.shape[1] ** 2
-    for _ in range(min(_MOST_ROUNDS, int(_MOST_OPERATIONS / one_round))):
+    for _ in range(min(_MAX_ROUNDS, int(_MAX_OPERATIONS / one_round))):
         before = least
         for position in range(len(chosen)):
             others = chosen[:position] + chosen[position + 1 :]
@@ -125,7 +125,7 @@ def exchange_terms(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...
             if better is None or better == chosen[position] or least <= floor:
                 continue
             value = _compute_unexplained(triangle, [*others, better])
-            if value < (1.0 - _LEAST_GAIN) * least:
+            if value < (1.0 - _MIN_GAIN) * least:
                 chosen[position], least = better, value
         if least == before:
             break
@@ -192,8 +192,10 @@ def select_terms(triangle: FloatArray, rule: TermRule, samples: int) -> ForwardS
     if not rule.exchange:
         selection = select_forward(triangle, rule.keep, rule.err)
         return selection.keep_first(_count_terms(selection.unexplained_shares, rule, samples))
-    taken = select_forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MOST_BACKWARD))).order
-    backward_sets = select_backward(triangle, taken) if len(taken) <= _MOST_BACKWARD else {}
+    taken = select_forward(
+        triangle, min(2 * rule.keep + 2, max(rule.keep, _MAX_BACKWARD_TERMS))
+    ).order
+    backward_sets = select_backward(triangle, taken) if len(taken) <= _MAX_BACKWARD_TERMS else {}
     sets = [
         [taken[:k], backward_sets.get(k, taken[:k])]
         for k in range(1, min(rule.keep, len(taken)) + 1)

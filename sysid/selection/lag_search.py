@@ -19,11 +19,11 @@ from sysid.selection.regression import find_lag_parameters
 
 _FULL_SEARCH = 4_000  # combinations: up to here all are tried, if their cost allows
 _READ_COST = 150.0  # operations equivalent to computing one value of a column
-_FEWEST_TRIALS = 60
+_MIN_TRIALS = 60
 _COARSE_SHARE = 0.1  # share of the trials that the coarse grid may take
-_MOST_OPERATIONS = 4e9  # of all trials together, about
+_MAX_OPERATIONS = 4e9  # of all trials together, about
 _DESCENTS = 3
-_MOST_ROUNDS = 6
+_MAX_ROUNDS = 6
 
 LagScore = Callable[[Mapping[str, float]], float]
 
@@ -88,12 +88,10 @@ def plan_effort(values: Mapping[str, Sequence[float]], terms: int) -> SearchEffo
     """Plan the effort so that all trials together stay cheap."""
     least_rows = max(5 * terms, 500)
     cost_per_row = 2.0 * (terms + 1) ** 2 + _READ_COST * (terms + 1)
-    trials = int(
-        min(max(_MOST_OPERATIONS / (cost_per_row * least_rows), _FEWEST_TRIALS), _FULL_SEARCH)
-    )
+    trials = int(min(max(_MAX_OPERATIONS / (cost_per_row * least_rows), _MIN_TRIALS), _FULL_SEARCH))
     expected = min(trials, prod(len(axis) for axis in values.values()))
     return SearchEffort(
-        trials, max(least_rows, int(_MOST_OPERATIONS / (cost_per_row * max(expected, 1))))
+        trials, max(least_rows, int(_MAX_OPERATIONS / (cost_per_row * max(expected, 1))))
     )
 
 
@@ -116,9 +114,7 @@ def search_lags(
         for point in product(*(range(size) for size in sizes)):
             evaluate(point)
     else:
-        coarse = product(
-            *_choose_coarse_grid(sizes, max(_COARSE_SHARE * trials, _FEWEST_TRIALS / 2))
-        )
+        coarse = product(*_choose_coarse_grid(sizes, max(_COARSE_SHARE * trials, _MIN_TRIALS / 2)))
         for point in islice(coarse, trials):  # with many lags, even two values each are too many
             evaluate(point)
         for start in sorted(scores, key=lambda p: (scores[p], p))[:_DESCENTS]:
@@ -146,7 +142,7 @@ def _descend_axes(
     is_over: Callable[[], bool],
 ) -> None:
     """Minimise along one axis after the other until there is no improvement."""
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         before = point
         for axis, size in enumerate(sizes):
             reach = max(1, size // 64)

@@ -27,9 +27,9 @@ from sysid.simulation.problem import Problem
 _RIDGES = (1e-8, 1e-6, 1e-4, 1e-2)  # of the sum of squares of a scaled column, which is 1
 _TERM_COUNTS = (1, 2, 3, 4, 6, 9, 13, 20, 32, 64)  # terms of the nested solutions
 _LAG_COMBINATIONS = 6  # combinations of the lags
-_MOST_ITERATIONS = 4  # of the simulated past values
+_MAX_ITERATIONS = 4  # of the simulated past values
 _ITERATED_STARTS = 2  # starts of these iterations
-_MOST_OPERATIONS = 1e9  # of one decomposition, about
+_MAX_OPERATIONS = 1e9  # of one decomposition, about
 _DIVERGENCE_LIMIT = 1e6  # of the output's standard deviation
 _BUDGET_SHARE = 4  # all starts take at most one in so many simulations of a budget
 
@@ -104,7 +104,7 @@ class _StartFinder:
             if t.coefficient_name in fixed
         }
         self._free = [i for i in range(len(self._terms)) if i not in self._fixed]
-        rows = int(_MOST_OPERATIONS / (2 * (2 * len(self._terms) + 1) ** 2))
+        rows = int(_MAX_OPERATIONS / (2 * (2 * len(self._terms) + 1) ** 2))
         self._rows = self._regression.thin_rows(max(rows, 20 * len(self._terms)))
 
     def find_starts(self) -> SearchStarts:
@@ -195,7 +195,7 @@ class _StartFinder:
         """Iterate solutions with simulated past values from a start, while they gain."""
         lags, size = start[0], len(self._terms)
         best, starts = np.inf, []
-        for _ in range(_MOST_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             simulated = self._simulate_start(start)
             if simulated is None:
                 break

@@ -28,7 +28,7 @@ from sysid.simulation.packing import (
 )
 
 # Weights outside this range are mistakes. Squares of weighted residuals could overflow.
-_LEAST_WEIGHT, _MOST_WEIGHT = 1e-100, 1e100
+_MIN_WEIGHT, _MAX_WEIGHT = 1e-100, 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +72,8 @@ def compute_output_weights(
             raise InvalidSettings(
                 f"/weights/{name}", f"the model has no output {name!r}{suggest_name(name, names)}"
             )
-        if not _LEAST_WEIGHT <= weight <= _MOST_WEIGHT:
-            need = f"need a number from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}"
+        if not _MIN_WEIGHT <= weight <= _MAX_WEIGHT:
+            need = f"need a number from {_MIN_WEIGHT:g} to {_MAX_WEIGHT:g}"
             raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a weight; {need}")
     if len(names) == 1:
         return {names[0]: 1.0}

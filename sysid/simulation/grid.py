@@ -13,7 +13,7 @@ from sysid.data.records import Channel
 from sysid.kernels.reads import is_difference
 from sysid.models.model import Model
 
-MOST_STEPS = 20_000_000
+MAX_STEPS = 20_000_000
 """Limit on the integration steps of one experiment."""
 
 _JITTER = 0.05  # of a sampling period: tolerated by a recursion
@@ -155,9 +155,9 @@ def _estimate_period(channel: Channel) -> float | None:
 
 
 def _check_length(steps: float) -> None:
-    if steps > MOST_STEPS:
+    if steps > MAX_STEPS:
         raise InvalidSettings(
             "/model/solver/step",
-            f"the simulation needs {steps:.3g} steps, but the limit is {MOST_STEPS:g}. "
+            f"the simulation needs {steps:.3g} steps, but the limit is {MAX_STEPS:g}. "
             "Set a longer step or cut the record",
         )

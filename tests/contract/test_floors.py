@@ -113,7 +113,7 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
 
 
 def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatch):
-    monkeypatch.setattr(cramer_rao, "MOST_PROBLEMS", 2)
+    monkeypatch.setattr(cramer_rao, "MAX_PROBLEMS", 2)
     (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
     (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
     assert [len(job.floors["problems"]) for job in (few, many)] == [2, 2]

@@ -121,7 +121,7 @@ def test_a_child_that_was_at_work_is_started_again_without_waiting_longer_each_t
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervision, "FIRST_PAUSE_SECONDS", 0.02)
-    monkeypatch.setattr(supervision, "LONGEST_PAUSE_SECONDS", 600.0)
+    monkeypatch.setattr(supervision, "MAX_PAUSE_SECONDS", 600.0)
     monkeypatch.setattr(supervision, "LIVED_SECONDS", 0.0)
     file = tmp_path / "pids"
     leave = f"os._exit({supervision.RESTART_EXIT_CODE})"

@@ -220,7 +220,7 @@ def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
     reference = run_at(served, served.job, 2.0)
     job = batch_of(served.server, served.parts, batch=batch, reference=reference)
-    monkeypatch.setattr("service.trends.trend.MOST_RUNS", 3)
+    monkeypatch.setattr("service.trends.trend.MAX_RUNS", 3)
     found = trend(served, job)
     (note,) = found["notes"]
     assert "has 4 runs" in note

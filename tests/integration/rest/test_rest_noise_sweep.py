@@ -131,7 +131,7 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     # 300 samples of two channels
-    monkeypatch.setattr("service.sweeps.output_spread.MOST_READ_VALUES", 599)
+    monkeypatch.setattr("service.sweeps.output_spread.MAX_READ_VALUES", 599)
     monkeypatch.setattr("service.sweeps.output_spread.load_recording", None)
     (fault,) = refused(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"

@@ -119,7 +119,7 @@ def test_a_profile_that_cannot_be_had_is_refused(
     monkeypatch.setattr(service.runs.profiles, "LIMIT_SECONDS", -1.0)
     fault = refused(served.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
     assert "were stopped at 'L'" in fault["detail"]
-    monkeypatch.setattr(service.runs.profiles, "MOST_WORK", 10)
+    monkeypatch.setattr(service.runs.profiles, "MAX_WORK", 10)
     fault = refused(served.server.post(url, json={}), 422, "invalid")[0]
     assert "need at most 10" in fault["detail"]
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from tests.simulated_executor import Theatre
 from workers.fair_share import (
     HEADSTART_SECONDS,
-    LONGEST_WAIT_INTERVAL,
     MAX_ABSENT_PROJECTS,
     MAX_SAVED_SECONDS,
+    WAIT_TURN_INTERVAL,
     FairShare,
 )
 from workers.packing import PACK_SECONDS, PACKS_PER_CPU
@@ -33,7 +33,7 @@ def test_sweeps_delay_a_single_identification_by_two_seconds_at_most(
     theatre.play((HEADSTART_SECONDS + 5.0) * sweeps / slots)
     theatre.add("single", 1, seconds)
     # One core alone gives every sixteenth pack to the patient; more cores lose nothing by it.
-    patient = seconds / (LONGEST_WAIT_INTERVAL - 1) if slots == 1 else 0.0
+    patient = seconds / (WAIT_TURN_INTERVAL - 1) if slots == 1 else 0.0
     assert theatre.until("single") <= seconds + patient + DELAY_SECONDS
 
 
@@ -158,7 +158,7 @@ def test_a_higher_priority_goes_first_and_the_lower_one_still_gets_its_sixteenth
     before = theatre.had("low")
     theatre.play(160.0)
     part = (theatre.had("low") - before) / 320.0
-    assert part == pytest.approx(1 / LONGEST_WAIT_INTERVAL, rel=0.25)
+    assert part == pytest.approx(1 / WAIT_TURN_INTERVAL, rel=0.25)
 
 
 def test_a_priority_beats_even_a_new_identification_of_a_lower_one() -> None:
@@ -181,7 +181,7 @@ def test_nobody_starves_under_a_stream_of_new_jobs() -> None:
             number += 1
             theatre.add(f"new{number}", 1, 1.0)
         theatre.step()
-    assert theatre.had("sweep") - before >= 0.8 * 160.0 / LONGEST_WAIT_INTERVAL
+    assert theatre.had("sweep") - before >= 0.8 * 160.0 / WAIT_TURN_INTERVAL
 
 
 def test_a_project_takes_no_more_cores_than_it_may() -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.dispatch.warm_starts import MOST_OPEN_CHAINS, OpenChains
+from service.dispatch.warm_starts import MAX_OPEN_CHAINS, OpenChains
 from service.jobs.warm_start_order import ChainLayout
 
 SHAPES = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
@@ -118,4 +118,4 @@ def test_chains_are_opened_as_runs_are_wanted_and_never_all_at_once(chain: Chain
     out = 64
     while numbers := chains.take_ready(64, 100_000):
         out += len(numbers)
-    assert out == MOST_OPEN_CHAINS
+    assert out == MAX_OPEN_CHAINS

@@ -161,7 +161,7 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
     y = np.concatenate([np.zeros(lag), u[:-lag]])
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
     (every,) = estimate_onset_delays(load_model("fopdt"), (record,))
-    monkeypatch.setattr(onset_delay, "_MOST_EVENTS", 40)
+    monkeypatch.setattr(onset_delay, "_MAX_EVENTS", 40)
     (some,) = estimate_onset_delays(load_model("fopdt"), (record,))
     assert every.events > 150
     assert 20 < some.events <= 40
@@ -169,7 +169,7 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
 
 
 def test_of_a_square_wave_both_edges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onset_delay, "_MOST_EVENTS", 40)
+    monkeypatch.setattr(onset_delay, "_MAX_EVENTS", 40)
     times, falls = 0.1 * np.arange(79 * 30 + 20), np.arange(79) % 2 == 1
     u, y = np.zeros(times.size), np.zeros(times.size)
     for event, does_fall in enumerate(falls):
