@@ -1,5 +1,6 @@
 """Small problems and comparisons for the tests of the search."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -42,6 +43,14 @@ def noisy(model: str = "duffing-eq16", n: int = 300, sd: float = 0.01, seed: int
 def example(model: str = "duffing-eq16", n: int = 300, sd: float = 0.01, seed: int = 0) -> Problem:
     """The paper's Example 1 or 2."""
     return Problem.build(load_model(model), [record(noisy(model, n, sd, seed))])
+
+
+def with_search(island: Island, **fields: float) -> Island:
+    """The same island with other values in its search record."""
+    search = island.search.copy()
+    for name, value in fields.items():
+        search[name] = value
+    return replace(island, search=search)
 
 
 def bits(state: RunState | Island) -> tuple[object, ...]:

@@ -1,21 +1,23 @@
-"""Just-in-time compilation with a disk cache that any change of the sources invalidates.
+"""Just-in-time compilation with a disk cache that a change of the sources invalidates.
 
 Numba's own cache keys a function by its own file only. A compiled function contains the functions
 that it calls. After an update of another file the old machine code would silently run on. Here
-the key holds a digest of all files with compiled functions. The code is stored with the kernels
-(`sysid.core.code_cache`): private, atomically written, with a digest.
+the key holds a digest of all files that the function's module imports, directly or through
+others. The code is stored with the kernels (`sysid.core.code_cache`): private, atomically
+written, with a digest.
 
 The cache uses internals of Numba. If these are not as expected, functions are compiled without a
 cache and a warning is logged.
 """
 
 import pickle
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import llvmlite
 import numba
@@ -49,18 +51,86 @@ _CACHE_ERRORS = (
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _digest_sources() -> str:
+# Two patterns that begin with plain text: one with `^` would take ten times as long.
+_IMPORTS = re.compile(rb"from (sysid[\w.]*)"), re.compile(rb"import (sysid[\w.]*)")
+
+
+class Source(NamedTuple):
+    """A file with compiled functions, or with values that they take.
+
+    Attributes
+    ----------
+    digest : str
+    imports : frozenset of str
+        The modules and packages of sysid that it names after `from` or `import`.
+    """
+
+    digest: str
+    imports: frozenset[str]
+
+
+class Sources:
+    """Sources of all compiled functions at one moment, by the names of their modules."""
+
+    def __init__(self, modules: Mapping[str, Source]) -> None:
+        self.modules = modules
+        self._packages = {name.rpartition(".")[0] for name in modules}
+        self._digests: dict[str, str] = {}
+
+    def find_imported(self, module: str) -> set[str]:
+        """Find a module and all that it imports, directly or through others.
+
+        Of a named package all modules count. A module outside of the sources may import any.
+        """
+        if module not in self.modules:
+            return set(self.modules)
+        imported, waiting = {module}, [module]
+        while waiting:
+            named = set().union(*map(self._list_modules, self.modules[waiting.pop()].imports))
+            waiting += named - imported
+            imported |= named
+        return imported
+
+    def _list_modules(self, name: str) -> set[str]:
+        """List the modules that the name of a module or package stands for."""
+        if name in self._packages:
+            return {m for m in self.modules if f"{m}.".startswith(f"{name}.")}
+        return {name} & self.modules.keys()
+
+    def compute_digest(self, module: str) -> str:
+        """Compute the digest of a module and all that it imports."""
+        if module not in self._digests:
+            parts = [(m, self.modules[m].digest) for m in sorted(self.find_imported(module))]
+            self._digests[module] = sha256(repr(parts).encode()).hexdigest()
+        return self._digests[module]
+
+
+def read_sources() -> Sources:
+    """Read the sources of all compiled functions.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
     package = Path(__file__).parents[1]
-    return digest_files((f for pattern in _SOURCE_PATTERNS for f in package.glob(pattern)), package)
+    modules = {}
+    for path in (f for pattern in _SOURCE_PATTERNS for f in package.glob(pattern)):
+        parts = path.relative_to(package.parent).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        content = path.read_bytes()
+        imports = {match.decode() for pattern in _IMPORTS for match in pattern.findall(content)}
+        modules[name] = Source(sha256(content).hexdigest(), frozenset(imports))
+    return Sources(modules)
 
 
-# Computed before any module with a compiled function is loaded: all of them import this one.
-_SOURCES_DIGEST = _digest_sources()
+# Read before any module with a compiled function is loaded: all of them import this one.
+_SOURCES = read_sources()
 
 
-def get_sources_digest() -> str:
-    """Return the digest of the sources of all compiled functions at the start of this process."""
-    return _SOURCES_DIGEST
+def get_sources_digest(module: str) -> str:
+    """Return the digest of what a module imports, as it was at the start of this process."""
+    return _SOURCES.compute_digest(module)
 
 
 @cache
@@ -79,6 +149,7 @@ class _FunctionCache:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._code = function.__code__
+        self._module = function.__module__
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._source = _digest_file(self._code.co_filename)
 
@@ -98,7 +169,7 @@ class _FunctionCache:
         process may have loaded some of them before the update and some after it.
         """
         try:
-            if _digest_sources() != _SOURCES_DIGEST:
+            if read_sources().modules != _SOURCES.modules:
                 warn_not_cached(f"{self._name}: sources have changed since this process began")
             elif not compiled_.library.has_dynamic_globals:
                 store_code(
@@ -116,7 +187,7 @@ class _FunctionCache:
         if self._source is None:
             raise OSError(f"{self._code.co_filename} cannot be read")
         parts = (
-            get_sources_digest(),
+            get_sources_digest(self._module),
             _VERSIONS,
             target_context.codegen().magic_tuple(),
             self._name,

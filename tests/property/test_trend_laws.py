@@ -106,6 +106,16 @@ def test_the_line_and_its_covariance_are_those_of_the_textbook() -> None:
     assert told["a"][1] == pytest.approx(law.error_factor * covariance[1, 1] ** 0.5)
 
 
+def test_the_errors_of_a_power_law_are_those_of_its_slopes() -> None:
+    x, y, stderr = noisy(3)
+    law = fit_power(x, y, stderr)
+    assert law is not None
+    (_, a, a_error), (_, b, b_error) = law.coefficients
+    slopes = np.column_stack([x**b, a * x**b * np.log(x)]) / stderr[:, None]
+    expected = law.error_factor * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    assert [a_error, b_error] == pytest.approx(expected.tolist(), rel=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_no_neighbour_of_the_power_law_is_better(seed: int) -> None:
     x, y, stderr = noisy(seed)
@@ -223,6 +233,80 @@ def test_means_of_several_runs_carry_the_scatter_between_them() -> None:
         (TrendEstimate(1.0, pytest.approx(0.1)),),
         1.0,
     )
+
+
+def test_runs_that_agree_by_luck_keep_their_stated_errors() -> None:
+    groups = [[TrendEstimate(1.0, 0.1), TrendEstimate(1.02, 0.1)], [TrendEstimate(3.0, 0.2)]]
+    means, ratio = pool_estimates(groups)
+    assert ratio == pytest.approx(0.02 / (0.1 * 2**0.5))  # one degree of freedom of two runs
+    assert [mean.value for mean in means] == pytest.approx([1.01, 3.0])
+    assert [mean.stderr for mean in means] == pytest.approx([0.1 / 2**0.5, 0.2])
+
+
+def test_scatter_has_one_degree_of_freedom_less_than_runs_at_each_label() -> None:
+    groups = [[TrendEstimate(value, 0.1) for value in values] for values in ([1, 2, 3], [5, 5.6])]
+    means, ratio = pool_estimates(groups)
+    assert ratio == pytest.approx(((2.0 + 0.18) / 0.01 / 3) ** 0.5)
+    errors = [ratio * 0.1 / 3**0.5, ratio * 0.1 / 2**0.5]
+    assert [mean.stderr for mean in means] == pytest.approx(errors)
+
+
+def test_points_that_lie_on_a_law_by_luck_keep_its_stated_errors() -> None:
+    stderr = np.full(5, 0.5)
+    lucky = fit_line(X, 0.3 * X + 1.0 + 0.01 * np.array([1, -1, 0, 1, -1]), stderr)
+    assert lucky is not None
+    assert lucky.birge_ratio < 0.1
+    covariance = np.linalg.inv(
+        np.column_stack([np.ones(5), X]).T @ np.column_stack([np.ones(5), X])
+    )
+    (_, _, a), (_, _, b) = lucky.coefficients
+    assert [a, b] == pytest.approx((0.5 * np.sqrt(np.diag(covariance))).tolist())
+    told = prediction(lucky, X, stderr, 20.0)
+    assert told.stderr == pytest.approx(float(np.hypot(lucky.evaluate_stderr(X[2:3])[0], 0.5)))
+    assert told.upper - told.value == pytest.approx(stats.norm.ppf(0.975) * told.stderr)
+
+
+def test_where_errors_are_understated_an_interval_is_that_of_student_and_of_the_scatter() -> None:
+    stderr = np.full(5, 0.01)
+    law = fit_line(X, 0.3 * X + 1.0 + 0.2 * np.array([1, -1, 0, 1, -1]), stderr)
+    assert law is not None
+    assert law.birge_ratio > 5
+    for at in (5.0, 30.0, 200.0):
+        told = prediction(law, X, stderr, at)
+        own = float(np.hypot(law.evaluate_stderr(np.array([at]))[0], 0.01))
+        assert told.stderr == pytest.approx(law.birge_ratio * own)
+        half = stats.t.ppf(0.975, 3) * told.stderr
+        assert (told.lower, told.upper) == pytest.approx((told.value - half, told.value + half))
+        assert told.is_outside is (at > 80.0)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_drift_from_a_law_that_scatters_little_counts_the_new_estimates_own_error(
+    direction: float,
+) -> None:
+    """The batch is exact, the new estimate is not: two of its own errors are no drift."""
+    stderr = np.full(5, 0.001)
+    law = fit_line(X, 0.3 * X + 1.0, stderr)
+    assert law is not None
+    for size, drifted in ((2.0, False), (3.1, True)):
+        new = TrendEstimate(0.3 * 20.0 + 1.0 + direction * size * 0.1, 0.1)
+        found = drift_from_law(new, law, X, stderr, 20.0)
+        assert found.z == pytest.approx(direction * size, rel=1e-3)
+        assert found.has_drifted is drifted
+        from_run = compute_drift(new, TrendEstimate(7.0, 1e-9))
+        assert (from_run.z, from_run.has_drifted) == (pytest.approx(direction * size), drifted)
+
+
+def test_of_batches_without_an_outlier_five_percent_are_told_of_one() -> None:
+    """A rate of batches, not of points; the stated errors are far too small to explain any."""
+    batches, flagged = 600, 0
+    draw = np.random.default_rng(21)
+    x = np.arange(1.0, 13.0)
+    for _ in range(batches):
+        y = 2.0 + 0.5 * x + draw.normal(size=12)
+        flagged += any(one.is_outlier for one in fit_trend_by_line(x, y, np.full(12, 1e-3)))
+    deviation = (0.05 * 0.95 / batches) ** 0.5
+    assert abs(flagged / batches - 0.05) <= 3 * deviation
 
 
 def test_drift_is_flagged_beyond_three_standard_errors() -> None:

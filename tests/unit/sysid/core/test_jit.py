@@ -7,25 +7,27 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 from numba.core.compiler import CompileResult
 from numba.core.runtime import nrt
 from packaging.requirements import Requirement
 
 from sysid.core import code_cache, jit
+from sysid.search import levenberg_marquardt
 
 ROOT = Path(jit.__file__).parents[2]
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from sysid.core import jit
-jit.get_sources_digest = lambda: sys.argv[2]
+jit.get_sources_digest = lambda module: sys.argv[2]
 from module import doubled
 print(doubled(2.0), sum(doubled.stats.cache_hits.values()))
 """
@@ -76,13 +78,11 @@ class Names:
                     self.made[name] = what_is_compiled(node.value)
 
 
-def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
-    """Modules that compiled functions come from or take values from, however indirectly."""
-    known = {path: Names(path) for path in modules}
+def list_frozen(known: dict[Path, Names], module: Path) -> set[Path]:
+    """Modules that compiled functions of a module come from or take values from."""
     waiting = [
-        (path, name)
-        for path, names in known.items()
-        for name, node in names.made.items()
+        (module, name)
+        for name, node in known[module].made.items()
         if isinstance(node, ast.FunctionDef) and is_compiled(node)
     ]
     seen: set[tuple[Path, str]] = set()
@@ -116,13 +116,73 @@ def names_in(node: ast.AST) -> set[str]:
     return {one.id for part in parts for one in ast.walk(part) if isinstance(one, ast.Name)}
 
 
-def test_the_fingerprint_covers_all_that_compiled_functions_take_values_from() -> None:
-    package = ROOT / "sysid"
-    covered = {path for pattern in jit._SOURCE_PATTERNS for path in package.glob(pattern)}
-    frozen = frozen_by_compiled(package.rglob("*.py"))
-    assert {package / "kernels" / "layout.py", package / "search" / "state.py"} <= frozen
-    assert frozen <= covered
-    assert len(jit.get_sources_digest()) == 64
+def name_module(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def test_the_key_covers_all_that_compiled_functions_take_values_from() -> None:
+    package, sources = ROOT / "sysid", jit.read_sources()
+    known = {path: Names(path) for path in package.rglob("*.py")}
+    frozen = {path: list_frozen(known, path) for path in known}
+    assert {package / "kernels" / "layout.py", package / "search" / "state.py"} <= frozen[
+        package / "search" / "evolution.py"
+    ]
+    compiled = [path for path, others in frozen.items() if others]
+    assert len(compiled) > 15
+    for path in compiled:
+        assert name_module(path) in sources.modules
+        needed = {name_module(other) for other in frozen[path]}
+        assert needed <= sources.find_imported(name_module(path))
+
+
+def test_imports_are_followed_and_a_package_stands_for_all_its_modules() -> None:
+    def source(*imports: str) -> jit.Source:
+        return jit.Source("digest", frozenset(imports))
+
+    sources = jit.Sources(
+        {
+            "sysid.a": source(),
+            "sysid.a.first": source("sysid.a.second", "sysid.core.types"),
+            "sysid.a.second": source("sysid.b.first"),
+            "sysid.a.secondary": source(),
+            "sysid.b": source(),
+            "sysid.b.first": source("sysid.a.first"),
+            "sysid.b.package": source("sysid.a"),
+            "sysid.b.all": source("sysid"),
+        }
+    )
+    circle = {"sysid.a.first", "sysid.a.second", "sysid.b.first"}
+    assert sources.find_imported("sysid.a.first") == circle
+    assert sources.find_imported("sysid.a.secondary") == {"sysid.a.secondary"}
+    package = circle | {"sysid.a", "sysid.a.secondary", "sysid.b.package"}
+    assert sources.find_imported("sysid.b.package") == package
+    assert sources.find_imported("sysid.b.all") == set(sources.modules)
+    assert sources.find_imported("somewhere.else") == set(sources.modules)
+
+
+def edit(monkeypatch: pytest.MonkeyPatch, module: str) -> None:
+    """Go on as a process that was started after an edit of a module."""
+    modules = dict(jit.read_sources().modules)
+    modules[module] = modules[module]._replace(digest="of another version")
+    monkeypatch.setattr(jit, "_SOURCES", jit.Sources(modules))
+    monkeypatch.setattr(jit, "read_sources", lambda: jit.Sources(modules))
+
+
+def test_an_edit_makes_the_code_of_importing_modules_invalid_and_no_other(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    multiply: Any = levenberg_marquardt.compute_inner_product
+
+    def count_hits() -> int:
+        copy: Any = jit.jit_compile(multiply.py_func)
+        assert copy(np.ones(1), np.ones(1), 1) == 1.0
+        return sum(copy.stats.cache_hits.values())
+
+    assert [count_hits(), count_hits()] == [0, 1]
+    edit(monkeypatch, "sysid.islands.evolve")
+    assert count_hits() == 1
+    edit(monkeypatch, "sysid.simulation.loss")
+    assert [count_hits(), count_hits()] == [0, 1]
 
 
 @pytest.mark.slow

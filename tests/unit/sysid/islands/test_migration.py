@@ -1,23 +1,46 @@
 """Topologies, and what migration may and may not do."""
 
+from dataclasses import replace
+from itertools import groupby
+
 import numpy as np
 import pytest
 
-from sysid.core.settings import TOPOLOGIES, GeneticAlgorithm, Migration, TopologyName
-from sysid.identification.run import advance_run, begin_run
+from sysid.core.settings import (
+    TOPOLOGIES,
+    GeneticAlgorithm,
+    IslandChange,
+    Migration,
+    TopologyName,
+)
+from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.migration import migrate
 from sysid.islands.topology import CONNECTIONS, list_edges
-from sysid.search.island import split_population
-from tests.searching import bits, example
+from sysid.search.island import Island, evolve, split_population
+from sysid.search.operators import decode
+from sysid.search.state import IslandPlan
+from sysid.simulation.scaling import from_unit
+from tests.searching import bits, example, with_search
 
 ALGORITHM = GeneticAlgorithm(
     method="simple", population=26, islands=4, generations=3, migration=Migration(every=100)
 )
+UNEQUAL = replace(ALGORITHM, islands=tuple(IslandChange(bits=count) for count in (24, 12, 20, 12)))
 
 
-def islands() -> tuple:  # type: ignore[type-arg]
+def evolved(algorithm: GeneticAlgorithm) -> tuple[tuple[Island, ...], tuple[IslandPlan, ...]]:
+    """Islands after some generations without migration, and their plans."""
     problem = example(n=80)
-    return advance_run(problem, ALGORITHM, begin_run(problem, ALGORITHM, 4)).islands
+    plans = make_plans(problem, algorithm, 4)
+    created = create_islands(problem, algorithm, 4)
+    return tuple(
+        evolve(problem.evaluator, plan, island, algorithm.generations)
+        for plan, island in zip(plans, created, strict=True)
+    ), plans
+
+
+def islands() -> tuple[Island, ...]:
+    return evolved(ALGORITHM)[0]
 
 
 def test_topologies_connect_as_named() -> None:
@@ -61,12 +84,80 @@ def test_unconnected_migration_is_the_identity() -> None:
 def test_migrants_are_copies_of_the_best_before_the_exchange() -> None:
     before = islands()
     after, log = migrate(before, (24,) * 4, Migration(migrants=2), 7)
+    assert len(log) >= 3
+    for source, lines in groupby(log, key=lambda line: line.source):
+        sent = list(lines)
+        assert {(line.epoch, line.destination) for line in sent} == {(7, (source + 1) % 4)}
+        best = before[source].fitness[:2].tolist()
+        assert [line.fitness for line in sent] in (best, best[:1], best[1:])
+        for line in sent:
+            word = before[source].chromosomes[before[source].fitness.tolist().index(line.fitness)]
+            arrived = after[line.destination]
+            here = np.all(arrived.chromosomes == word, axis=1)
+            assert arrived.fitness[here].tolist() == [line.fitness]
+
+
+def test_a_champion_travels_one_connection_in_an_exchange() -> None:
+    before = sorted(islands(), key=lambda island: island.champion_rms)
+    assert len({island.champion_rms for island in before}) == 4
+    after, _ = migrate(before, (24,) * 4, Migration(migrants=1), 0)
+    for source, destination in zip(before[:-1], after[1:], strict=True):
+        assert np.array_equal(destination.chromosomes[0], source.chromosomes[0])
+        assert destination.champion_rms == source.champion_rms
+        assert destination.history[-1].parameters == source.history[-1].parameters
+    assert after[0].history == before[0].history
+
+
+@pytest.mark.parametrize("algorithm", [ALGORITHM, UNEQUAL], ids=["equal", "unequal"])
+@pytest.mark.parametrize("name", sorted(set(TOPOLOGIES) - {"unconnected"}))
+def test_after_an_exchange_fitness_is_that_of_the_chromosome(
+    algorithm: GeneticAlgorithm, name: TopologyName
+) -> None:
+    """Islands of unequal bits round migrants, so these are evaluated where they arrive."""
+    problem = example(n=80)
+    before, plans = evolved(algorithm)
+    after, log = migrate(
+        before, [plan.bits for plan in plans], Migration(topology=name, migrants=2), 0
+    )
     assert log
-    for line in log:
-        assert line.epoch == 7
-        assert line.destination == (line.source + 1) % 4
-        assert line.fitness in before[line.source].fitness[:2]
-        assert line.fitness in after[line.destination].fitness
+    waiting = 0
+    for island, plan in zip(after, plans, strict=True):
+        theta = from_unit(problem.evaluator, decode(island.chromosomes, plan.bits))
+        known = np.isfinite(island.fitness)
+        waiting += np.count_nonzero(~known)
+        assert np.array_equal(island.fitness[known], problem.evaluate_fitness(theta)[known])
+        arrived = evolve(problem.evaluator, plan, island, 0)
+        theta = from_unit(problem.evaluator, decode(arrived.chromosomes, plan.bits))
+        assert np.array_equal(arrived.fitness, problem.evaluate_fitness(theta))
+        assert np.all(np.diff(arrived.fitness) >= 0)
+        assert arrived.champion_rms == arrived.fitness[0]
+        assert arrived.history[-1].parameters == tuple(theta[0])
+    assert (waiting > 0) == (algorithm is UNEQUAL)
+
+
+def test_a_migrant_as_fit_as_the_worst_individual_does_not_arrive() -> None:
+    before = tuple(replace(island, fitness=np.ones_like(island.fitness)) for island in islands())
+    after, log = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)
+    assert log == ()
+    assert [bits(i) for i in after] == [bits(i) for i in before]
+
+
+def test_a_better_champion_has_to_be_confirmed_again_and_another_one_stays_confirmed() -> None:
+    evidence = {
+        "champion_converged": 1,
+        "stagnation": 9,
+        "confirmed_starts": 3,
+        "hop_count": 2,
+        "returned_hops": 1,
+        "champion_discontinuities": 1,
+    }
+    before = tuple(with_search(island, **evidence) for island in islands())
+    after, _ = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)
+    changed = [new.champion_rms < old.champion_rms for old, new in zip(before, after, strict=True)]
+    assert sorted(changed) == [False, True, True, True]
+    for island, is_new in zip(after, changed, strict=True):
+        found = {name: int(island.search[name]) for name in evidence}
+        assert found == (dict.fromkeys(evidence, 0) if is_new else evidence)
 
 
 def test_a_better_champion_by_migration_is_in_the_history() -> None:

@@ -1,34 +1,47 @@
 """When searches agree enough for a run to end."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Migration, Stop
 from sysid.identification.conclude import conclude_run
-from sysid.identification.run import advance_run, begin_run, exchange_migrants
-from sysid.islands.state import RunState
+from sysid.identification.run import advance_run, begin_run
+from sysid.islands.evolve import make_stopping_rule
+from sysid.islands.stopping import count_restarts, has_process_ended
 from sysid.models.catalogue.load import load_model
+from sysid.search.state import SEARCH_RECORD, SearchArray
 from sysid.simulation.problem import Problem
-from tests.searching import DUFFING, example, noisy, record
+from tests.searching import DUFFING, noisy, record
 
 ALONE = GeneticAlgorithm(islands=1, migration=Migration(every=1))
 
 
-def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = False) -> RunState:
-    """A run at its second border, its searches as told."""
-    start = begin_run(example(), ALONE, 1)
-    state = advance_run(example(), replace(ALONE, generations=1), start)
-    search = state.islands[0].search.copy()
-    search["generation"], search["confirmed_starts"], search["random_starts"] = 2, again, tried
-    search["returned_hops"], search["hop_count"] = returned, hops
-    island = replace(state.islands[0], search=search)
-    return exchange_migrants(ALONE, replace(state, has_ended=False, is_warm=is_warm), [island])
+def make_search(islands: int = 1, generation: int = 2, **fields: object) -> SearchArray:
+    """Search records of islands that have all passed a border."""
+    search = np.zeros(islands, SEARCH_RECORD)
+    search["generation"] = generation
+    for name, values in fields.items():
+        search[name] = values
+    return search
+
+
+def ends(
+    again: int, tried: int, returned: int, hops: int, *, is_warm: bool = False, jumps: bool = False
+) -> bool:
+    """Whether a run ends at its second border, its searches as told."""
+    search = make_search(
+        confirmed_starts=again,
+        random_starts=tried,
+        returned_hops=returned,
+        hop_count=hops,
+        champion_discontinuities=int(jumps),
+    )
+    rule = make_stopping_rule(ALONE, is_warm=is_warm)
+    return bool(has_process_ended(rule, 2, np.array([0.5]), search, False))
 
 
 @pytest.mark.parametrize(
-    ("again", "tried", "returned", "hops", "ends"),
+    ("again", "tried", "returned", "hops", "enough"),
     [
         (8, 8, 3, 3, True),
         (8, 16, 8, 10, True),
@@ -41,14 +54,60 @@ def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = F
     ],
 )
 def test_where_searches_from_anywhere_disagree_more_of_them_are_needed(
-    again: int, tried: int, returned: int, hops: int, ends: bool
+    again: int, tried: int, returned: int, hops: int, enough: bool
 ) -> None:
-    assert found(again, tried, returned, hops).has_ended is ends
+    assert ends(again, tried, returned, hops) is enough
 
 
 def test_behind_an_earlier_result_few_searches_are_enough() -> None:
-    assert not found(3, 7, 1, 1).has_ended
-    assert found(3, 7, 1, 1, is_warm=True).has_ended
+    assert not ends(3, 7, 1, 1)
+    assert ends(3, 7, 1, 1, is_warm=True)
+
+
+@pytest.mark.parametrize(
+    ("again", "tried", "returned", "hops", "enough"),
+    [
+        (6, 9, 9, 10, True),
+        (6, 10, 9, 10, False),  # fewer than two thirds from anywhere
+        (6, 9, 8, 10, False),  # fewer than nine tenths from near it
+        (5, 5, 9, 9, False),  # all, but few
+        (9, 9, 5, 5, False),
+    ],
+)
+def test_where_the_fitness_jumps_nearly_all_searches_must_agree(
+    again: int, tried: int, returned: int, hops: int, enough: bool
+) -> None:
+    assert ends(again, tried, returned, hops, jumps=True) is enough
+
+
+def test_searches_for_a_worse_champion_confirm_none_but_count_as_tried() -> None:
+    search = make_search(
+        3,
+        random_starts=[5, 7, 2],
+        confirmed_starts=[4, 6, 1],
+        hop_count=[3, 9, 2],
+        returned_hops=[2, 8, 1],
+        champion_discontinuities=[0, 1, 0],
+    )
+    found = count_restarts(np.array([0.5, 0.6, 0.5 * (1 + 5e-5)]), search)
+    assert tuple(found) == (14, 5, 5, 3, False)
+
+
+def test_the_best_champion_decides_whether_the_target_is_reached() -> None:
+    rule = make_stopping_rule(GeneticAlgorithm(stop=Stop(rms=0.1)), is_warm=False)
+    for best, reached in ((0.1, True), (0.11, False)):
+        rms = np.array([0.5, best, 0.7])
+        assert has_process_ended(rule, 2, rms, make_search(3), False) is reached
+
+
+def test_a_run_ends_when_all_islands_rest_and_not_before() -> None:
+    rule = make_stopping_rule(ALONE, is_warm=False)
+    for generations, rest in (([3, 10], False), ([10, 10], False), ([3, 4], True)):
+        search = make_search(2, generation=generations)  # type: ignore[arg-type]
+        assert has_process_ended(rule, 10, np.ones(2), search, False) is rest
+    for border, last in ((rule.most_generations - 1, False), (rule.most_generations, True)):
+        search = make_search(2, generation=border)
+        assert has_process_ended(rule, border, np.ones(2), search, False) is last
 
 
 def test_a_false_optimum_that_a_third_of_the_searches_find_does_not_end_a_run() -> None:
