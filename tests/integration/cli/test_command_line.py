@@ -298,11 +298,11 @@ def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(
     assert "already stored as 'steps'" in again.stdout
     job = tmp_path / "job.yaml"
     job.write_text("model: fopdt\ndatasets: [steps]\nseed: 3\n")
-    done = run_lagid_process("submit", job, "--json", **environment)
+    done = run_lagid("submit", job, "--json", **environment)
     submitted: dict[str, Any] = json.loads(done.stdout)
     assert submitted["id"] in run_lagid("jobs", **environment).stdout
     assert "queued" in run_lagid("runs", **environment).stdout
-    assert "cancelled" in run_lagid_process("cancel", submitted["id"], **environment).stdout
+    assert "cancelled" in run_lagid("cancel", submitted["id"], **environment).stdout
     watched = run_lagid_process("watch", submitted["id"], "--json", **environment)
     assert watched.code == 1
     assert json.loads(watched.stdout)["state"] == "cancelled"
