@@ -151,7 +151,7 @@ def _compare_parameters(
     for (name, unit), values in entries.items():
         if len(values) < 2:
             continue
-        pair = _find_furthest_pair([estimate for _, estimate in values])
+        pair = find_furthest_pair([estimate for _, estimate in values])
         note = ""
         if pair is not None:
             note = _describe_difference(
@@ -172,7 +172,7 @@ def _compare_parameters(
         )
 
 
-def _find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
+def find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
     """Find the two estimates whose 95 % intervals are furthest apart; None if all overlap."""
     with_interval = [i for i, estimate in enumerate(estimates) if _has_ends(estimate["interval95"])]
     gaps = {

@@ -111,20 +111,11 @@ def log_of(place: Place) -> str:
     [["service.dispatch.process"], ["service.cli.main", "dispatcher"]],
     ids=["module", "lagid"],
 )
-@pytest.mark.parametrize(
-    ("address", "told"),
-    [
-        ("127.0.0.1:1", "no Ray cluster answers at 127.0.0.1:1 (Connection refused)"),
-        ("nowhere.invalid:6379", "no Ray cluster answers at nowhere.invalid:6379"),
-        ("10.0.0.5", "the Ray address '10.0.0.5' is invalid: write host:port"),
-        ("ray://10.0.0.5:10001", "is one of Ray Client, which is not supported"),
-    ],
-)
 def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
-    tmp_path: Path, command: list[str], address: str, told: str
+    tmp_path: Path, command: list[str]
 ) -> None:
     place = Place(tmp_path / "data")
-    settings = place.settings.model_copy(update={"ray_address": address})
+    settings = place.settings.model_copy(update={"ray_address": "ray://10.0.0.5:10001"})
     done = subprocess.run(
         [sys.executable, "-m", *command],
         env={**os.environ, **to_environment(settings)},
@@ -134,5 +125,5 @@ def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
     )
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if "ERROR" in line]
-    assert told in line
+    assert "is one of Ray Client, which is not supported" in line
     assert "Traceback" not in done.stderr

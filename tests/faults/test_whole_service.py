@@ -6,11 +6,14 @@ How soon it recovers is measured by `benchmarks/torture.py`; here it must, and n
 from collections.abc import Callable, Iterator
 
 import pytest
+from sqlalchemy import func, select
 
 from benchmarks.breaking import cancelling, faults
 from benchmarks.breaking.faults import Bench
 from benchmarks.breaking.stand import Stand, standing_service
 from benchmarks.breaking.work import ALWAYS, Stream
+from service.core.states import JobState
+from service.storage.tables import Run
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -45,7 +48,18 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, Str
 def test_the_work_goes_on_after(
     fault: Callable[[Bench], float], bench: tuple[Bench, Stream]
 ) -> None:
+    stand = bench[0].stand
+    before = count_successes(stand)
     fault(bench[0])
+    assert count_successes(stand) > before
+    assert stand.answers() == 200
+
+
+def count_successes(stand: Stand) -> int:
+    """Number of runs of all jobs whose results are stored."""
+    with stand.database.read_session() as session:
+        ended = select(func.count()).where(Run.state == JobState.SUCCEEDED)
+        return session.scalar(ended) or 0
 
 
 def test_nothing_is_lost_doubled_stuck_different_or_left(bench: tuple[Bench, Stream]) -> None:

@@ -1,6 +1,5 @@
 """The house rules that no linter knows, as small tests over the source tree."""
 
-import ast
 import re
 import subprocess
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.repository import ROOT
+from tests.sources import list_modules, read_facts
 
 CODE = ("sysid", "workers", "service", "migrations", "tests", "benchmarks")
 MACHINE = re.compile(
@@ -22,13 +22,9 @@ def _tracked() -> list[Path]:
     return [ROOT / line for line in listing.stdout.splitlines() if (ROOT / line).is_file()]
 
 
-def _python() -> list[Path]:
-    return [path for part in CODE for path in (ROOT / part).rglob("*.py")]
-
-
 def test_the_formatter_has_no_exceptions() -> None:
     mark = re.compile(r"#\s*fmt:\s*(?:skip|off)")
-    marked = [str(p.relative_to(ROOT)) for p in _python() if mark.search(p.read_text())]
+    marked = [str(p.relative_to(ROOT)) for p in list_modules(CODE) if mark.search(p.read_text())]
     assert marked == []
 
 
@@ -39,26 +35,21 @@ PARTICIPLE = re.compile(
 PRODUCT = ("sysid", "workers", "service", "migrations")
 
 
-def _definitions(*kinds: type[ast.AST]) -> list[tuple[str, str]]:
-    return [
-        (node.name, f"{path.relative_to(ROOT)}:{node.lineno}")  # type: ignore[attr-defined]
-        for path in _python()
-        if path.relative_to(ROOT).parts[0] in PRODUCT
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, kinds)
-    ]
-
-
 def test_no_function_is_named_by_a_participle() -> None:
-    functions = _definitions(ast.FunctionDef, ast.AsyncFunctionDef)
-    named = [f"{place} {name}" for name, place in functions if PARTICIPLE.match(name)]
+    named = [
+        f"{path.relative_to(ROOT)}:{line} {name}"
+        for path in list_modules(PRODUCT)
+        for name, line in read_facts(path).functions
+        if PARTICIPLE.match(name)
+    ]
     assert named == []
 
 
 def test_no_class_name_is_used_twice() -> None:
     places: dict[str, list[str]] = {}
-    for name, place in _definitions(ast.ClassDef):
-        places.setdefault(name, []).append(place)
+    for path in list_modules(PRODUCT):
+        for name, line in read_facts(path).classes:
+            places.setdefault(name, []).append(f"{path.relative_to(ROOT)}:{line}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
@@ -89,7 +80,7 @@ def test_every_package_on_disk_is_listed_for_installation() -> None:
     names = set(re.findall(r'"([\w.]+)"', listed[1]))
     on_disk = {
         ".".join(init.parent.relative_to(ROOT).parts)
-        for part in ("sysid", "workers", "service", "migrations")
+        for part in PRODUCT
         for init in (ROOT / part).rglob("__init__.py")
     }
     assert names == on_disk

@@ -1,13 +1,12 @@
 """Sentences of documents and messages stay short: readers are engineers in a hurry."""
 
-import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.repository import ROOT
+from tests.sources import list_modules, read_facts
 
 MOST_WORDS, MEAN_WORDS = 25, 16
 PROGRAMS = (ROOT / "sysid/export/c.py", ROOT / "sysid/export/python.py")  # texts are code
@@ -24,40 +23,6 @@ def sentences(markdown: str) -> list[str]:
     prose = re.sub(r"^\s*\|.*$|^#.*$", "", prose, flags=re.MULTILINE)
     parts = re.split(r"(?<=[.!?:])\s+|\n\s*\n|^\s*(?:[-*]|\d+\.) ", prose, flags=re.MULTILINE)
     return [part for part in parts if len(part.split()) > 2]
-
-
-def messages(path: Path) -> Iterator[tuple[int, str]]:
-    """Texts of a module that a person may read; a value that is filled in counts as a word."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    skipped = {node.value for node in nodes if isinstance(node, ast.Expr)}
-    for node in nodes:
-        if isinstance(node, ast.JoinedStr):
-            skipped |= {inner for inner in ast.walk(node) if inner is not node}
-    for node in nodes:
-        text = "" if node in skipped else _text_of(node)
-        if _is_prose(text):
-            yield node.lineno, text  # type: ignore[attr-defined]
-
-
-def _text_of(node: ast.AST) -> str:
-    if isinstance(node, ast.JoinedStr):
-        return "".join(
-            str(getattr(part, "value", "X")) if isinstance(part, ast.Constant) else "X"
-            for part in node.values
-        )
-    if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        return node.value
-    return ""
-
-
-def _is_prose(text: str) -> bool:
-    """Whether it is a line of words, and no code, markup or SQL."""
-    return (
-        len(text.split()) >= 6
-        and "\n" not in text
-        and re.search(r"[a-z]{3} [a-z]{2}", text) is not None
-        and re.search(r"<\w+|SELECT |UPDATE |INSERT |CREATE |\{%|= %|; ModuleID", text) is None
-    )
 
 
 def test_a_long_sentence_is_seen() -> None:
@@ -79,10 +44,9 @@ def test_sentences_of_documents_are_short(path: Path) -> None:
 def test_sentences_of_messages_are_short() -> None:
     long = [
         f"{path.relative_to(ROOT)}:{line}: {sentence}"
-        for part in ("sysid", "workers", "service")
-        for path in sorted((ROOT / part).rglob("*.py"))
+        for path in list_modules(("sysid", "workers", "service"))
         if path not in PROGRAMS
-        for line, text in messages(path)
+        for text, line in read_facts(path).messages
         for sentence in re.split(r"(?<=[.!?])\s+", text)
         if len(sentence.split()) > MOST_WORDS
     ]

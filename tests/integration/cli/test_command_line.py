@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +14,20 @@ import httpx
 import numpy as np
 import pytest
 
+from service.api.app import create_app
 from service.client.embedded import find_free_port
-from tests.rest import recording
+from tests.commands import (
+    LIMIT_SECONDS,
+    PROGRAM,
+    check_refusal,
+    make_environment,
+    run_lagid,
+    run_lagid_process,
+)
+from tests.rest import recording, settings_of
+from tests.serving import serve_in_thread
 
-pytestmark = pytest.mark.slow  # processes of their own
+pytestmark = pytest.mark.slow  # some are processes of their own, and one identifies
 
 OWN = """
 name: own
@@ -31,69 +40,12 @@ outputs: {y: x}
 initial: {x: measured}
 """
 
-LIMIT_SECONDS = 240.0  # beside other work what a command compiles takes minutes
-
-
-def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "service.cli.main", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_SECONDS,
-        check=False,
-        env={**os.environ, "LAGID_URL": "http://127.0.0.1:1", **environment},
-    )
-
-
-def refused(done: "subprocess.CompletedProcess[str]", code: int = 1) -> str:
-    """The one line of a command that was refused."""
-    assert done.returncode == code, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1, done.stderr
-    return lines[0]
-
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A web process without a dispatcher."""
-    folder = tmp_path_factory.mktemp("served")
-    port = find_free_port()
-    child = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "service.cli.main",
-            "serve",
-            "--no-dispatcher",
-            "--port",
-            str(port),
-            "--data-dir",
-            str(folder),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    url = f"http://127.0.0.1:{port}"
-    assert child.stdout is not None
-    assert url in child.stdout.readline()
-    _wait_until_answering(url)
-    yield url
-    child.send_signal(signal.SIGTERM)
-    assert child.wait(timeout=60) == 0
-    child.stdout.close()
-
-
-def _wait_until_answering(url: str) -> None:
-    limit = time.monotonic() + LIMIT_SECONDS
-    while time.monotonic() < limit:
-        try:
-            httpx.get(f"{url}/healthz").raise_for_status()
-            return
-        except httpx.HTTPError:
-            time.sleep(0.1)
-    raise AssertionError("the server does not answer")
+    """The web application without a dispatcher."""
+    with serve_in_thread(create_app(settings_of(tmp_path_factory.mktemp("served")))) as url:
+        yield url
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +56,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_help_names_every_command() -> None:
-    text = lagid("--help").stdout
+    text = run_lagid_process("--help").stdout
     for command in (
         "serve",
         "identify",
@@ -126,13 +78,17 @@ def test_help_names_every_command() -> None:
 
 
 def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
-    assert lagid("submitt").returncode == 2
-    assert lagid("identify", data).returncode == 2
-    line = refused(lagid("identify", data, "--model", "fopdt", "--set", "seed"), 2)
+    assert run_lagid("submitt").code == 2
+    assert run_lagid("identify", data).code == 2
+    line = check_refusal(run_lagid("identify", data, "--model", "fopdt", "--set", "seed"), 2)
     assert "path=value" in line
-    line = refused(lagid("identify", data, "--model", "fopdt", "--set", "algorithm.bit=3"), 2)
+    line = check_refusal(
+        run_lagid("identify", data, "--model", "fopdt", "--set", "algorithm.bit=3"), 2
+    )
     assert "did you mean 'bits'?" in line
-    line = refused(lagid("identify", data, "--model", "fopdt", "--noise-model", "pink"), 2)
+    line = check_refusal(
+        run_lagid("identify", data, "--model", "fopdt", "--noise-model", "pink"), 2
+    )
     assert "need 'auto', 'white' or 'ar1'" in line
 
 
@@ -156,13 +112,13 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
 def test_words_that_a_command_does_not_have_are_one_line_of_ours(
     words: list[str], expected: str
 ) -> None:
-    assert refused(lagid(*words), 2).startswith(f"lagid: {expected}")
+    assert check_refusal(run_lagid(*words), 2).startswith(f"lagid: {expected}")
 
 
 def test_a_command_without_its_words_shows_the_help() -> None:
     for words in ((), ("sweep",)):
-        done = lagid(*words)
-        assert done.returncode == 2
+        done = run_lagid(*words)
+        assert done.code == 2
         assert "--help" in done.stdout + done.stderr
         assert "lagid: " not in done.stderr
 
@@ -184,19 +140,21 @@ def test_what_identify_cannot_do_in_this_process_is_refused(
     data: Path, words: list[str], expected: str
 ) -> None:
     words = [word if word != "{data}" else str(data) for word in words]
-    done = lagid("identify", data, "--model", "fopdt", *words)
-    assert expected in refused(done, done.returncode)
-    assert done.returncode in (1, 2)
+    done = run_lagid("identify", data, "--model", "fopdt", *words)
+    assert expected in check_refusal(done, done.code)
+    assert done.code in (1, 2)
 
 
 def test_a_file_that_is_not_utf8_is_said_without_an_empty_place(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_bytes(b"model: \xff")
-    assert refused(lagid("submit", job)).startswith(f"lagid: {job}: the document is not UTF-8")
+    assert check_refusal(run_lagid("submit", job)).startswith(
+        f"lagid: {job}: the document is not UTF-8"
+    )
 
 
 def test_no_server_is_said_with_what_to_do() -> None:
-    assert "lagid serve" in refused(lagid("jobs"))
+    assert "lagid serve" in check_refusal(run_lagid("jobs"))
 
 
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
@@ -204,48 +162,53 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        line = refused(lagid("serve", "--port", port, "--data-dir", tmp_path))
+        words = ("serve", "--port", port, "--data-dir", tmp_path)
+        ended = run_lagid_process(*words)
+        assert run_lagid(*words) == ended
+    line = check_refusal(ended)
     assert f"port {port}" in line
     assert "in use" in line
 
 
 def test_a_data_folder_that_is_not_writable_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    line = refused(lagid("serve", "--port", 0, "--data-dir", tmp_path / "file" / "data"))
+    line = check_refusal(run_lagid("serve", "--port", 0, "--data-dir", tmp_path / "file" / "data"))
     assert "not writable" in line
 
 
 def test_a_database_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
     nowhere = "postgresql://lagid:secret@127.0.0.1:1/lagid"
-    line = refused(lagid("serve", "--port", 0, "--data-dir", tmp_path, LAGID_DATABASE_URL=nowhere))
+    line = check_refusal(
+        run_lagid("serve", "--port", 0, "--data-dir", tmp_path, LAGID_DATABASE_URL=nowhere)
+    )
     assert "the database cannot be opened" in line
     assert "LAGID_DATABASE_URL" in line
     assert "secret" not in line
 
 
 def test_another_host_is_refused_without_keys(tmp_path: Path) -> None:
-    line = refused(lagid("serve", "--host", "0.0.0.0", "--data-dir", tmp_path))
+    line = check_refusal(run_lagid("serve", "--host", "0.0.0.0", "--data-dir", tmp_path))
     assert "LAGID_ALLOW_OPEN_HOST" in line
 
 
 def test_a_setting_that_cannot_be_used_names_its_variable(tmp_path: Path) -> None:
-    line = refused(lagid("serve", "--data-dir", tmp_path, LAGID_PORT="many"))
+    line = check_refusal(run_lagid("serve", "--data-dir", tmp_path, LAGID_PORT="many"))
     assert "LAGID_PORT" in line
 
 
 def test_built_in_models_are_listed_shown_and_checked(tmp_path: Path) -> None:
     environment = {"LAGID_URL": ""}
-    listed = json.loads(lagid("models", "list", "--json", **environment).stdout)
+    listed = json.loads(run_lagid("models", "list", "--json", **environment).stdout)
     assert {"tube", "duffing-eq16"} <= {one["name"] for one in listed}
     shown = tmp_path / "tube.yaml"
-    shown.write_text(lagid("models", "show", "tube", **environment).stdout)
-    assert lagid("models", "check", shown).returncode == 0
+    shown.write_text(run_lagid("models", "show", "tube", **environment).stdout)
+    assert run_lagid("models", "check", shown).code == 0
 
 
 def test_a_fault_of_a_model_has_its_column(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text(OWN.replace("- x)/T", "- z)/T"))
-    line = refused(lagid("models", "check", path))
+    line = check_refusal(run_lagid("models", "check", path))
     assert "column" in line
     assert "'z'" in line
 
@@ -257,7 +220,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     model = tmp_path / "own.yaml"
     model.write_text(OWN)
     result = tmp_path / "out.json"
-    done = lagid(
+    done = run_lagid_process(
         "identify",
         data,
         "--model",
@@ -269,7 +232,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         "--json",
         result,
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert "±" in done.stdout
     assert "If the input was held, use --set hold.u=zero" in " ".join(done.stderr.split())
     found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
@@ -304,44 +267,46 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     ],
 )
 def test_a_mistake_of_identify_is_one_line(data: Path, words: list[str], expected: str) -> None:
-    assert expected in refused(lagid("identify", data, *words))
+    assert expected in check_refusal(run_lagid("identify", data, *words))
 
 
 def test_identify_tells_all_that_cannot_be_read_first(data: Path) -> None:
     words = ("--set", "seed=x", "--set", "parameters.LL.upper=9", "--set", "bits=3")
-    line = refused(lagid("identify", data, "--model", "fopdt", *words), 2)
+    line = check_refusal(run_lagid("identify", data, "--model", "fopdt", *words), 2)
     assert "--set seed: found 'x'; need a whole number" in line
     assert "--set bits: unknown field 'bits'; there is --set algorithm.bits" in line
     assert "LL" not in line
 
 
 def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Path) -> None:
-    assert "there is no file" in refused(lagid("identify", tmp_path / "x.csv", "--model", "fopdt"))
+    assert "there is no file" in check_refusal(
+        run_lagid("identify", tmp_path / "x.csv", "--model", "fopdt")
+    )
     bad = tmp_path / "bad.csv"
     bad.write_text("t,u,y\n0,1,2\n0.1,volt,2\n")
-    assert "row 3" in refused(lagid("identify", bad, "--model", "fopdt"))
+    assert "row 3" in check_refusal(run_lagid("identify", bad, "--model", "fopdt"))
 
 
 def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(
     server: str, data: Path, tmp_path: Path
 ) -> None:
     environment = {"LAGID_URL": server}
-    stored = json.loads(lagid("dataset", "add", data, "--json", **environment).stdout)
+    stored = json.loads(run_lagid("dataset", "add", data, "--json", **environment).stdout)
     assert stored["name"] == "steps"
-    assert "steps" in lagid("datasets", **environment).stdout
-    again = lagid("dataset", "add", data, "--name", "other", **environment)
+    assert "steps" in run_lagid("datasets", **environment).stdout
+    again = run_lagid("dataset", "add", data, "--name", "other", **environment)
     assert "already stored as 'steps'" in again.stdout
     job = tmp_path / "job.yaml"
     job.write_text("model: fopdt\ndatasets: [steps]\nseed: 3\n")
-    done = lagid("submit", job, "--json", **environment)
+    done = run_lagid("submit", job, "--json", **environment)
     submitted: dict[str, Any] = json.loads(done.stdout)
-    assert submitted["id"] in lagid("jobs", **environment).stdout
-    assert "queued" in lagid("runs", **environment).stdout
-    assert "cancelled" in lagid("cancel", submitted["id"], **environment).stdout
-    watched = lagid("watch", submitted["id"], "--json", **environment)
-    assert watched.returncode == 1
+    assert submitted["id"] in run_lagid("jobs", **environment).stdout
+    assert "queued" in run_lagid("runs", **environment).stdout
+    assert "cancelled" in run_lagid("cancel", submitted["id"], **environment).stdout
+    watched = run_lagid_process("watch", submitted["id"], "--json", **environment)
+    assert watched.code == 1
     assert json.loads(watched.stdout)["state"] == "cancelled"
-    assert "queued" in lagid("resume", submitted["id"], **environment).stdout
+    assert "queued" in run_lagid("resume", submitted["id"], **environment).stdout
 
 
 @pytest.mark.parametrize(
@@ -359,58 +324,89 @@ def test_a_job_file_that_cannot_be_used_is_one_line(
 ) -> None:
     job = tmp_path / "job.yaml"
     job.write_text(text)
-    assert expected in refused(lagid("submit", job, LAGID_URL=server))
+    assert expected in check_refusal(run_lagid("submit", job, LAGID_URL=server))
 
 
-def test_an_open_event_stream_does_not_hold_up_the_end(tmp_path: Path) -> None:
+def test_a_server_ends_in_order_on_sigterm_and_so_does_an_open_event_stream(
+    tmp_path: Path,
+) -> None:
     port = find_free_port()
     url = f"http://127.0.0.1:{port}"
+    words = ("serve", "--no-dispatcher", "--port", str(port), "--data-dir", str(tmp_path))
     child = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "service.cli.main",
-            "serve",
-            "--no-dispatcher",
-            "--port",
-            str(port),
-            "--data-dir",
-            str(tmp_path),
-        ],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        [*PROGRAM, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=make_environment({}),
     )
-    _wait_until_answering(url)
-    with httpx.Client(base_url=url, timeout=60) as http:
-        csv = {"content-type": "text/csv"}
-        dataset = http.post("/v1/datasets", content=recording(), headers=csv).json()["id"]
-        job = http.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset]}).json()["id"]
-        with http.stream("GET", f"/v1/jobs/{job}/events") as stream:
-            lines = stream.iter_lines()
-            assert next(lines).startswith("retry")
-            child.send_signal(signal.SIGTERM)
-            for _ in lines:
-                pass  # the stream ends, and so does the loop
-    assert child.wait(timeout=60) == 0
+    try:
+        assert child.stdout is not None
+        assert url in child.stdout.readline()
+        _wait_until_answering(url)
+        with httpx.Client(base_url=url, timeout=60) as http:
+            csv = {"content-type": "text/csv"}
+            dataset = http.post("/v1/datasets", content=recording(), headers=csv).json()["id"]
+            body = {"model": "fopdt", "datasets": [dataset]}
+            job = http.post("/v1/jobs", json=body).json()["id"]
+            with http.stream("GET", f"/v1/jobs/{job}/events") as stream:
+                lines = stream.iter_lines()
+                assert next(lines).startswith("retry")
+                child.send_signal(signal.SIGTERM)
+                for _ in lines:
+                    pass  # the stream ends, and so does the loop
+        rest, _ = child.communicate(timeout=60)
+        assert child.returncode == 0, rest
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def _wait_until_answering(url: str) -> None:
+    limit = time.monotonic() + LIMIT_SECONDS
+    while time.monotonic() < limit:
+        try:
+            httpx.get(f"{url}/healthz").raise_for_status()
+            return
+        except httpx.HTTPError:
+            time.sleep(0.1)
+    raise AssertionError("the server does not answer")
+
+
+def test_a_reader_that_goes_away_ends_a_command_without_a_message() -> None:
+    """As in `lagid models list | head -1`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as closed:
+        done = subprocess.run(
+            [*PROGRAM, "--help"],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=LIMIT_SECONDS,
+            check=False,
+            env=make_environment({}),
+        )
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_tables_are_made_and_checked_by_command(tmp_path: Path) -> None:
-    assert "no database" in refused(lagid("db", "check", "--data-dir", tmp_path))
-    assert lagid("db", "upgrade", "--data-dir", tmp_path).returncode == 0
-    assert "at head" in lagid("db", "check", "--data-dir", tmp_path).stdout
+    assert "no database" in check_refusal(run_lagid("db", "check", "--data-dir", tmp_path))
+    assert run_lagid("db", "upgrade", "--data-dir", tmp_path).code == 0
+    assert "at head" in run_lagid("db", "check", "--data-dir", tmp_path).stdout
 
 
 @pytest.mark.slow
 def test_the_doctor_finds_a_sound_installation(tmp_path: Path) -> None:
-    done = lagid("doctor", "--data-dir", tmp_path, LAGID_PORT=str(find_free_port()))
-    assert done.returncode == 0, done.stderr
+    done = run_lagid_process("doctor", "--data-dir", tmp_path, LAGID_PORT=str(find_free_port()))
+    assert done.code == 0, done.stderr
     assert "compiled" in done.stdout
 
 
 def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_text("model: fopdt\ndatasets: [a]\nparameters: {L: {upper: .inf}}\n")
-    said = refused(lagid("submit", job), 2)
+    said = check_refusal(run_lagid("submit", job), 2)
     assert said == f"lagid: {job}: /parameters/L/upper: found inf; need a finite number"
 
 
@@ -450,15 +446,15 @@ def test_a_noise_sweep_is_submitted_with_the_settings_that_were_given(server: st
         "--set",
         "parameters.L.upper=1",
     )
-    done = lagid(*words, "--json", LAGID_URL=server)
-    assert done.returncode == 0, done.stderr
+    done = run_lagid(*words, "--json", LAGID_URL=server)
+    assert done.code == 0, done.stderr
     job = json.loads(done.stdout)
     assert job["progress"]["runs"] == 6
     request = httpx.get(f"{server}/v1/jobs/{job['id']}", timeout=60).json()["request"]
     assert request["algorithm"]["population"] == 12
     assert request["parameters"] == {"L": {"upper": 1}}
     assert request["sweep"]["axes"][0]["values"] == [0, 0.1, 0.2]
-    again = lagid(*words, LAGID_URL=server)
+    again = run_lagid(*words, LAGID_URL=server)
     assert "6 runs, queued" in again.stdout
 
 
@@ -473,4 +469,4 @@ def test_a_mistake_of_a_noise_sweep_is_one_line(server: str) -> None:
         (("runs", "job_none"), 1, "lagid: there is no job job_none"),
         ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "--methods: found 'best'"),
     ):
-        assert expected in refused(lagid(*words, LAGID_URL=server), code)
+        assert expected in check_refusal(run_lagid(*words, LAGID_URL=server), code)

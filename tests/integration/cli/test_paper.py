@@ -1,10 +1,7 @@
 """`lagid paper` over a service of its own: the report's numbers are those of the jobs."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +9,7 @@ import pytest
 
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
+from tests.commands import check_refusal, run_lagid
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 
@@ -22,21 +20,10 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield address
 
 
-def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "service.cli.main", "paper", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-        env={**os.environ, **environment},
-    )
-
-
 def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> None:
     report = tmp_path / "paper.html"
-    done = lagid("--quick", "--only", "table1", "--url", url, "--output", report)
-    assert done.returncode == 0, done.stderr
+    done = run_lagid("paper", "--quick", "--only", "table1", "--url", url, "--output", report)
+    assert done.code == 0, done.stderr
     page = report.read_text(encoding="utf-8")
     jobs = dict.fromkeys(re.findall(r"job_[0-9a-z]{26}", page))
     assert len(jobs) == 3  # one for each reading
@@ -54,8 +41,9 @@ def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> 
 
 def test_without_its_data_the_tube_is_that_of_the_plant(url: str, tmp_path: Path) -> None:
     report = tmp_path / "paper.html"
-    done = lagid("--only", "table3", "--url", url, "--output", report, LAGID_DATA=str(tmp_path))
-    assert done.returncode == 0, done.stderr
+    words = ("--only", "table3", "--url", url, "--output", report)
+    done = run_lagid("paper", *words, LAGID_DATA=str(tmp_path))
+    assert done.code == 0, done.stderr
     assert "LAGID_DATA has no records, so the service made them" in done.stdout
     assert "L of the two patterns agrees" in report.read_text(encoding="utf-8")
 
@@ -68,9 +56,7 @@ def test_without_its_data_the_tube_is_that_of_the_plant(url: str, tmp_path: Path
     ],
 )
 def test_what_cannot_be_done_is_refused_before_any_work(
-    words: list[str], told: str, code: int, tmp_path: Path
+    words: list[str], told: str, code: int
 ) -> None:
-    done = lagid(*words, "--url", "http://127.0.0.1:1")
-    assert done.returncode == code
-    assert told in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    done = run_lagid("paper", *words, "--url", "http://127.0.0.1:1")
+    assert told in check_refusal(done, code)

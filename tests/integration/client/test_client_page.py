@@ -2,13 +2,11 @@
 
 import re
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
@@ -18,6 +16,7 @@ from service.repositories.jobs import JobRepository
 from tests.identified import carried_out
 from tests.repository import ROOT
 from tests.rest import settings_of
+from tests.serving import serve_in_thread
 
 PAGE = (ROOT / "docs/client.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -43,23 +42,14 @@ class _Worker(threading.Thread):
 @pytest.fixture
 def url(tmp_path: Path) -> Iterator[str]:
     app = create_app(settings_of(tmp_path))
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-        time.sleep(0.01)
-    worker = _Worker(app.state.parts)
-    worker.start()
-    try:
-        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    finally:
-        worker.ended.set()
-        worker.join(timeout=20)
-        app.state.parts.stopping.set()
-        server.should_exit = True
-        thread.join(timeout=20)
+    with serve_in_thread(app) as address:
+        worker = _Worker(app.state.parts)
+        worker.start()
+        try:
+            yield address
+        finally:
+            worker.ended.set()
+            worker.join(timeout=20)
 
 
 def test_the_page_shows_every_recipe_and_what_follows_it() -> None:

@@ -8,6 +8,7 @@ import pytest
 from sysid.core.errors import InvalidSettings
 from sysid.identification.run import begin_run
 from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
+from workers import packing, tasks
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.inline_executor import InlineExecutor
 from workers.job_queue import JobQueue
@@ -296,16 +297,16 @@ def test_a_run_is_told_to_begin_once_also_when_it_goes_on_from_a_checkpoint() ->
 def test_islands_whose_turn_did_not_come_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     one = spec(3, "long", generations=60, islands=8, population=64)
     plain = carry_out(InlineExecutor(), {"r": one})
-    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
-    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
-    monkeypatch.setattr("workers.tasks.PACK_LIMIT_SECONDS", 0.0)  # one island of a pack at a time
+    monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr(packing, "FIRST_SLICE_SECONDS", 0.001)
+    monkeypatch.setattr(tasks, "PACK_LIMIT_SECONDS", 0.0)  # one island of a pack at a time
     spread = carry_out(InlineExecutor(slots=2), {"r": one})
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
 
 def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedExecutor, Notebook]:
     """A run of four islands, of which the first two are one pack and the others another."""
-    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
     one = spec(islands=4)
     kept = begin_run(build_pack_problems(one.problem, RECORDS)[0], one.algorithm, 1)
     crew, notebook = ScriptedExecutor(fails), Notebook()

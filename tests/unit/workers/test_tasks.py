@@ -5,6 +5,7 @@ import pickle
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 import workers.tasks
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
+from sysid.identification import conclude, generalised_least_squares
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
@@ -180,18 +182,19 @@ def interrupts() -> Iterator[None]:
 
 @pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize(
-    "part",
+    ("module", "part"),
     [
-        "conclude.refine_candidates",
-        "conclude.analyse_estimate",
-        "conclude.run_residual_tests",
-        "conclude.estimate_onset_delays",
-        "generalised_least_squares._estimate_correlation_times",
-        "generalised_least_squares._draw_starts",
+        (conclude, "refine_candidates"),
+        (conclude, "analyse_estimate"),
+        (conclude, "run_residual_tests"),
+        (conclude, "estimate_onset_delays"),
+        (generalised_least_squares, "_estimate_correlation_times"),
+        (generalised_least_squares, "_draw_starts"),
     ],
+    ids=lambda one: one if isinstance(one, str) else one.__name__.rpartition(".")[2],
 )
 def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_later_one(
-    part: str, monkeypatch: pytest.MonkeyPatch
+    module: ModuleType, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (short,) = RECORDS["short"]
     slow = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, short.outputs[0].values.size))
@@ -207,7 +210,7 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
         os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
 
     with monkeypatch.context() as patched:
-        patched.setattr(f"sysid.identification.{part}", cancelled)
+        patched.setattr(module, part, cancelled)
         with pytest.raises(KeyboardInterrupt):
             workers.tasks.process_pack(pack, ["drifting"], records)
     (again,) = workers.tasks.process_pack(pack, ["drifting"], records)

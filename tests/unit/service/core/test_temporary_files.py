@@ -46,9 +46,12 @@ def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path:
 def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gone = tmp_path / "lagid-tmp-another-host-1-file"
-    monkeypatch.setattr(Path, "glob", lambda *_: [gone])
+    gone, left = (tmp_path / f"lagid-tmp-another-host-{number}-file" for number in (1, 2))
+    left.touch()
+    os.utime(left, (0.0, 0.0))
+    monkeypatch.setattr(Path, "glob", lambda *_: [gone, left])
     temporary_files.remove_leftovers(tmp_path)
+    assert not left.exists()
 
 
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(

@@ -113,9 +113,18 @@ def test_an_axis_has_some_ticks_but_not_too_many(span: float, start: float) -> N
     assert all(20 - 1e-6 <= place <= 220 + 1e-6 for place, _ in ticks)
 
 
-def test_a_constant_line_and_an_empty_one_can_be_drawn() -> None:
-    for x, y in (([0, 1], [3, 3]), ([], []), ([1], [None])):
-        parsed(str(to_svg(figure(line(x, y)), "flat")))
+def test_a_constant_line_is_drawn_at_half_height() -> None:
+    found = str(to_svg(figure(line([0, 1], [3, 3])), "flat"))
+    _, top, bottom = re.findall(r'class="frame" d="M(\S+) (\S+)V(\S+)H', found)[0]
+    middle = (float(top) + float(bottom)) / 2
+    assert [float(up) for up in re.findall(r"[ML]\S+ ([\d.]+)", path_of(found))] == [middle] * 2
+
+
+@pytest.mark.parametrize(("x", "y"), [([], []), ([1], [None])])
+def test_of_a_line_without_points_only_the_axes_are_drawn(x: list[Any], y: list[Any]) -> None:
+    found = str(to_svg(figure(line(x, y)), "empty"))
+    assert {"time [s]", "y [m]", "0", "1"} <= set(texts(found))
+    assert re.findall(r'd="([^"]*)" fill="none"', found) == [""]
 
 
 def test_a_gap_parts_the_line() -> None:

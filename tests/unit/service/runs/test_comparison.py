@@ -3,7 +3,7 @@
 import pytest
 
 from service.core.text import plain_estimate
-from service.runs.comparison import _find_furthest_pair
+from service.runs.comparison import find_furthest_pair
 
 
 def estimate(value: float, stderr: float | None) -> dict[str, object]:
@@ -12,13 +12,13 @@ def estimate(value: float, stderr: float | None) -> dict[str, object]:
 
 
 def test_intervals_that_meet_tell_nothing_apart() -> None:
-    assert _find_furthest_pair([estimate(1.0, 0.1), estimate(1.3, 0.1)]) is None
-    assert _find_furthest_pair([estimate(1.0, 0.1), estimate(9.0, None)]) is None
+    assert find_furthest_pair([estimate(1.0, 0.1), estimate(1.3, 0.1)]) is None
+    assert find_furthest_pair([estimate(1.0, 0.1), estimate(9.0, None)]) is None
 
 
 def test_of_several_the_two_furthest_apart_are_named() -> None:
     three = [estimate(1.0, 0.01), estimate(1.5, 0.01), estimate(1.2, 0.01)]
-    assert _find_furthest_pair(three) == (0, 1)
+    assert find_furthest_pair(three) == (0, 1)
 
 
 @pytest.mark.parametrize(
