@@ -289,6 +289,14 @@ def test_a_footer_that_denies_the_summary_is_refused() -> None:
     assert "says that the summary begins at 0" in error.detail
 
 
+def test_a_record_longer_than_the_limit_is_refused_unread_whatever_it_holds() -> None:
+    content = file_of(Metadata("notes", {"text": "x" * 2000}), CHANNEL, MESSAGE)
+    assert read_mcap_with_notes(content, DEFAULT_LIMITS)[0].names == ("x",)
+    error = refused(content, replace(DEFAULT_LIMITS, record_bytes=1000))
+    assert "the metadata record declares" in error.detail
+    assert "at most 1000" in error.detail
+
+
 def test_the_number_of_channels_is_limited() -> None:
     channels = [replace(CHANNEL, id=number) for number in range(1, 5)]
     assert "at most 3" in refused(file_of(*channels), replace(DEFAULT_LIMITS, channels=3)).detail
