@@ -24,10 +24,11 @@ def foreign(
     schema: tuple[str, str, bytes] = ("Any", "jsonschema", b"{}"),
     compression: CompressionType = CompressionType.ZSTD,
     chunked: bool = True,
+    chunk_size: int = 1024**2,
 ) -> bytes:
     """Content of a file made by the plain `mcap` writer from (topic, log time in ns, data)."""
     stream = BytesIO()
-    writer = Writer(stream, compression=compression, use_chunking=chunked)
+    writer = Writer(stream, chunk_size, compression=compression, use_chunking=chunked)
     writer.start()
     number = writer.register_schema(*schema)
     topics = dict.fromkeys(topic for topic, _, _ in messages)

@@ -215,9 +215,10 @@ def read_recording(path: Path, reading: CsvOptions) -> "Recording":
         fail(f"there is no file {path}")
     if path.suffix.lower() == ".mcap":
         from service.formats.limits import DEFAULT_LIMITS
-        from service.formats.mcap import read_mcap_with_notes
+        from service.formats.sandbox import read_untrusted
 
-        recording, notes = read_mcap_with_notes(path, DEFAULT_LIMITS)
+        upload = read_untrusted(path, "mcap", DEFAULT_LIMITS)
+        recording, notes = upload.recording, upload.notes
     else:
         recording, notes = read_csv(
             path, sample_time=reading.sample_time, segments=reading.segments

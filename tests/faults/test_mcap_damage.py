@@ -1,9 +1,12 @@
 """Damaged and hostile MCAP files: always one clear error or a right answer, never another end."""
 
 import struct
+import subprocess
+import sys
 import zlib
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -20,6 +23,7 @@ from mcap.writer import CompressionType
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap import read_mcap_with_notes
+from service.formats.mcap_messages import build_schema
 from service.formats.mcap_writer import MCAP_MAGIC
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
@@ -44,11 +48,14 @@ def refused(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> InvalidUpl
     return caught.value
 
 
-def file_of(*records: McapRecord | bytes) -> bytes:
-    """Return a file of any records, right or wrong, with a right beginning and end."""
+def file_of(*records: McapRecord | bytes, summary: tuple[McapRecord, ...] = ()) -> bytes:
+    """Return a file of any records, right or wrong, with a right beginning and end.
+
+    The footer does not mention the summary.
+    """
     stream = BytesIO()
     stream.write(MCAP_MAGIC)
-    for record in (Header("", "test"), *records, DataEnd(0), Footer(0, 0, 0)):
+    for record in (Header("", "test"), *records, DataEnd(0), *summary, Footer(0, 0, 0)):
         stream.write(record if isinstance(record, bytes) else as_bytes(record))
     return stream.getvalue() + MCAP_MAGIC
 
@@ -64,8 +71,25 @@ def chunk_of(content: bytes, compression: str, packed: bytes, size: int | None =
     return Chunk(compression, packed, 0, 0, zlib.crc32(content), declared)
 
 
+def joined(*records: McapRecord) -> bytes:
+    return b"".join(map(as_bytes, records))
+
+
 CHANNEL = ChannelRecord(1, "/a", "json", {}, 0)
 MESSAGE = Message(1, 5, b'{"x": 2}', 5, 0)
+FLAT_SCHEMA = Schema(1, build_schema("Pair", ("x", "y")), "protobuf", "lagid.Pair")
+FLAT = ChannelRecord(1, "/a", "protobuf", {}, 1)
+
+
+def flat_message(log_time: int, x: float, y: float) -> Message:
+    """Message of `FLAT`, laid out as in our own files: those are read as one array."""
+    return Message(1, log_time, struct.pack("<BdBd", 0x09, x, 0x11, y), log_time, 0)
+
+
+def flat_file(*messages: Message) -> bytes:
+    """File with all messages in one chunk that holds nothing else."""
+    content = joined(*messages)
+    return file_of(FLAT_SCHEMA, FLAT, chunk_of(content, "", content))
 
 
 def test_the_parts_used_here_make_a_file_that_is_read() -> None:
@@ -82,69 +106,94 @@ def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> N
         assert 0 <= error.byte <= length
 
 
-@pytest.mark.parametrize("content", FILES)
-@given(data=st.data())
-@settings(max_examples=150)
-def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
-    whole, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
-    damaged = bytearray(content)
-    for _ in range(data.draw(st.integers(1, 3))):
-        place = data.draw(st.integers(0, len(content) - 1))
-        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
-    try:
-        read, _ = read_mcap_with_notes(bytes(damaged), DEFAULT_LIMITS)
-    except InvalidUpload:
-        return
-    for before, after in zip(whole.channels, read.channels, strict=True):
-        np.testing.assert_array_equal(before.values, after.values)
+def test_one_flipped_bit_anywhere_in_a_file_of_ours_is_found() -> None:
+    for place in range(len(OURS)):
+        damaged = bytearray(OURS)
+        damaged[place] ^= 1 << place % 8
+        refused(bytes(damaged))
 
 
-def is_read_whole_or_refused(content: bytes) -> bool:
-    """Whether a file gives channels with a value for every time, or a reason; nothing else may."""
-    try:
-        recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
-    except InvalidUpload as error:
-        return bool(str(error))
-    return bool(recording.channels) and all(
-        one.times.shape == one.values.shape for one in recording.channels
-    )
+def test_a_damaged_summary_is_refused_by_its_checksum() -> None:
+    damaged = bytearray(OURS)
+    damaged[-len(MCAP_MAGIC) - 29 - 1] ^= 1  # last byte before the footer
+    assert "for the summary" in refused(bytes(damaged)).detail
 
 
-@given(st.binary(max_size=400), st.sampled_from(FILES), st.data())
-@settings(max_examples=150)
-def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
-    junk: bytes, content: bytes, data: st.DataObject
-) -> None:
-    place = data.draw(st.integers(0, len(content)))
-    damaged = content[:place] + junk + content[place + data.draw(st.integers(0, 400)) :]
-    assert is_read_whole_or_refused(damaged)
+BOMB_BYTES = 96 * ONE_MIB
 
 
-@given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=80)), max_size=8))
-@settings(max_examples=200)
-def test_records_of_any_content_are_read_or_refused(records: list[tuple[int, bytes]]) -> None:
-    raw = [struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records]
-    for content in (
-        file_of(CHANNEL, *raw, MESSAGE),
-        file_of(chunk_of(b"".join(raw), "", b"".join(raw))),
-    ):
-        assert is_read_whole_or_refused(content)
+def bomb(compression: str, declared: int) -> bytes:
+    """File with a chunk that unpacks to far more than it declares."""
+    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
+    packed = pack(bytes(BOMB_BYTES))
+    assert len(packed) < 0.005 * BOMB_BYTES
+    return file_of(CHANNEL, Chunk(compression, packed, 0, 0, 0, declared))
+
+
+def windowed(log: int) -> bytes:
+    """File with a right message in a zstd frame that asks for a window of 2ˡᵒᵍ bytes."""
+    parameters = zstandard.ZstdCompressionParameters(window_log=log)
+    packer = zstandard.ZstdCompressor(compression_params=parameters).compressobj()
+    content = as_bytes(MESSAGE)
+    packed = packer.compress(content) + packer.flush()
+    assert zstandard.get_frame_parameters(packed).window_size == 1 << log
+    return file_of(CHANNEL, chunk_of(content, "zstd", packed))
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("declared", [1000, 64 * ONE_MIB, 2**40])
-def test_a_bomb_is_refused_without_being_unpacked(compression: str, declared: int) -> None:
-    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
-    packed = pack(bytes(96 * ONE_MIB))
-    assert len(packed) < 0.005 * 96 * ONE_MIB
-    bomb = Chunk(compression, packed, 0, 0, 0, declared)
-    assert "chunk record declares" in refused(file_of(CHANNEL, bomb)).detail
+def test_a_bomb_is_refused(compression: str, declared: int) -> None:
+    assert "chunk record declares" in refused(bomb(compression, declared)).detail
 
 
 def test_a_zstd_frame_that_asks_for_a_huge_window_is_refused() -> None:
-    # Magic, a header without size or single segment, and the window of 3.75 TiB it may ask for.
-    frame = b"\x28\xb5\x2f\xfd" + bytes([0x00, 0xFF]) + b"\x01\x00\x00"
-    assert "cannot be decompressed" in refused(file_of(Chunk("zstd", frame, 0, 0, 0, 10))).detail
+    recording, _ = read_mcap_with_notes(windowed(23), DEFAULT_LIMITS)
+    assert recording.channel("x").values[0] == 2
+    for log in (24, 30):
+        assert "too much memory" in refused(windowed(log)).detail
+
+
+READ_IN_LITTLE_MEMORY = """
+import resource, sys
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
+from service.formats.mcap import read_mcap_with_notes
+
+right, *bombs = sys.argv[1:]
+read_mcap_with_notes(right, DEFAULT_LIMITS)  # loads all that reading needs
+with open("/proc/self/statm") as pages:
+    used = int(pages.read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 32 * 1024**2, used + 32 * 1024**2))
+for path in bombs:
+    try:
+        read_mcap_with_notes(path, DEFAULT_LIMITS)
+    except InvalidUpload as error:
+        print(error.detail)
+"""
+
+
+def test_a_bomb_needs_no_more_memory_than_it_declares(tmp_path: Path) -> None:
+    files = {
+        "right": (windowed(23), ""),
+        "zstd": (bomb("zstd", 1000), "declares 1000 bytes of content, but holds more"),
+        "lz4": (bomb("lz4", 1000), "declares 1000 bytes of content, but holds more"),
+        "huge": (bomb("zstd", 2**40), "at most 67108864"),
+        "window": (windowed(30), "requires too much memory"),
+        "length": (file_of(b"\5" + struct.pack("<Q", 2**40)), "at most 67108864"),
+    }
+    for name, (content, _) in files.items():
+        (tmp_path / name).write_bytes(content)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_IN_LITTLE_MEMORY, *(tmp_path / name for name in files)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    for line, (_, words) in zip(lines, list(files.values())[1:], strict=True):
+        assert words in line
 
 
 def test_many_small_chunks_are_counted_together() -> None:
@@ -157,6 +206,9 @@ def test_many_small_chunks_are_counted_together() -> None:
     chunk = replace(chunk, uncompressed_crc=0)
     limits = replace(DEFAULT_LIMITS, total_bytes=100 * ONE_MIB)
     assert "to more than" in refused(file_of(chunk, chunk), limits).detail
+
+
+MAP_PAST_ITS_LENGTH = struct.pack("<II", 0, 8) + struct.pack("<I", 1) + b"a" + bytes(4)
 
 
 @pytest.mark.parametrize(
@@ -182,6 +234,10 @@ def test_many_small_chunks_are_counted_together() -> None:
         ((DataEnd(0), CHANNEL, MESSAGE), "in the summary"),
         ((DataEnd(77),), "for the data section"),
         ((DataEnd(0), Footer(5, 0, 0)), "summary begins"),
+        (
+            (struct.pack("<BQ", Opcode.METADATA, 4 + 4 + 9) + MAP_PAST_ITS_LENGTH,),
+            "past its length",
+        ),
         ((Metadata("lagid.dataset", {"format": "9"}), CHANNEL, MESSAGE), "cannot be used"),
         ((Metadata("lagid.dataset", {}), CHANNEL, MESSAGE), "cannot be used"),
     ],
@@ -205,6 +261,40 @@ def test_a_record_that_cannot_be_right_is_refused(
 )
 def test_every_limit_is_kept(limits: UploadLimits, words: str) -> None:
     assert words in refused(FOREIGN[CompressionType.ZSTD], limits).detail
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        (UploadLimits(messages=3), "messages to more than 3"),
+        (UploadLimits(channels=1), "at most 1 are read"),
+        (UploadLimits(total_bytes=150), "to more than 150"),
+    ],
+)
+def test_the_limits_hold_for_messages_that_are_read_as_one_array(
+    limits: UploadLimits, words: str
+) -> None:
+    content = flat_file(*(flat_message(k, k, -k) for k in range(4)))
+    recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
+    np.testing.assert_array_equal(recording.channel("y").values, [0, -1, -2, -3])
+    assert words in refused(content, limits).detail
+
+
+def test_a_time_beyond_the_clock_is_refused_in_an_array_of_messages_too() -> None:
+    assert "2⁶³" in refused(flat_file(flat_message(1, 0, 0), flat_message(2**63, 0, 0))).detail
+
+
+def test_a_footer_that_denies_the_summary_is_refused() -> None:
+    error = refused(file_of(CHANNEL, MESSAGE, summary=(CHANNEL,)))
+    assert "says that the summary begins at 0" in error.detail
+
+
+def test_a_record_longer_than_the_limit_is_refused_unread_whatever_it_holds() -> None:
+    content = file_of(Metadata("notes", {"text": "x" * 2000}), CHANNEL, MESSAGE)
+    assert read_mcap_with_notes(content, DEFAULT_LIMITS)[0].names == ("x",)
+    error = refused(content, replace(DEFAULT_LIMITS, record_bytes=1000))
+    assert "the metadata record declares" in error.detail
+    assert "at most 1000" in error.detail
 
 
 def test_the_number_of_channels_is_limited() -> None:
@@ -259,3 +349,52 @@ def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> N
     assert read_mcap_with_notes(good, DEFAULT_LIMITS)[0].names == ("u",)
     bad = file_of(Metadata("lagid.dataset", {**manifest, **change}), CHANNEL, MESSAGE, later)
     refused(bad)
+
+
+@pytest.mark.parametrize("content", FILES)
+@given(data=st.data())
+@settings(max_examples=150)
+def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
+    whole, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
+    damaged = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        read, _ = read_mcap_with_notes(bytes(damaged), DEFAULT_LIMITS)
+    except InvalidUpload:
+        return
+    for before, after in zip(whole.channels, read.channels, strict=True):
+        np.testing.assert_array_equal(before.values, after.values)
+
+
+def is_read_whole_or_refused(content: bytes) -> bool:
+    """Whether a file gives channels with a value for every time, or a reason; nothing else may."""
+    try:
+        recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
+    except InvalidUpload as error:
+        return bool(str(error))
+    return bool(recording.channels) and all(
+        one.times.shape == one.values.shape for one in recording.channels
+    )
+
+
+@given(st.binary(max_size=400), st.sampled_from(FILES), st.data())
+@settings(max_examples=150)
+def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
+    junk: bytes, content: bytes, data: st.DataObject
+) -> None:
+    place = data.draw(st.integers(0, len(content)))
+    damaged = content[:place] + junk + content[place + data.draw(st.integers(0, 400)) :]
+    assert is_read_whole_or_refused(damaged)
+
+
+@given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=80)), max_size=8))
+@settings(max_examples=200)
+def test_records_of_any_content_are_read_or_refused(records: list[tuple[int, bytes]]) -> None:
+    raw = [struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records]
+    for content in (
+        file_of(CHANNEL, *raw, MESSAGE),
+        file_of(chunk_of(b"".join(raw), "", b"".join(raw))),
+    ):
+        assert is_read_whole_or_refused(content)

@@ -1,5 +1,6 @@
 """Uploads read in a child process: right answers, and one clear error for whatever goes wrong."""
 
+import sys
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.cli.identify import CsvOptions, read_recording
+from service.formats import limits as format_limits
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.sandbox import FileKind, read_untrusted
@@ -96,3 +99,35 @@ def test_a_file_that_makes_the_reader_stop_is_refused(tmp_path: Path) -> None:
 
 def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
     assert "63 bits" in refused(saved(tmp_path, b"t,u\n-1e12,1\n0,2\n"), "csv").detail
+
+
+def test_identify_reads_mcap_under_the_limits_of_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = np.arange(20_000) * 0.01
+    path = tmp_path / "recording.mcap"
+    path.write_bytes(recorded(Recording((Channel("u", times, np.sin(times)),))))
+    own = CsvOptions(None, ())
+    np.testing.assert_array_equal(read_recording(path, own).channel("u").values, np.sin(times))
+    for change, words in (
+        ({"memory_bytes": 64 * MIB}, "64 MiB of memory"),
+        ({"seconds": 0.01}, "takes more than 0.01 s"),
+    ):
+        smaller = replace(DEFAULT_LIMITS, **change)  # type: ignore[arg-type]
+        monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
+        with pytest.raises(InvalidUpload, match=words):
+            read_recording(path, own)
+
+
+def test_the_reader_does_not_see_the_secrets_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "python"
+    program.write_text(f"#!/bin/sh\nexec env > {tmp_path}/seen\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setenv("LAGID_API_KEY", "secret")
+    refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), "csv")
+    names = {line.partition("=")[0] for line in (tmp_path / "seen").read_text().splitlines()}
+    assert "PYTHONPATH" in names
+    assert "LAGID_API_KEY" not in names

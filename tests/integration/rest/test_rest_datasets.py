@@ -29,6 +29,30 @@ def test_the_same_bytes_again_give_the_same_dataset(server: TestClient, dataset:
     assert read_otherwise.json()["sample_time"] == pytest.approx(0.2)
 
 
+def test_the_same_bytes_read_otherwise_are_another_dataset(server: TestClient) -> None:
+    content = b"n,u,y\n1,2,3\n1,3,4\n2,4,5\n2,5,6\n"
+    ways = ["sample_time=0.1", "sample_time=0.2", "sample_time=0.1&segments=n"]
+    stored = [server.post(f"/v1/datasets?{way}", content=content, headers=CSV) for way in ways]
+    assert [answer.status_code for answer in stored] == [201, 201, 201]
+    assert len({answer.json()["id"] for answer in stored}) == 3
+    again = server.post(f"/v1/datasets?{ways[0]}&name=else", content=content, headers=CSV).json()
+    assert again["id"] == stored[0].json()["id"]
+    assert any("already stored as" in warning for warning in again["warnings"])
+    assert not any("already stored" in warning for warning in stored[0].json()["warnings"])
+
+
+def test_the_same_steps_on_two_datasets_give_two(server: TestClient, dataset: str) -> None:
+    other = server.post("/v1/datasets?name=b", content=recording(120), headers=CSV).json()["id"]
+    steps = {"steps": [{"trim": {"start": 0, "stop": 5}}]}
+    made = [
+        server.post(f"/v1/datasets/{one}:derive", json=steps).json() for one in (dataset, other)
+    ]
+    assert made[0]["id"] != made[1]["id"]
+    for one, parent in zip(made, (dataset, other), strict=True):
+        edges = server.get(f"/v1/datasets/{one['id']}/lineage").json()["edges"]
+        assert [edge["parent"] for edge in edges if edge["child"] == one["id"]] == [parent]
+
+
 def test_a_dataset_tells_its_channels_and_its_sampling(server: TestClient, dataset: str) -> None:
     told = server.get(f"/v1/datasets/{dataset}").json()
     assert [channel["name"] for channel in told["channels"]] == ["u", "y"]

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.formats.csv_recordings import read_csv
+from service.formats.csv_recordings import generate_csv, read_csv
 from service.formats.errors import InvalidUpload
+from sysid.data.records import Channel, Recording
 
 
 def refused(content: str | bytes, **options: object) -> InvalidUpload:
@@ -43,6 +44,13 @@ def test_times_in_another_unit_become_seconds(unit: str, row: float, seconds: fl
     assert notes == (() if unit == "Sec" else (told,))
 
 
+def test_times_in_milliseconds_are_the_nearest_numbers_of_seconds() -> None:
+    rows = "".join(f"{k},{k}\n" for k in range(1, 1000))
+    recording, _ = read_csv(f"t [ms],u\n{rows}".encode())
+    expected = [float(f"0.{k:03}") for k in range(1, 1000)]
+    assert recording.channel("u").times.tolist() == expected
+
+
 def test_a_unit_that_is_part_of_a_name_stays_in_the_name() -> None:
     recording, _ = read_csv(b"t_s,P1_true_Pa\n0,1\n1,2\n")
     assert recording.names == ("P1_true_Pa",)
@@ -54,8 +62,9 @@ def test_comma_semicolon_and_tab_separate(sign: str) -> None:
     assert [channel.values[0] for channel in recording.channels] == [1, 2]
 
 
-def test_decimal_commas_are_detected_and_said() -> None:
-    recording, notes = read_csv(b"t;u\n0,0;1,5\n0,1;-2\n")
+@pytest.mark.parametrize("sign", [";", "\t"])
+def test_decimal_commas_are_detected_and_said(sign: str) -> None:
+    recording, notes = read_csv("t;u\n0,0;1,5\n0,1;-2\n".replace(";", sign).encode())
     np.testing.assert_array_equal(recording.channel("u").values, [1.5, -2])
     assert any("decimal commas" in note for note in notes)
 
@@ -112,6 +121,28 @@ def test_segments_are_laid_end_to_end_with_their_labels() -> None:
     np.testing.assert_array_equal(pieces[1].channel("u").times, [0.1, 0.3])
 
 
+def test_the_axis_of_segments_has_the_decimals_that_were_written() -> None:
+    rows = "".join(f"{n},{0.3 + 0.1 * k:.1f},{k}\n" for n in range(4) for k in range(9))
+    recording, _ = read_csv(f"n,t,u\n{rows}".encode(), segments=("n",))
+    expected = [float(f"{n + 0.1 * k:.1f}") for n in range(4) for k in range(9)]
+    assert recording.channel("u").times.tolist() == expected
+    for piece in recording.split_segments():
+        assert piece.channel("u").times.tolist() == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1]
+
+
+def test_a_segment_as_long_as_a_round_step_does_not_touch_the_next() -> None:
+    recording, _ = read_csv(b"n,t,u\n1,0,1\n1,1,2\n2,0,3\n2,1,4\n", segments=("n",))
+    assert recording.channel("u").times.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_labels_are_numbers_only_if_all_of_them_are_finite() -> None:
+    recording, _ = read_csv(b"n,m,t,u\n1,1,0,1\nnan,2,0,2\n", segments=("n", "m"))
+    assert [dict(one.labels) for one in recording.segments] == [
+        {"n": "1", "m": 1.0},
+        {"n": "nan", "m": 2.0},
+    ]
+
+
 def test_equal_times_are_allowed_inside_repeats_only() -> None:
     recording, notes = read_csv(b"n,t,u\n1,0,1\n1,0,2\n2,0,3\n", segments=("n",))
     assert recording.samples == 3
@@ -123,6 +154,11 @@ def test_a_text_in_a_column_of_numbers_is_told_with_row_and_column() -> None:
     assert (error.row, error.column) == (3, "y")
     assert "'oops'" in error.detail
     assert error.errors[0].pointer == "/rows/3/y"
+
+
+def test_blank_rows_count_where_a_fault_is_told() -> None:
+    assert refused("t,u\n0,1\n\n\n1,2\n\n2,x\n").row == 7
+    assert refused("t,u\n0,1\n\n0,2\n").row == 4
 
 
 def test_the_row_of_a_fault_far_down_is_right() -> None:
@@ -194,6 +230,20 @@ def test_time_told_twice_or_wrongly_is_refused() -> None:
 def test_an_unknown_label_column_is_refused_with_the_nearest() -> None:
     assert "did you mean 'length'" in refused("t,length\n0,1\n", segments=("lenght",)).detail
     assert "no signal" in refused("t,length\n0,1\n", segments=("length",)).detail
+
+
+def test_channels_with_other_times_are_written_in_rows_of_their_own() -> None:
+    slow = Channel("u", np.array([0.05, 0.25]), np.array([1.0, 2.0]), "V")
+    fast = Channel("y", np.array([0.0, 0.1, 0.2]), np.array([0.1, np.nan, 0.3]))
+    text = "".join(generate_csv(Recording((slow, fast))))
+    assert text.splitlines() == [
+        "t,u [V],y",
+        "0.0,,0.1",
+        "0.05,1.0,",
+        "0.1,,",
+        "0.2,,0.3",
+        "0.25,2.0,",
+    ]
 
 
 def test_a_stray_quote_is_told_with_its_row() -> None:

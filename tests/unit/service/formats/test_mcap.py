@@ -1,14 +1,20 @@
 """Files of ours as other programs see them: the plain `mcap` reader and protobuf's own decoder."""
 
+import struct
+import zlib
 from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
 import pytest
+import zstandard
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import DataEnd, Footer, McapRecord, Message, MessageIndex, SummaryOffset
+from mcap.stream_reader import StreamReader
 
 from service.formats import mcap_writer
 from service.formats.mcap import (
@@ -39,6 +45,130 @@ def two_bases() -> Recording:
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcap_writer, "CHUNK_SAMPLES", 16)
+
+
+def walk_records(content: bytes, start: int = 8) -> dict[int, tuple[int, bytes]]:
+    """Opcode and content of every record by its offset, read without a library."""
+    records = {}
+    while start + 9 <= len(content):
+        opcode, length = struct.unpack_from("<BQ", content, start)
+        records[start] = (opcode, content[start + 9 : start + 9 + length])
+        start += 9 + length
+    return records
+
+
+def read_record(content: bytes, offset: int) -> McapRecord:
+    """Record at an offset, as the plain reader sees it."""
+    return next(StreamReader(BytesIO(content[offset:]), skip_magic=True).records)
+
+
+def unpack_chunk(chunk: bytes) -> tuple[int, bytes]:
+    """Stored checksum and unpacked content of a chunk record."""
+    _, _, size, crc, length = struct.unpack_from("<QQQII", chunk)
+    assert chunk[32 : 32 + length] == b"zstd"
+    return crc, zstandard.decompress(chunk[40 + length :], max_output_size=size)
+
+
+def later_and_shorter() -> Recording:
+    """Two topics: the second begins last and ends first."""
+    return Recording(
+        (
+            Channel("u", TIMES + 1, np.sin(TIMES)),
+            Channel("y", np.array([1.1, 1.15, 1.2]), np.array([1.0, 2.0, 3.0])),
+        )
+    )
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_every_checksum_is_stored_and_right() -> None:
+    content = recorded(two_bases())
+    records = walk_records(content)
+    chunks = [unpack_chunk(body) for opcode, body in records.values() if opcode == Opcode.CHUNK]
+    assert len(chunks) == 4
+    assert all(crc == zlib.crc32(unpacked) != 0 for crc, unpacked in chunks)
+    [data_end] = [at for at, (opcode, _) in records.items() if opcode == Opcode.DATA_END]
+    stored = read_record(content, data_end)
+    assert isinstance(stored, DataEnd)
+    assert stored.data_section_crc == zlib.crc32(content[:data_end]) != 0
+    [end] = [at for at, (opcode, _) in records.items() if opcode == Opcode.FOOTER]
+    footer = read_record(content, end)
+    assert isinstance(footer, Footer)
+    assert footer.summary_start == data_end + 9 + 4
+    assert footer.summary_crc == zlib.crc32(content[footer.summary_start : end + 9 + 16]) != 0
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_the_index_of_a_chunk_points_to_each_message_and_has_its_time() -> None:
+    content = recorded(later_and_shorter())
+    records = walk_records(content)
+    summary = make_reader(BytesIO(content)).get_summary()
+    assert summary is not None
+    times: dict[int, list[int]] = {1: [], 2: []}
+    sequences: dict[int, list[int]] = {1: [], 2: []}
+    for entry in summary.chunk_indexes:
+        opcode, chunk = records[entry.chunk_start_offset]
+        assert opcode == Opcode.CHUNK
+        assert entry.chunk_length == 9 + len(chunk)
+        assert entry.compressed_size == len(chunk) - 40 - len("zstd")
+        unpacked = unpack_chunk(chunk)[1]
+        assert entry.uncompressed_size == len(unpacked)
+        [(channel, offset)] = entry.message_index_offsets.items()
+        assert records[offset][0] == Opcode.MESSAGE_INDEX
+        assert offset == entry.chunk_start_offset + entry.chunk_length
+        assert entry.message_index_length == 9 + len(records[offset][1])
+        index = read_record(content, offset)
+        assert isinstance(index, MessageIndex)
+        assert index.channel_id == channel
+        assert [place for _, place in index.records] == list(walk_records(unpacked, 0))
+        for log_time, place in index.records:
+            message = read_record(unpacked, place)
+            assert isinstance(message, Message)
+            assert (message.channel_id, message.log_time) == (channel, log_time)
+            times[channel].append(log_time)
+            sequences[channel].append(message.sequence)
+        assert struct.unpack_from("<QQ", chunk) == (index.records[0][0], index.records[-1][0])
+        assert entry.message_start_time == index.records[0][0]
+        assert entry.message_end_time == index.records[-1][0]
+    assert times[1] == [1_000_000_000 + 10_000_000 * k for k in range(40)]
+    assert times[2] == [1_100_000_000, 1_150_000_000, 1_200_000_000]
+    assert sequences == {1: list(range(40)), 2: [0, 1, 2]}
+
+
+def test_the_statistics_span_all_topics() -> None:
+    summary = make_reader(BytesIO(recorded(later_and_shorter()))).get_summary()
+    assert summary is not None
+    statistics = summary.statistics
+    assert statistics is not None
+    assert statistics.message_start_time == 1_000_000_000
+    assert statistics.message_end_time == 1_390_000_000
+    assert statistics.channel_message_counts == {1: 40, 2: 3}
+    assert (statistics.schema_count, statistics.channel_count) == (2, 2)
+
+
+def test_the_offsets_of_the_summary_enclose_records_of_one_kind_each() -> None:
+    content = recorded(two_bases())
+    records = walk_records(content)
+    offsets = [
+        record
+        for at, (opcode, _) in records.items()
+        if opcode == Opcode.SUMMARY_OFFSET
+        and isinstance(record := read_record(content, at), SummaryOffset)
+    ]
+    assert len(offsets) == 5
+    for group in offsets:
+        inside = range(group.group_start, group.group_start + group.group_length)
+        opcodes = {opcode for at, (opcode, _) in records.items() if at in inside}
+        assert opcodes == {group.group_opcode}
+        assert inside.stop in records
+    ends = [group.group_start + group.group_length for group in offsets]
+    assert [group.group_start for group in offsets[1:]] == ends[:-1]
+
+
+def test_times_before_zero_come_back() -> None:
+    before = Channel("u", np.array([-0.5, -0.25, 0.0, 2.0]), np.arange(4.0))
+    np.testing.assert_array_equal(
+        read_recording(recorded(Recording((before,)))).channel("u").times, before.times
+    )
 
 
 @pytest.mark.usefixtures("small_chunks")

@@ -1,5 +1,7 @@
 """Files of other programs: what is read, what is left out, and what is refused."""
 
+import struct
+
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Kind
@@ -11,6 +13,7 @@ from mcap.writer import CompressionType
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import read_mcap_with_notes
+from service.formats.mcap_messages import build_schema
 from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 
@@ -105,6 +108,56 @@ def test_the_times_of_a_clock_are_counted_from_the_first_exactly() -> None:
     recording, notes = read(content)
     np.testing.assert_array_equal(recording.channels[0].times, [0, 0.001, 0.002])
     assert any(str(start) in note for note in notes)
+
+
+def test_the_times_of_a_clock_are_counted_from_the_first_of_any_topic() -> None:
+    start = 1_700_000_000_000_000_000
+    content = foreign([("/late", start + 10**9, b'{"x": 1}'), ("/early", start, b'{"x": 2}')])
+    recording, _ = read(content)
+    assert recording.channel("early.x").times.tolist() == [0.0]
+    assert recording.channel("late.x").times.tolist() == [1.0]
+
+
+PAIR = ("lagid.Pair", "protobuf", build_schema("Pair", ("x", "y")))
+
+
+def pair(x: float, y: float) -> bytes:
+    """Message of `PAIR` with both fields written, as our own writer does."""
+    return struct.pack("<BdBd", 0x09, x, 0x11, y)
+
+
+def test_two_topics_of_one_schema_do_not_mix_wherever_their_chunks_end() -> None:
+    messages = [
+        (topic, k * 10**6, pair(sign * k, sign * (k + 0.5)))
+        for k in range(100)
+        for topic, sign in (("/a", 1), ("/b", -1))
+    ]
+    for size in (200, 1000, 10**6):
+        content = foreign(messages, encoding="protobuf", schema=PAIR, chunk_size=size)
+        recording, _ = read(content)
+        assert recording.names == ("a.x", "a.y", "b.x", "b.y")
+        for name, sign in (("a", 1), ("b", -1)):
+            steps = np.arange(100)
+            np.testing.assert_array_equal(recording.channel(f"{name}.x").values, sign * steps)
+            np.testing.assert_array_equal(
+                recording.channel(f"{name}.y").values, sign * (steps + 0.5)
+            )
+            np.testing.assert_array_equal(recording.channel(f"{name}.x").times, steps / 1000)
+
+
+def test_fields_count_by_their_number_and_not_by_their_place() -> None:
+    swapped = struct.pack("<BdBd", 0x11, 2.0, 0x09, 1.0)
+    messages = [("/a", k, data) for k, data in enumerate([pair(1, 2), *[swapped] * 60])]
+    recording, _ = read(foreign(messages, encoding="protobuf", schema=PAIR, chunk_size=100))
+    np.testing.assert_array_equal(recording.channel("x").values, np.ones(61))
+    np.testing.assert_array_equal(recording.channel("y").values, np.full(61, 2.0))
+
+
+def test_messages_of_one_time_keep_their_order_when_a_topic_is_sorted() -> None:
+    times = [5] * 50 + [1] * 50
+    content = foreign([("/a", time, b'{"x": %d}' % k) for k, time in enumerate(times)])
+    recording, _ = read(content)
+    np.testing.assert_array_equal(recording.channel("x").values, [*range(50, 100), *range(50)])
 
 
 def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:

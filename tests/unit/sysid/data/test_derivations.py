@@ -118,6 +118,24 @@ def test_the_mean_of_each_period_is_taken() -> None:
     assert values(made, "u")[2] == pytest.approx(np.mean(values(start, "u")[8:13]))
 
 
+def test_a_sample_between_two_periods_counts_half_in_each() -> None:
+    start = recording(101)
+    made = derive_recording(start, [{"resample": {"sample_time": 0.2, "method": "mean"}}])
+    u = values(start, "u")
+    np.testing.assert_allclose(
+        values(made, "u")[1:50], (u[1:98:2] + 2 * u[2:99:2] + u[3:100:2]) / 4
+    )
+
+
+def test_a_common_grid_has_no_time_that_a_channel_lacks() -> None:
+    late = Channel("y", 0.5 + np.arange(20) * 0.1, np.arange(20.0))
+    early = Channel("u", np.arange(15) * 0.1, np.arange(15.0))
+    made = derive_recording(Recording((early, late)), [{"resample": {"sample_time": 0.1}}])
+    np.testing.assert_allclose(made.channel("u").times, 0.5 + np.arange(10) * 0.1)
+    np.testing.assert_allclose(values(made, "u"), np.arange(5.0, 15.0))
+    np.testing.assert_allclose(values(made, "y"), np.arange(10.0))
+
+
 def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() -> None:
     # Jumps between the points of the new grid must not move, or every lag behind them would.
     held = Channel(

@@ -5,6 +5,7 @@ import pytest
 
 from sysid.core.errors import InvalidSettings
 from sysid.data.noise import Noise, add_output_noise, draw_noise
+from sysid.data.records import Channel, Record
 from tests.searching import clean, record
 
 
@@ -30,6 +31,26 @@ def test_noise_repeats_by_its_seed_and_differs_between_channels_and_experiments(
     assert np.array_equal(once.outputs[0].values, again.outputs[0].values)
     assert not np.array_equal(once.outputs[0].values, other.outputs[0].values)
     assert not np.array_equal(draw_noise(noise, 9, 0), draw_noise(noise, 9, 1))
+
+
+def test_no_stream_of_a_seed_is_a_stream_of_another() -> None:
+    drawn = {
+        draw_noise(Noise(1.0, seed=seed), 4, stream).tobytes()
+        for seed in range(4)
+        for stream in range(4)
+    }
+    assert len(drawn) == 16
+
+
+def test_every_output_of_every_experiment_has_noise_of_its_own() -> None:
+    times = np.arange(4.0)
+    zero = Record((), tuple(Channel(name, times, np.zeros(4)) for name in ("y", "z", "w")))
+    drawn = {
+        output.values.tobytes()
+        for experiment in range(4)
+        for output in add_output_noise(zero, Noise(1.0, seed=3), experiment).outputs
+    }
+    assert len(drawn) == 12
 
 
 def test_noise_leaves_the_inputs_and_zero_sigma_leaves_all() -> None:

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
-from sysid.data.records import Channel, Record, Recording, Segment, measure_sampling
+from sysid.data.records import (
+    Channel,
+    History,
+    Record,
+    Recording,
+    Segment,
+    find_common_sample_time,
+    measure_sampling,
+    trim_missing_history,
+)
 from sysid.data.splitting import split_record
 
 
@@ -56,6 +65,44 @@ def test_several_segments_are_several_experiments_on_their_own_times() -> None:
     first, second = recording.to_records({}, {"y": "y"})
     np.testing.assert_array_equal(first.outputs[0].times, [0, 0.5])
     np.testing.assert_array_equal(second.outputs[0].times, [3, 3.25])
+
+
+def test_a_part_holds_the_samples_at_both_of_its_ends() -> None:
+    channel = Channel("y", np.arange(6.0), np.arange(6.0) ** 2)
+    np.testing.assert_array_equal(channel.slice_time(1.0, 4.0).times, [1, 2, 3, 4])
+    with pytest.raises(InvalidRecord, match=r"no sample from 1\.25 to 1\.75 s"):
+        channel.slice_time(1.25, 1.75)
+
+
+def test_a_record_is_known_before_its_start_as_long_as_all_inputs_are() -> None:
+    def known(since: float | None) -> Channel:
+        before = None if since is None else np.arange(since, 0.0)
+        history = None if before is None else History(before, np.ones(before.size))
+        return Channel("u", np.arange(3.0), np.ones(3), history=history)
+
+    output = Channel("y", np.arange(3.0), np.ones(3))
+    assert Record((known(-5.0), known(-2.0)), (output,)).history_duration == 2.0
+    assert Record((known(-5.0), known(None)), (output,)).history_duration == 0.0
+    assert Record((), (output,)).history_duration == 0.0
+
+
+def test_a_history_is_cut_behind_the_last_of_its_gaps() -> None:
+    holes = np.array([1.0, np.nan, 3.0, np.nan, 5.0, 6.0])
+    kept = trim_missing_history(History(np.arange(-6.0, 0.0), holes))
+    assert kept is not None
+    assert (kept.times.tolist(), kept.values.tolist()) == ([-2, -1], [5, 6])
+
+
+def test_one_sample_off_its_place_makes_a_long_record_irregular() -> None:
+    times = np.arange(1000) * 0.1
+    times[500] += 0.02
+    assert not measure_sampling(times).is_regular
+
+
+def test_records_have_one_sampling_period_only_if_all_outputs_share_it() -> None:
+    slow, fast = (Record((), (ramp("y", 20, period),)) for period in (0.2, 0.1))
+    assert find_common_sample_time([slow, slow]) == pytest.approx(0.2)
+    assert find_common_sample_time([slow, fast]) is None
 
 
 def test_regular_and_irregular_times_are_told_apart() -> None:

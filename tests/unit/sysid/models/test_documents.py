@@ -98,6 +98,9 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"form": None}, "/form", "is missing"),
         ({"name": None}, "/name", "is missing"),
         ({"name": "two words"}, "/name", "cannot be a model's name"),
+        ({"name": "a/b"}, "/name", "cannot be a model's name"),
+        ({"name": ".hidden"}, "/name", "starting with a letter or a digit"),
+        ({"name": "a" * 65}, "/name", "up to 64"),
         ({"equation": {}}, "/equation", "did you mean 'equations'?"),
         ({"title": 3}, "/title", "3 is not a text"),
         ({"constants": {"m": 0, 2: None}}, "/constants", "write 0.2 where 0,2 was meant"),
@@ -129,6 +132,7 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"solver": {"step": 0}}, "/solver/step", "need more than 0"),
         ({"solver": {"step": "smple"}}, "/solver/step", "is not 'sample'"),
         ({"solver": {"substeps": 1.5}}, "/solver/substeps", "whole number from 1"),
+        ({"solver": {"substeps": 1001}}, "/solver/substeps", "whole number from 1 to 1000"),
         ({"solver": {"substep": 2}}, "/solver/substep", "did you mean 'substeps'?"),
     ],
 )

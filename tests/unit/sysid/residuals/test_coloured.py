@@ -11,7 +11,11 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.residuals.autocorrelation import space_residuals
-from sysid.residuals.coloured import estimate_spectrum_root
+from sysid.residuals.coloured import (
+    ColouredCovariance,
+    estimate_coloured_covariance,
+    estimate_spectrum_root,
+)
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
@@ -123,6 +127,52 @@ def test_intervals_hold_the_truth_where_the_noise_is_coloured() -> None:
         assert found is not None
         held.append(np.abs(end.theta - truth) <= 1.97 * np.sqrt(np.diag(found.covariance)))
     assert np.mean(held) > 0.87  # about 0.92; without R about 0.6
+
+
+def unequal(lengths: tuple[int, ...], deviations: tuple[float, ...]) -> tuple[Problem, FloatArray]:
+    """A mean of several white records, and their residuals."""
+    draw = np.random.default_rng(5)
+    noise = [sd * draw.standard_normal(n) for n, sd in zip(lengths, deviations, strict=True)]
+    records = [
+        Record(
+            (Channel("u", np.arange(1.0 * n), np.zeros(n)),),
+            (Channel("y", np.arange(1.0 * n), values),),
+        )
+        for n, values in zip(lengths, noise, strict=True)
+    ]
+    problem = Problem.build(load_model(STEADY), records, skip=1)
+    return problem, np.concatenate([values[1:] for values in noise])
+
+
+def covariance(
+    lengths: tuple[int, ...], deviations: tuple[float, ...]
+) -> ColouredCovariance | None:
+    problem, residuals = unequal(lengths, deviations)
+    return estimate_coloured_covariance(problem, residuals, np.ones((residuals.size, 1)))
+
+
+def test_records_of_one_noise_are_not_taken_for_unequal_however_long_each_is() -> None:
+    assert covariance((41, 4001), (1.0, 1.0)) is None
+    assert covariance((4001, 41), (1.0, 1.0)) is None
+    assert covariance((41, 4001), (2.5, 1.0)) is not None
+
+
+def test_white_records_of_unequal_noise_have_their_own_variances_and_degrees() -> None:
+    lengths, deviations = (101, 401), (4.0, 1.0)
+    found = covariance(lengths, deviations)
+    assert found is not None
+    assert found.is_white
+    _, residuals = unequal(lengths, deviations)
+    n = np.array([100.0, 400.0])
+    squares = np.array([np.sum(residuals[:100] ** 2), np.sum(residuals[100:] ** 2)])
+    used = n / 500  # one parameter, which each sample determines alike
+    # The variance of a record from its own degrees of freedom; n terms of it, less the share of
+    # the parameter among all, which the caller's mean square has taken already.
+    parts = squares / (n - used) * n * (499 / 500)
+    assert found.middle[0, 0] == pytest.approx(np.sum(parts))
+    degrees = np.sum(parts) ** 2 / np.sum(parts**2 / (n - used))
+    assert found.compute_degrees(np.ones(1)) == pytest.approx(degrees)
+    assert degrees < 0.5 * 500
 
 
 def test_slow_noise_beside_white_is_as_slow_as_it_is() -> None:

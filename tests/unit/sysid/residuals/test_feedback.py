@@ -107,6 +107,20 @@ def test_too_short_constant_and_irregular_records_are_not_judged() -> None:
     assert compute_explained_share(judged._replace(times=uneven), held(u)) == 0.0
 
 
+@pytest.mark.parametrize(("closed", "least", "most"), [("first", 0.0, 0.3), ("last", 0.9, 1.0)])
+def test_of_a_long_record_the_last_5_000_samples_are_judged(
+    closed: str, least: float, most: float
+) -> None:
+    n = 10_000
+    draw, times = np.random.default_rng(4), STEP * np.arange(10_000)
+    residual = draw.normal(size=n)
+    follows = -residual - 0.5 * np.concatenate([[0.0], residual[:-1]])
+    in_loop = times < times[n // 2] if closed == "first" else times >= times[n // 2]
+    u = np.where(in_loop, follows, 0.0) + np.where(in_loop, 0.01, 1.0) * draw.normal(size=n)
+    long = ResidualSeries(0, "y", times, residual, np.ones(n, dtype=np.bool_), 1.0, ())
+    assert least <= compute_explained_share(long, Channel("u", times, u, hold="zero")) <= most
+
+
 def test_a_regulated_record_without_reference_is_warned_of() -> None:
     u, y = loop(1, np.zeros(N))
     record = Record((held(u),), (Channel("y", TIMES, y),))

@@ -73,6 +73,18 @@ def test_a_later_output_has_a_delay_that_is_longer_by_as_much() -> None:
     assert later == pytest.approx(first + 0.25, abs=0.003)
 
 
+def test_one_event_that_is_answered_late_does_not_move_it() -> None:
+    late = response(TIMES)
+    turn = 3 * HOLD
+    held_back = response(TIMES, L + 0.5)
+    late[turn : turn + HOLD] = held_back[turn : turn + HOLD]  # one step of five
+    found = delays(steps(), late)
+    assert found.events == LEVELS.size - 1
+    assert found.delay == pytest.approx(EXPECTED, abs=0.002)
+    assert found.spread is not None
+    assert found.spread > 0.1
+
+
 def test_a_ramp_of_the_input_is_not_counted_as_delay() -> None:
     ramp = np.interp(TIMES, [1.0, 1.4], [0.0, 1.0])
     late = np.interp(TIMES - 0.3, [1.0, 1.4], [0.0, 1.0])

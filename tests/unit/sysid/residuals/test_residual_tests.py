@@ -11,16 +11,19 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.parameters import override_parameters
+from sysid.residuals.autocorrelation import space_residuals
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import (
     CorrelationFunction,
     ResidualTests,
     compute_correlations,
     judge_tests,
+    list_residual_series,
     make_residual_series,
     run_residual_tests,
 )
 from sysid.simulation.problem import Problem
+from tests.models import difference
 
 N, STEP = 400, 0.1
 TIMES = np.arange(N) * STEP
@@ -321,6 +324,14 @@ def test_a_degree_of_freedom_is_always_left_and_records_share_the_loss() -> None
     assert [curve.test.degrees for curve in compute_correlations(pair)] == [23.0, 23.0]
 
 
+def test_an_output_loses_degrees_for_its_own_coefficients_only() -> None:
+    one = make_residual_series(
+        0, "y", TIMES, draws(1).normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ()
+    )
+    both = [one._replace(coefficients=4), one._replace(output="z", coefficients=2)]
+    assert [curve.test.degrees for curve in compute_correlations(both)] == [21.0, 23.0]
+
+
 @pytest.mark.parametrize(
     ("name", "fixed", "count"),
     [
@@ -365,3 +376,74 @@ def test_one_input_after_another_is_told_apart_whatever_its_numbers_are(kind: ty
     assert not np.array_equal(first, second)
     again = [found(residual, u.astype(kind))[1].values for u in inputs]
     assert np.array_equal(again, [first, second])
+
+
+@pytest.mark.parametrize(("faulty", "outcome"), [("first", "passed"), ("last", "failed")])
+def test_of_a_long_record_the_last_20_000_samples_are_tested(faulty: str, outcome: str) -> None:
+    n = 23_000
+    draw = draws(15)
+    residual, u = draw.normal(size=n), held(draw, n)
+    span = slice(0, 3000) if faulty == "first" else slice(n - 3000, n)
+    residual[span] += np.concatenate([np.zeros(7), u[span][:-7]])  # a missed response
+    times = STEP * np.arange(n)
+    channel = Channel("u", times, u, hold="zero")
+    everything = np.ones(n, dtype=bool)
+    series = make_residual_series(0, "y", times, residual, np.zeros(n), everything, (channel,))
+    tests = [curve.test for curve in compute_correlations([series])]
+    assert [test.samples for test in tests] == [20_000, 20_000]
+    assert tests[1].outcome == outcome
+    # The size that tells rounding is that of the tested part.
+    assert series.size == np.max(np.abs(residual[-20_000:]))
+
+
+def test_outputs_of_other_weights_meet_a_robust_loss_with_their_weights() -> None:
+    model = difference(
+        {"x": "c*x(k-1) + b*u(k-1)"}, "x", outputs={"y": "x", "z": "2*x"}, initial={"x": 0}
+    )
+    draw = draws(16)
+    record = Record(
+        (Channel("u", TIMES, held(draw)),),
+        tuple(Channel(name, TIMES, draw.normal(size=N)) for name in ("y", "z")),
+    )
+    scale, weights = 0.7, {"y": 4.0, "z": 0.25}
+    fixed = {"c": {"fixed": 0.5}, "b": {"fixed": 1.0}, "L": {"fixed": 0.0}}
+    one = Problem.build(
+        model, (record,), parameters=fixed, weights=weights, loss=Loss("soft-l1", scale)
+    )
+    simulated = draw.normal(size=2 * N)
+    for series, model_output in zip(
+        list_residual_series(one, simulated),
+        one.split_by_output(simulated)[0].values(),
+        strict=True,
+    ):
+        measured = next(item.values for item in record.outputs if item.name == series.output)
+        error = weights[series.output] * (measured - model_output)
+        np.testing.assert_allclose(series.residual, error / np.sqrt(1 + (error / scale) ** 2))
+        assert series.size == np.max(np.abs(weights[series.output] * measured))
+
+
+@pytest.mark.parametrize(("share", "is_regular"), [(0.04, True), (0.06, False), (0.4, False)])
+def test_samples_count_as_regular_up_to_5_percent_of_a_period_off_their_place(
+    share: float, is_regular: bool
+) -> None:
+    times = TIMES.copy()
+    times[[50, 171]] += share * STEP
+    assert space_residuals(times, np.ones(N)).is_regular is is_regular
+    crossed = found(draws(17).normal(size=N), held(draws(17)), times=times)
+    assert (crossed[0].period is not None) is is_regular
+
+
+def test_the_last_value_of_a_held_input_holds_for_a_period() -> None:
+    draw = draws(18)
+    coarse = draw.choice([-1.0, 1.0], N // 2)
+    fine = Channel("u", TIMES, np.repeat(coarse, 2), hold="zero")
+    sparse = Channel("u", TIMES[::2], coarse, hold="zero")
+    assert sparse.times[-1] < TIMES[-1]
+    residual = draw.normal(size=N)
+    residual[-1] = 30.0  # if this sample is left out, every correlation changes
+    both = [
+        make_residual_series(0, "y", TIMES, residual, np.zeros(N), np.ones(N, dtype=bool), (one,))
+        for one in (fine, sparse)
+    ]
+    first, second = (compute_correlations([series])[1] for series in both)
+    np.testing.assert_allclose(second.values, first.values, atol=1e-12)
