@@ -74,6 +74,11 @@ class RunRecorder:
 
     Events are collected, and `write_due` writes them. Results are written at most every
     `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
+
+    Parameters
+    ----------
+    stopwatch : callable
+        Elapsed seconds of this process.
     """
 
     def __init__(
@@ -82,9 +87,11 @@ class RunRecorder:
         claim: Claim,
         save_signals: SaveSignals,
         tell_failed: Callable[[str], None],
+        *,
+        stopwatch: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lease = claim.lease
-        self._tell_failed = tell_failed
+        self._tell_failed, self._stopwatch = tell_failed, stopwatch
         self.is_stopped = False
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MOST_REASONS)
@@ -98,7 +105,7 @@ class RunRecorder:
         self._evaluations, self._generation = before.evaluations, before.generations
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
-        self._n_begun, self._begun = claim.job.n_done, time.monotonic()
+        self._n_begun, self._begun = claim.job.n_done, self._stopwatch()
         self._n_known = 0
         self._taken: list[RunOutcome] = []  # from other runs, in the present transaction
         self._told = self._wrote = self._kept = 0.0
@@ -183,7 +190,7 @@ class RunRecorder:
         LeaseLost
             If another dispatcher holds the job. Nothing was written.
         """
-        now = time.monotonic()
+        now = self._stopwatch()
         tell = self._news and now - self._told > PROGRESS_SECONDS
         keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
         some = self._pending.has_runs
@@ -192,7 +199,7 @@ class RunRecorder:
 
     def write_all(self) -> None:
         """Write everything, including checkpoints, because the dispatcher stops."""
-        self._commit_writes(time.monotonic(), tell=True, keep=True)
+        self._commit_writes(self._stopwatch(), tell=True, keep=True)
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
@@ -219,7 +226,7 @@ class RunRecorder:
 
     def write_results(self) -> None:
         """Write the last results without ending the job."""
-        self._commit_writes(time.monotonic(), tell=True, keep=False)
+        self._commit_writes(self._stopwatch(), tell=True, keep=False)
 
     def cancel_job(self) -> None:
         """End the job as cancelled. Earlier results of its runs remain."""
@@ -255,7 +262,7 @@ class RunRecorder:
         before = sum(live.first_generation for live in self._live.values())
         done = (self._n_done - self._n_begun) * self._generations + open_runs - before
         left = total - self._n_done * self._generations - open_runs
-        elapsed = time.monotonic() - self._begun
+        elapsed = self._stopwatch() - self._begun
         return max(0.0, elapsed * left / done) if done > 0 else None
 
     def _summarise_failures(self, n_failed: int, n_runs: int) -> str | None:
