@@ -74,6 +74,11 @@ class RunRecorder:
 
     Events are collected, and `write_due` writes them. Results are written at most every
     `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
+
+    Parameters
+    ----------
+    stopwatch : callable
+        Elapsed seconds of this process.
     """
 
     def __init__(
@@ -82,9 +87,11 @@ class RunRecorder:
         claim: Claim,
         save_signals: SaveSignals,
         report_failure: Callable[[str], None],
+        *,
+        stopwatch: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lease = claim.lease
-        self._report_failure = report_failure
+        self._report_failure, self._stopwatch = report_failure, stopwatch
         self.is_stopped = False
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MAX_REASONS)
@@ -98,7 +105,7 @@ class RunRecorder:
         self._evaluations, self._generation = before.evaluations, before.generations
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
-        self._n_begun, self._begun = claim.job.n_done, time.monotonic()
+        self._n_begun, self._begun = claim.job.n_done, self._stopwatch()
         self._n_reused = 0
         self._reused_outcomes: list[RunOutcome] = []  # from other runs, in the present transaction
         self._progress_written_at = 0.0  # these three on the monotonic clock
@@ -185,7 +192,7 @@ class RunRecorder:
         LeaseLost
             If another dispatcher holds the job. Nothing was written.
         """
-        now = time.monotonic()
+        now = self._stopwatch()
         with_progress = (
             self._has_new_progress and now - self._progress_written_at > PROGRESS_SECONDS
         )
@@ -198,7 +205,7 @@ class RunRecorder:
 
     def write_all(self) -> None:
         """Write everything, including checkpoints, because the dispatcher stops."""
-        self._commit_writes(time.monotonic(), with_progress=True, with_checkpoints=True)
+        self._commit_writes(self._stopwatch(), with_progress=True, with_checkpoints=True)
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
@@ -225,7 +232,7 @@ class RunRecorder:
 
     def write_results(self) -> None:
         """Write the last results without ending the job."""
-        self._commit_writes(time.monotonic(), with_progress=True, with_checkpoints=False)
+        self._commit_writes(self._stopwatch(), with_progress=True, with_checkpoints=False)
 
     def cancel_job(self) -> None:
         """End the job as cancelled. Earlier results of its runs remain."""
@@ -263,7 +270,7 @@ class RunRecorder:
         before = sum(live.first_generation for live in self._live.values())
         done = (self._n_done - self._n_begun) * self._generations + open_runs - before
         left = total - self._n_done * self._generations - open_runs
-        elapsed = time.monotonic() - self._begun
+        elapsed = self._stopwatch() - self._begun
         return max(0.0, elapsed * left / done) if done > 0 else None
 
     def _summarise_failures(self, n_failed: int, n_runs: int) -> str | None:

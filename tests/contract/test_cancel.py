@@ -117,6 +117,36 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
     assert claim(database).lease.attempt == 2
 
 
+def test_a_resumed_job_begins_with_a_clean_slate_and_leaves_other_jobs_alone(database):
+    other, (foreign,) = claimed(database)
+    with database.write_session() as session:
+        RunWriter(session, other.lease).record_outcomes(
+            [RunOutcome(run_id=foreign, state=JobState.SUCCEEDED, best_rms=0.1)]
+        )
+    running, (runs_on,) = claimed(database)
+    with database.write_session() as session:
+        RunWriter(session, running.lease).start_runs([runs_on])
+    got, (run_id,) = claimed(database, max_attempts=2)
+    with database.write_session() as session:
+        RunWriter(session, got.lease).write_kills({run_id: 1})
+    for _ in range(2):  # the dispatcher loses its workers twice, and gives up
+        with database.write_session() as session:
+            LeaseQueue(session).release_job(got.lease, lost=True)
+        got = claim(database) or got
+    assert state_of(database, got.job.id) is JobState.FAILED
+    with database.write_session() as session:
+        job = JobRepository(session).resume(got.job.id)
+        assert (job.n_done, job.lost_leases, job.cancel_requested) == (0, 0, False)
+    assert [run.kills for run in runs_of(database, got.job.id)] == [0]
+    again = claim(database)
+    assert again.job.id == got.job.id
+    with database.write_session() as session:
+        LeaseQueue(session).release_job(again.lease, lost=True)
+    assert state_of(database, got.job.id) is JobState.QUEUED  # one loss of two
+    states = [runs_of(database, one.job.id)[0].state for one in (other, running)]
+    assert states == [JobState.SUCCEEDED, JobState.RUNNING]
+
+
 def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
     job_id = submit(database)
     with pytest.raises(RowConflict, match="queued"), database.write_session() as session:

@@ -8,6 +8,7 @@ from sqlalchemy import text
 
 from service.core.states import JobState
 from service.queue.leases import JobProgress, Lease, LeaseQueue
+from service.queue.notifications import read_queue_status
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
@@ -15,6 +16,8 @@ from service.storage.errors import LeaseLost, RowConflict
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 
 LEASE = timedelta(seconds=10)
+IMPATIENT_SECONDS = 0.5
+"""How long a transaction of a test waits for a lock that must not be in its way."""
 ENDS = [JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED]
 
 
@@ -82,10 +85,61 @@ def test_no_two_claimers_ever_get_the_same_job(database):
 @pytest.mark.postgres
 def test_a_claimer_does_not_wait_for_a_rival_that_has_not_committed(postgres_database):
     first, second = submit(postgres_database), submit(postgres_database)
+    found = []
     with postgres_database.write_session() as slow:
         assert LeaseQueue(slow).claim_job("slow").job.id == first
-        assert claim(postgres_database, "quick").job.id == second
-        assert claim(postgres_database, "quick") is None
+        for _ in range(2):
+            with postgres_database.write_session(IMPATIENT_SECONDS) as quick:
+                got = LeaseQueue(quick).claim_job("quick")
+                found.append(None if got is None else got.job.id)
+    assert found == [second, None]
+
+
+@pytest.mark.postgres
+def test_a_reaper_leaves_a_job_alone_while_its_owner_writes(postgres_database, clock):
+    job = submit(postgres_database)
+    lease = claim(postgres_database, "d1", clock).lease
+    clock.advance(11)
+    with postgres_database.write_session() as writer:
+        LeaseQueue(writer).lock_job(lease)
+        with postgres_database.write_session(IMPATIENT_SECONDS) as session:
+            assert LeaseQueue(session, clock).reap_expired().requeued == ()
+        LeaseQueue(writer).append_event(lease, "log", {"line": "in time"})
+    assert reap(postgres_database, clock).requeued == (job,)
+
+
+@pytest.mark.postgres
+def test_a_reaper_does_not_wait_for_another_that_reaps_the_same_job(postgres_database, clock):
+    job = submit(postgres_database)
+    claim(postgres_database, "d1", clock)
+    clock.advance(11)
+    with postgres_database.write_session() as slow:
+        assert LeaseQueue(slow, clock).reap_expired().requeued == (job,)
+        with postgres_database.write_session(IMPATIENT_SECONDS) as quick:
+            assert LeaseQueue(quick, clock).reap_expired().requeued == ()
+    assert job_of(postgres_database, job).lost_leases == 1
+
+
+def test_a_claim_without_an_answer_is_found_among_those_of_its_owner_only(database):
+    rival, known, lost = (submit(database) for _ in range(3))
+    for owner, job in (("rival", rival), ("d1", known), ("d1", lost)):
+        assert claim(database, owner).job.id == job
+    with database.write_session() as session:
+        queue = LeaseQueue(session)
+        assert queue.recover_claim("d1", [known]).lease == Lease(lost, 1, "d1")
+        assert queue.recover_claim("d1", [known, lost]) is None
+        assert queue.recover_claim("d2", []) is None
+
+
+def test_a_dispatcher_is_asked_to_cancel_its_own_jobs_only(database):
+    mine, theirs = submit(database), submit(database)
+    claim(database, "d1"), claim(database, "d2")
+    with database.write_session() as session:
+        for job in (mine, theirs):
+            JobRepository(session).cancel(job)
+    with database.read_session() as session:
+        asked = [read_queue_status(session, owner).jobs_to_cancel for owner in ("d1", "d2")]
+    assert asked == [{mine}, {theirs}]
 
 
 def test_a_claim_that_is_rolled_back_leaves_the_job_queued(database):
@@ -162,6 +216,14 @@ def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
         assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
 
 
+def test_a_heartbeat_does_not_renew_the_lease_of_a_job_that_waits_again(database, clock):
+    job = submit(database)
+    lost, _ = lose(database, clock)
+    with database.write_session() as session:
+        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
+    assert job_of(database, job).lease_until is None
+
+
 def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
     job_id = submit(database)
     claim(database, "d1", clock)
@@ -201,6 +263,17 @@ def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock
         assert [run.id for run in RunWriter(session, again.lease).list_pending()] == [second]
 
 
+def test_a_reaped_job_takes_no_run_of_another_job_with_it(database, clock):
+    lost, rival = claimed(database), claimed(database)
+    for got, runs in (lost, rival):
+        with database.write_session() as session:
+            RunWriter(session, got.lease).start_runs(runs)
+    with database.write_session() as session:
+        LeaseQueue(session).release_job(lost[0].lease)
+    states = [runs_of(database, got.job.id)[0].state for got, _ in (lost, rival)]
+    assert states == [JobState.QUEUED, JobState.RUNNING]
+
+
 def test_a_job_began_with_its_first_claim_and_not_with_a_later_one(database, clock):
     job_id, began = submit(database), clock.now
     lose(database, clock)
@@ -211,7 +284,12 @@ def test_a_job_began_with_its_first_claim_and_not_with_a_later_one(database, clo
 def test_a_job_that_loses_its_lease_too_often_fails_and_says_why(database, clock):
     job_id = submit(database, max_attempts=2)
     assert lose(database, clock)[1].requeued == (job_id,)
-    assert lose(database, clock)[1].failed == (job_id,)
+    again = claim(database, "silent", clock)
+    with database.write_session() as session:
+        RunWriter(session, again.lease).create_runs([NewRun(number=0)])
+    clock.advance(11)
+    assert reap(database, clock).failed == (job_id,)
+    assert [run.state for run in runs_of(database, job_id)] == [JobState.FAILED]
     job = job_of(database, job_id)
     assert job.state is JobState.FAILED
     assert "gave up after 2 attempts without progress" in job.error
@@ -324,6 +402,25 @@ def test_a_job_cannot_succeed_while_a_run_is_unfinished(database):
     with pytest.raises(RowConflict, match="2 of its runs"):
         finish(database, got.lease)
     assert state_of(database, got.job.id) is JobState.RUNNING
+
+
+def test_results_of_another_job_neither_end_this_one_nor_are_its_best(database):
+    other, (done,) = claimed(database)
+    with database.write_session() as session:
+        RunWriter(session, other.lease).record_outcomes(
+            [RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1)]
+        )
+    got, (run_id,) = claimed(database)
+    with pytest.raises(RowConflict, match="1 of its runs"):
+        finish(database, got.lease)
+    with database.write_session() as session:
+        RunWriter(session, got.lease).record_outcomes(
+            [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED, best_rms=0.7)]
+        )
+    finish(database, got.lease)
+    assert job_of(database, got.job.id).best_rms == 0.7
+    finish(database, other.lease)
+    assert job_of(database, other.job.id).best_rms == 0.1
 
 
 @pytest.mark.parametrize("end", [JobState.FAILED, JobState.CANCELLED])

@@ -60,6 +60,15 @@ def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(dat
         assert DispatcherRepository(session).list_alive() == []
 
 
+@needs_proc
+def test_a_dispatcher_whose_process_has_ended_is_forgotten_also_without_jobs(database) -> None:
+    announce(database, "dead", of_a_process_that_has_ended())
+    announce(database, "here", describe_process())
+    reap_jobs(database)
+    with database.read_session() as session:
+        assert [row.owner for row in DispatcherRepository(session).list_all()] == ["here"]
+
+
 def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(database) -> None:
     announce(database, "here", describe_process())
     announce(database, "elsewhere", {**describe_process(), "machine": "another", "pid": 2**22 - 1})
@@ -118,6 +127,26 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
         clock.advance(11)
         assert reap_jobs(database, clock).requeued == (job,), number
     assert job_of(database, job).lost_leases == 1
+    claim(database, "falls", clock)  # and now no run ends, but those of earlier attempts have
+    clock.advance(11)
+    assert reap_jobs(database, clock).failed == (job,)
+
+
+def test_a_job_is_not_spared_for_its_own_progress(database, clock: Clock) -> None:
+    job = submit(database, max_attempts=1)
+    save_one(database, claim(database, "falls", clock))
+    clock.advance(11)
+    assert reap_jobs(database, clock).failed == (job,)
+
+
+def test_a_job_is_not_spared_for_the_progress_of_another_dispatcher(database, clock: Clock) -> None:
+    mine = submit(database, max_attempts=1)
+    claim(database, "falls", clock)
+    theirs = submit(database, max_attempts=2)
+    save_one(database, claim(database, "works", clock))
+    clock.advance(11)
+    reaped = reap_jobs(database, clock)
+    assert (reaped.failed, reaped.requeued) == ((mine,), (theirs,))
 
 
 def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) -> None:
@@ -255,6 +284,27 @@ def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: 
         repository.add_dispatcher("quick", {LEASE_SECONDS_KEY: 10.0})
         clock.advance(30)
         assert [one.owner for one in repository.list_alive()] == ["slow"]
+
+
+def test_each_dispatcher_has_its_own_heartbeat_and_leaves_alone(database, clock: Clock) -> None:
+    with database.write_session() as session:
+        repository = DispatcherRepository(session, clock)
+        for owner in ("first", "second"):
+            repository.add_dispatcher(owner, {LEASE_SECONDS_KEY: 10.0})
+        clock.advance(11)
+        repository.record_heartbeat("second")
+        assert [one.owner for one in repository.list_alive()] == ["second"]
+        repository.remove_dispatcher("second")
+        assert [one.owner for one in repository.list_all()] == ["first"]
+
+
+def test_a_dispatcher_is_forgotten_a_day_after_its_last_heartbeat(database, clock: Clock) -> None:
+    with database.write_session() as session:
+        repository = DispatcherRepository(session, clock)
+        for owner in ("old", "silent", "new"):
+            repository.add_dispatcher(owner, {LEASE_SECONDS_KEY: 10.0})
+            clock.advance(13 * 3600)
+        assert [one.owner for one in repository.list_all()] == ["new", "silent"]
 
 
 @pytest.mark.postgres

@@ -9,7 +9,7 @@ from service.dispatch.recorder import RunRecorder
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
-from service.repositories.history import HistoryPoint
+from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.runs import RunRepository
 from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
@@ -52,7 +52,31 @@ def point(run, number):
     return HistoryPoint(run, 0, number, 10 * number, 50, 1.0 / (number + 1), "genetic", [1.5])
 
 
+def saved_by_another(place, state) -> None:
+    """A job of another dispatcher with a failure and a checkpoint."""
+    rival = place.submit(sweep={"axes": [{"path": "/seed", "values": [1, 2]}]})
+    with place.database.write_session() as session:
+        got = LeaseQueue(session).claim_job("d2")
+    assert got.job.id == rival
+    fails, goes_on = (run.id for run in place.runs(rival))
+    with place.database.write_session() as session:
+        ledger = RunWriter(session, got.lease)
+        ledger.record_outcomes(
+            [
+                RunOutcome(
+                    run_id=fails,
+                    state=JobState.FAILED,
+                    error="elsewhere",
+                    evaluations=5000,
+                    generations=500,
+                )
+            ]
+        )
+        ledger.save_checkpoints([(goes_on, 9000, pack_state(state))])
+
+
 def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> None:
+    saved_by_another(place, state)
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write_session() as session:
@@ -89,7 +113,10 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write_session() as session:
         ledger = RunWriter(session, first.lease)
-        ledger.append_history([point(run, number) for run in runs for number in range(2)])
+        ledger.append_history(
+            [point(run, number) for run in runs for number in range(2)],
+            [MigrantPoint(run, 0, 1, 0, 1, 0.5) for run in runs],
+        )
         ledger.record_outcomes([RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED)])
         ledger.save_checkpoints(
             [(runs[1], 9, pack_state(state)), (runs[2], 9, b"lagid 0.0 run state 1\n...")]
@@ -103,6 +130,7 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     ]
     with place.database.read_session() as session:
         lengths = [len(RunRepository(session).read_history(run)) for run in runs]
+        logs = [len(RunRepository(session).read_migrations(run)) for run in runs]
         kept = [(one.run_id, unpack_state(one.state) is None) for one in session.query(Checkpoint)]
-    assert lengths == [2, 2, 0, 0]
+    assert (lengths, logs) == ([2, 2, 0, 0], [1, 1, 0, 0])
     assert kept == [(runs[1], False)]

@@ -100,6 +100,40 @@ def test_started_runs_carry_the_attempt_that_started_them(database):
     assert (second.state, second.attempt) == (JobState.QUEUED, 0)
 
 
+@pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED])
+def test_a_run_that_has_ended_is_not_started_again(database, end):
+    got, (run_id, other) = claimed(database, n_runs=2)
+    record(database, got.lease, RunOutcome(run_id=run_id, state=end))
+    with database.write_session() as session:
+        RunWriter(session, got.lease).start_runs([run_id, other])
+    assert [run.state for run in runs_of(database, got.job.id)] == [end, JobState.RUNNING]
+    assert job_of(database, got.job.id).n_done == 1
+
+
+def test_writes_under_one_lease_change_no_run_of_another_job(database):
+    _, (foreign,) = claimed(database)
+    got, (own,) = claimed(database)
+    with database.write_session() as session:
+        writer = RunWriter(session, got.lease)
+        writer.start_runs([foreign, own])
+        assert [run.id for run in writer.list_pending()] == [own]
+        assert [run.id for run in writer.list_unfinished([0])] == [own]
+        writer.save_checkpoints([(own, 10, b"own")])
+    with database.read_session() as session:
+        runs = RunRepository(session)
+        assert (runs.get(foreign).state, runs.get(foreign).attempt) == (JobState.QUEUED, 0)
+        assert runs.get(own).state is JobState.RUNNING
+
+
+def test_checkpoints_are_read_for_one_job(database):
+    (first, (a,)), (second, (b,)) = claimed(database), claimed(database)
+    for got, run in ((first, a), (second, b)):
+        with database.write_session() as session:
+            RunWriter(session, got.lease).save_checkpoints([(run, 10, run.encode())])
+    with database.write_session() as session:
+        assert RunWriter(session, first.lease).read_checkpoints() == {a: a.encode()}
+
+
 def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
     got, (run_id,) = claimed(database)
     assert record(database, got.lease, good(run_id)) == (run_id,)

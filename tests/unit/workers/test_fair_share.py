@@ -137,6 +137,31 @@ def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
     assert len(shares._projects) == MAX_ABSENT_PROJECTS + 1
 
 
+def test_unused_time_is_saved_for_later_up_to_a_limit() -> None:
+    shares: FairShare[str] = FairShare()
+    for project in ("greedy", "modest"):
+        shares.open_account(project, project=project)
+    shares.charge_seconds("greedy", 10 * MAX_SAVED_SECONDS)
+    shares.charge_seconds("modest", MAX_SAVED_SECONDS - 1.0)
+    in_flight = {"greedy": 0, "modest": 0}
+    assert shares.order_jobs(in_flight) == ["modest", "greedy"]
+    shares.charge_seconds("modest", 2.0)
+    assert shares.order_jobs(in_flight) == ["greedy", "modest"]
+
+
+def test_of_two_jobs_of_a_project_one_saves_no_more_than_the_limit() -> None:
+    shares: FairShare[str] = FairShare()
+    for job in ("early", "late"):
+        shares.open_account(job, project="one")
+        shares.charge_seconds(job, HEADSTART_SECONDS)
+    shares.charge_seconds("early", 10 * MAX_SAVED_SECONDS)
+    shares.charge_seconds("late", MAX_SAVED_SECONDS - 1.0)
+    in_flight = {"early": 0, "late": 0}
+    assert shares.order_jobs(in_flight) == ["late", "early"]
+    shares.charge_seconds("late", 2.0)
+    assert shares.order_jobs(in_flight) == ["early", "late"]
+
+
 def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> None:
     theatre = Theatre(2)
     theatre.add("greedy", 5 * SWEEP, 0.1, project="greedy")
@@ -190,6 +215,14 @@ def test_a_project_takes_no_more_cores_than_it_may() -> None:
     theatre.add("b", SWEEP, 0.1, project="a")
     theatre.play(20.0)
     assert theatre.had("a") + theatre.had("b") == pytest.approx(60.0, abs=2.0)
+
+
+def test_cores_that_one_project_may_not_take_are_for_the_others() -> None:
+    theatre = Theatre(4, project_cores=3)
+    theatre.add("a", SWEEP, 0.1, project="a")
+    theatre.add("b", SWEEP, 0.1, project="b")
+    theatre.play(20.0)
+    assert theatre.had("a") + theatre.had("b") == pytest.approx(80.0, abs=2.0)
 
 
 def test_a_lonely_sweep_has_a_pack_waiting_at_every_core() -> None:

@@ -1,0 +1,414 @@
+"""What a dispatcher writes about the runs of a job, and when; the stopwatch is the test's."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.core.states import JobState
+from service.dispatch.checkpoints import unpack_state
+from service.dispatch.fitted_signals import SignalsLocation
+from service.dispatch.recorder import (
+    CHECKPOINT_SECONDS,
+    MOST_REASONS,
+    PROGRESS_SECONDS,
+    RESULTS_SECONDS,
+    RunRecorder,
+)
+from service.queue.leases import LeaseOwners, LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.storage.errors import LeaseLost, ObjectStoreFailed
+from service.storage.tables import Checkpoint
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
+from sysid.search.island import Island
+from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
+from sysid.uncertainty.estimates import Criteria
+from tests.dispatching import Place
+from workers.protocol import RunConclusion, RunFailure
+
+N_RUNS, GENERATIONS = 4, 100
+
+
+class Stopwatch:
+    """Elapsed seconds that only tests move."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Desk:
+    """A job of four runs that a dispatcher holds, and the recorder of its runs."""
+
+    def __init__(self, place: Place) -> None:
+        self.place, self.stopwatch = place, Stopwatch()
+        self.signals: dict[str, SignalsLocation | ObjectStoreFailed] = {}
+        self.failed: list[str] = []
+        axes = [{"path": "/seed", "range": [0, N_RUNS]}]
+        self.job = place.submit(sweep={"axes": axes}, algorithm={"generations": GENERATIONS})
+        self.runs = [run.id for run in place.runs(self.job)]
+        self.recorder = self.claim()
+
+    def claim(self) -> RunRecorder:
+        with self.place.database.write_session() as session:
+            claim = LeaseQueue(session).claim_job("d1")
+        assert claim is not None
+        assert claim.job.id == self.job
+        return RunRecorder(
+            self.place.database,
+            claim,
+            lambda run, _: ShelvedFile(self.signals[run]) if run in self.signals else None,
+            self.failed.append,
+            stopwatch=self.stopwatch,
+        )
+
+    def claim_again(self) -> RunRecorder:
+        """Give the job back and claim it under the next attempt."""
+        with self.place.database.write_session() as session:
+            LeaseQueue(session).release_job(self.recorder.lease)
+        return self.claim()
+
+    def write_after(self, seconds: float) -> None:
+        """Let time pass, then write what is due."""
+        self.stopwatch.now += seconds
+        self.recorder.write_due()
+
+    def checkpoints(self) -> dict[str, int]:
+        """Evaluations in the checkpoint of each run that has one."""
+        with self.place.database.read_session() as session:
+            return {row.run_id: row.evaluations for row in session.query(Checkpoint)}
+
+    def states(self) -> list[JobState]:
+        return [run.state for run in self.place.runs(self.job)]
+
+    def messages(self) -> list[str]:
+        with self.place.database.read_session() as session:
+            events = EventRepository(session).list_after(self.job)
+        return [event.data["message"] for event in events if event.kind == "log"]
+
+
+class ShelvedFile:
+    """A file that the store takes, or refuses with this error."""
+
+    def __init__(self, told: SignalsLocation | ObjectStoreFailed) -> None:
+        self._told = told
+
+    def store_file(self) -> SignalsLocation:
+        if isinstance(self._told, ObjectStoreFailed):
+            raise self._told
+        return self._told
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    made = Desk(Place(tmp_path / "data"))
+    yield made
+    made.place.database.dispose()
+
+
+def searched(
+    generation: int, evaluations: int, *rms: float, migrants: tuple[Migrant, ...] = ()
+) -> RunState:
+    """A run that found these RMS one after the other, with one island."""
+    search = np.zeros((), SEARCH_RECORD)
+    search["generation"], search["evaluations"] = generation, evaluations
+    history = tuple(
+        Improvement(number, 10 * number, value, "genetic", (float(number),))
+        for number, value in enumerate(rms)
+    )
+    nothing = np.zeros((0, 1), np.uint64), np.zeros(0)
+    island = Island(0, 1, *nothing, search, np.zeros(1), history)
+    return RunState(1, (island,), generation, migrations=migrants)
+
+
+def concluded(state: RunState) -> RunConclusion:
+    """The result of a run that ended in this state."""
+    return RunConclusion(
+        Identification(
+            estimates=(),
+            rms=state.rms,
+            fit_percent=90.0,
+            rms_validation=None,
+            fit_percent_validation=None,
+            valid=True,
+            evaluations=state.evaluations,
+            generations=state.generation,
+            islands=(),
+            history=state.history,
+            migrations=state.migrations,
+            uncertainty=None,
+            simulated=(),
+            simulated_validation=(),
+            agreement=(),
+            agreement_validation=(),
+            warnings=(),
+            selection=(),
+            criteria=Criteria(0.0, None, 0.0, 100, 1),
+            residual_tests=None,
+            onset_delays=(),
+            correlation_times={},
+            holds={},
+            sample_time=0.1,
+            known_before=(),
+            known_before_validation=(),
+        )
+    )
+
+
+def test_progress_is_written_every_second_and_checkpoints_every_four(desk: Desk) -> None:
+    run = desk.runs[0]
+    desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_due()
+    assert desk.checkpoints() == {run: 100}
+    assert desk.place.job(desk.job).evaluations == 100
+    desk.recorder.record_progress(run, searched(20, 200, 0.5), 2.0)
+    desk.write_after(PROGRESS_SECONDS - 0.1)
+    assert desk.place.job(desk.job).evaluations == 100
+    desk.write_after(0.2)
+    assert desk.place.job(desk.job).evaluations == 200
+    assert desk.checkpoints() == {run: 100}
+    desk.write_after(CHECKPOINT_SECONDS - PROGRESS_SECONDS - 0.2)
+    assert desk.checkpoints() == {run: 100}
+    desk.write_after(0.2)
+    assert desk.checkpoints() == {run: 200}
+    with desk.place.database.read_session() as session:
+        stored = unpack_state(session.query(Checkpoint).one().state)
+    assert stored is not None
+    assert stored.generation == 20
+
+
+def test_a_run_that_did_not_go_on_is_not_saved_again(desk: Desk) -> None:
+    def saved_at() -> list[object]:
+        with desk.place.database.read_session() as session:
+            return [session.get_one(Checkpoint, run).created_at for run in desk.runs[:2]]
+
+    for run in desk.runs[:2]:
+        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_due()
+    before = saved_at()
+    desk.recorder.record_progress(desk.runs[0], searched(20, 200, 0.5), 2.0)
+    desk.write_after(CHECKPOINT_SECONDS + 0.1)
+    assert [old == new for old, new in zip(before, saved_at(), strict=True)] == [False, True]
+
+
+def test_starts_are_collected_for_a_second_and_deaths_are_written_at_once(desk: Desk) -> None:
+    first, second = desk.runs[:2]
+    desk.recorder.record_start(first)
+    desk.recorder.write_due()
+    desk.recorder.record_start(second)
+    desk.write_after(RESULTS_SECONDS - 0.1)
+    assert desk.states()[:2] == [JobState.RUNNING, JobState.QUEUED]
+    desk.write_after(0.2)
+    assert desk.states()[:2] == [JobState.RUNNING, JobState.RUNNING]
+    desk.recorder.record_worker_death(second, 1)
+    desk.write_after(0.01)
+    assert [run.kills for run in desk.place.runs(desk.job)] == [0, 1, 0, 0]
+
+
+def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
+    desk.recorder.record_progress(desk.runs[0], searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_due()
+    with desk.place.database.read_session() as session:
+        before = EventRepository(session).list_after(desk.job)[-1].id
+    desk.write_after(PROGRESS_SECONDS + 0.1)
+    with desk.place.database.read_session() as session:
+        assert EventRepository(session).list_after(desk.job)[-1].id == before
+
+
+def test_each_evaluation_counts_once_whatever_becomes_of_its_run(desk: Desk) -> None:
+    done, fails, goes_on, refused = desk.runs
+    for run in (done, fails, goes_on):
+        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_due()
+    desk.recorder.record_result(done, concluded(searched(30, 310, 0.5, 0.2)), 3.0)
+    desk.recorder.record_failure(fails, RunFailure("as told"))
+    desk.recorder.record_failure(refused, RunFailure("late", evaluations=40))
+    desk.recorder.write_all()
+    job = desk.place.job(desk.job)
+    assert (job.evaluations, job.generation, job.best_rms) == (310 + 100 + 40 + 100, 30, 0.2)
+    assert (job.n_done, job.n_failed) == (3, 2)
+    assert desk.checkpoints() == {goes_on: 100}
+    runs = {run.id: run for run in desk.place.runs(desk.job)}
+    assert [runs[run].evaluations for run in desk.runs] == [310, 100, 0, 40]
+    assert desk.failed == [fails, refused]
+
+
+def test_a_run_that_begins_and_ends_between_two_writes_has_both_times(desk: Desk) -> None:
+    run = desk.runs[0]
+    desk.recorder.record_start(run)
+    desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+    desk.recorder.write_due()
+    row = desk.place.runs(desk.job)[0]
+    assert row.state is JobState.SUCCEEDED
+    assert row.started_at is not None
+    assert row.finished_at is not None
+
+
+def test_history_is_whole_whatever_was_written_before_the_end(desk: Desk) -> None:
+    first, second = desk.runs[:2]
+    migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(3))
+    for run in (first, second):
+        desk.recorder.record_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+    desk.recorder.write_due()
+    desk.recorder.record_progress(
+        first, searched(20, 200, 0.9, 0.8, 0.7, migrants=migrants[:2]), 2.0
+    )
+    desk.write_after(PROGRESS_SECONDS + 0.1)
+    end = searched(30, 300, 0.9, 0.8, 0.7, 0.6, migrants=migrants)
+    for run in (first, second):
+        desk.recorder.record_result(run, concluded(end), 3.0)
+    desk.write_after(PROGRESS_SECONDS + 0.1)
+    with desk.place.database.read_session() as session:
+        for run in (first, second):
+            history = RunRepository(session).read_history(run)
+            assert [(point.number, point.rms) for point in history] == [
+                (0, 0.9),
+                (1, 0.8),
+                (2, 0.7),
+                (3, 0.6),
+            ]
+            log = RunRepository(session).read_migrations(run)
+            assert [(one.number, one.epoch) for one in log] == [(0, 0), (1, 1), (2, 2)]
+
+
+def end_all(desk: Desk, n_failed: int) -> None:
+    for number, run in enumerate(desk.runs):
+        if number < n_failed:
+            desk.recorder.record_failure(run, RunFailure(f"reason {number}"))
+        else:
+            desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+    desk.recorder.finish_job()
+
+
+@pytest.mark.parametrize(
+    ("n_failed", "state", "error"),
+    [
+        (0, JobState.SUCCEEDED, None),
+        (1, JobState.SUCCEEDED, "1 of 4 runs failed: reason 0"),
+        (4, JobState.FAILED, "4 of 4 runs failed: reason 0; reason 1; reason 2"),
+    ],
+)
+def test_a_job_fails_when_all_its_runs_failed_and_tells_some_reasons(
+    desk: Desk, n_failed: int, state: JobState, error: str | None
+) -> None:
+    end_all(desk, n_failed)
+    job = desk.place.job(desk.job)
+    assert (job.state, job.error, job.n_failed) == (state, error, n_failed)
+    assert len(desk.messages()) == min(n_failed, MOST_REASONS)
+
+
+def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Desk) -> None:
+    run = desk.runs[0]
+    desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_due()
+    desk.recorder.record_progress(run, searched(20, 200, 0.5), 1.5)
+    desk.recorder.write_all()
+    assert desk.checkpoints() == {run: 200}
+    desk.recorder = desk.claim_again()
+    desk.recorder.record_progress(run, searched(30, 300, 0.5), 2.0)
+    desk.recorder.cancel_job()
+    assert desk.place.job(desk.job).state is JobState.CANCELLED
+    with desk.place.database.write_session() as session:
+        JobRepository(session).resume(desk.job)
+    desk.recorder = desk.claim()
+    assert desk.checkpoints() == {run: 300}
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).evaluations == 300
+
+
+def computed_before(desk: Desk, evaluations: int) -> str:
+    """A run of another job that has succeeded with so many evaluations."""
+    job = desk.place.submit()
+    with desk.place.database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("other")
+        assert claim is not None
+        assert claim.job.id == job
+        writer = RunWriter(session, claim.lease)
+        (run,) = writer.list_pending()
+        result = {"parameters": []}
+        writer.record_outcomes(
+            [
+                RunOutcome(
+                    run_id=run.id,
+                    state=JobState.SUCCEEDED,
+                    result=result,
+                    best_rms=0.1,
+                    evaluations=evaluations,
+                    generations=70,
+                )
+            ]
+        )
+    return run.id
+
+
+def test_a_result_that_is_taken_over_counts_once(desk: Desk) -> None:
+    source = computed_before(desk, 1000)
+    desk.recorder.record_reuse(desk.runs[0], source)
+    desk.recorder.write_due()
+    for number, run in enumerate(desk.runs[1:]):
+        desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+        desk.write_after(PROGRESS_SECONDS + 0.1)
+        assert desk.place.job(desk.job).evaluations == 1000 + 50 * (number + 1)
+    desk.recorder.finish_job()
+    job = desk.place.job(desk.job)
+    assert (job.evaluations, job.generation, job.best_rms) == (1150, 70, 0.1)
+    assert (job.n_reused, job.n_done) == (1, 4)
+    assert desk.messages() == ["1 of 4 runs were taken over from earlier runs"]
+
+
+def test_what_is_left_is_told_from_what_was_computed_in_this_attempt(desk: Desk) -> None:
+    first, second, third, _ = desk.runs
+    source = computed_before(desk, 1000)
+    desk.recorder.record_progress(first, searched(50, 100, 0.5), 1.0)
+    desk.recorder.write_all()
+    desk.recorder = desk.claim_again()
+    desk.recorder.record_progress(first, searched(60, 120, 0.5), 1.0)
+    desk.recorder.record_progress(second, searched(10, 20, 0.5), 1.0)
+    desk.stopwatch.now += 10.0
+    desk.recorder.write_all()
+    # 10 generations in 10 s: those of the second run, as the first one went on at 60.
+    assert desk.place.job(desk.job).seconds_left == pytest.approx(400 - 60 - 10)
+    desk.recorder.record_reuse(third, source)
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).seconds_left == pytest.approx(300 - 60 - 10)
+    desk.recorder.record_result(second, concluded(searched(100, 200, 0.5)), 3.0)
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).seconds_left == pytest.approx(10 * (200 - 60) / 100)
+
+
+def test_signals_that_the_store_refuses_cost_no_result_and_are_told(desk: Desk) -> None:
+    full = ObjectStoreFailed("the disk is full")
+    location = SignalsLocation("c" * 64, 10, 20)
+    desk.signals = dict(zip(desk.runs, [full, location, full], strict=False))
+    end_all(desk, 0)
+    rows = desk.place.runs(desk.job)
+    assert {row.state for row in rows} == {JobState.SUCCEEDED}
+    assert [(row.signals_sha256, row.signals_start, row.signals_size) for row in rows] == [
+        (None, None, None),
+        location,
+        (None, None, None),
+        (None, None, None),
+    ]
+    assert desk.messages() == [
+        f"the signals of {desk.runs[0]} and 1 others are not stored: the disk is full"
+    ]
+
+
+def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: Desk) -> None:
+    with desk.place.database.write_session() as session:
+        LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({"d1"})))
+    desk.recorder.record_result(desk.runs[0], concluded(searched(5, 50, 0.5)), 0.2)
+    desk.recorder.record_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
+    for write in (desk.recorder.write_due, desk.recorder.cancel_job, desk.recorder.finish_job):
+        with pytest.raises(LeaseLost):
+            write()
+    assert desk.states() == [JobState.QUEUED] * 4
+    assert desk.checkpoints() == {}
+    assert desk.place.job(desk.job).n_done == 0
