@@ -14,43 +14,47 @@ from typing import Any
 TARGET = "bench"
 
 
-def figures(folder: Path, program: str) -> list[dict[str, Any]]:
+def read_figures(folder: Path, program: str) -> list[dict[str, Any]]:
     """The figures with bars of one program, named by it; none if it wrote nothing."""
     path = folder / f"{program}.json"
     if not path.exists():
         return []
-    found = json.loads(path.read_text())
-    return [{**one, "name": f"{program}: {one['name']}"} for one in found]
+    rows = json.loads(path.read_text())
+    return [{**row, "name": f"{program}: {row['name']}"} for row in rows]
 
 
-def line(one: dict[str, Any]) -> str:
+def format_line(figure: dict[str, Any]) -> str:
     """One figure as a line of the table."""
-    bar, verdict = f"{one['relation']} {one['bar']:g}", "yes" if one["holds"] else "**no**"
-    return f"| {one['name']} | {one['value']:.5g} | {one['unit']} | {bar} | {verdict} |"
+    bar, verdict = f"{figure['relation']} {figure['bar']:g}", "yes" if figure["holds"] else "**no**"
+    return f"| {figure['name']} | {figure['value']:.5g} | {figure['unit']} | {bar} | {verdict} |"
 
 
 def main() -> int:
     """Write both files; the exit code."""
-    made = argparse.ArgumentParser(description=__doc__)
-    made.add_argument("folder", type=Path)
-    made.add_argument("programs", nargs="+")
-    options = made.parse_args()
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("folder", type=Path)
+    arguments.add_argument("programs", nargs="+")
+    options = arguments.parse_args()
     folder: Path = options.folder
-    found = [one for program in options.programs for one in figures(folder, program)]
-    (folder / f"{TARGET}.json").write_text(json.dumps(found, indent=1) + "\n")
+    rows = [row for program in options.programs for row in read_figures(folder, program)]
+    (folder / f"{TARGET}.json").write_text(json.dumps(rows, indent=1) + "\n")
     lines = [
         "# Benchmarks",
         "",
         "| figure | measured | unit | to reach | holds |",
         "|---|--:|---|--:|---|",
-        *map(line, found),
+        *map(format_line, rows),
     ]
-    silent = [one for one in options.programs if not (folder / f"{one}.md").exists()]
-    lines += [f"| {one} | did not finish | | | **no** |" for one in silent]
-    parts = [(folder / f"{one}.md").read_text() for one in options.programs if one not in silent]
+    silent = [program for program in options.programs if not (folder / f"{program}.md").exists()]
+    lines += [f"| {program} | did not finish | | | **no** |" for program in silent]
+    parts = [
+        (folder / f"{program}.md").read_text()
+        for program in options.programs
+        if program not in silent
+    ]
     (folder / f"{TARGET}.md").write_text("\n".join([*lines, "", *parts]))
-    held = sum(one["holds"] for one in found)
-    print(f"{held} of {len(found)} bars hold; see {folder / TARGET}.md and .json")
+    held = sum(row["holds"] for row in rows)
+    print(f"{held} of {len(rows)} bars hold; see {folder / TARGET}.md and .json")
     return 1 if silent else 0
 
 

@@ -51,20 +51,20 @@ class Draws:
         bias = np.abs(np.mean(error, axis=0)) / np.std(error, axis=0)
         held = 100 * np.mean((self.low <= self.truth) & (self.truth <= self.high), axis=0)
         draws = error.shape[0]
-        made = [
+        rows = [
             Row(f"{label}: sampling error of an RMS error", 1 / np.sqrt(2 * draws), "of itself"),
             Row(f"{label}: sampling error of a bias", 1 / np.sqrt(draws), "sd"),
             Row(f"{label}: binomial error of 95 %", 100 * np.sqrt(0.05 * 0.95 / draws), "%"),
         ]
         for i, name in enumerate(self.names):
             what = f"{label}, {name}"
-            made += [
+            rows += [
                 Row(f"{what}: RMS error", float(size[i]), "of the bound", 1.10),
                 Row(f"{what}: bias", float(bias[i]), "sd", 0.2),
                 Row(f"{what}: interval holds truth", float(held[i]), "%", 93, ">="),
                 Row(f"{what}: interval holds truth", float(held[i]), "%", 97),
             ]
-        return made
+        return rows
 
 
 def record(y: NDArray[np.float64]) -> Record:
@@ -74,19 +74,19 @@ def record(y: NDArray[np.float64]) -> Record:
     return Record((force,), (Channel("y", times, y, "m"),))
 
 
-def drawn(model: Model, truth: dict[str, float], draws: int) -> Draws:
+def identify_draws(model: Model, truth: dict[str, float], draws: int) -> Draws:
     """Identify every draw."""
     problem = Problem.build(model, [record(np.zeros(SAMPLES))])
     names = problem.free_names
     theta = np.array([truth[name] for name in names])
     clean = problem.predict(theta[None])[0]
-    found = []
+    rows = []
     for draw in range(draws):
         noise = SD * np.random.default_rng([7, draw]).standard_normal(SAMPLES)
         estimates = identify(model, record(clean + noise), seed=draw + 1).estimates
-        ends = [one.interval95 or (np.nan, np.nan) for one in estimates]
-        found.append([[one.value, *end] for one, end in zip(estimates, ends, strict=True)])
-    table = np.array(found)
+        ends = [estimate.interval95 or (np.nan, np.nan) for estimate in estimates]
+        rows.append([[estimate.value, *end] for estimate, end in zip(estimates, ends, strict=True)])
+    table = np.array(rows)
     return Draws(names, theta, bound(problem, theta), table[..., 0], table[..., 1], table[..., 2])
 
 
@@ -105,7 +105,7 @@ def main(options: argparse.Namespace) -> None:
     draws = QUICK if options.quick else DRAWS
     rows = []
     for name, truth in EXAMPLES.items():
-        rows += drawn(load_model(name), truth, draws).rows(name)
+        rows += identify_draws(load_model(name), truth, draws).rows(name)
     report(f"Efficiency over {draws} noise draws (sd {SD:g})", rows, [], options)
 
 

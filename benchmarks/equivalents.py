@@ -96,14 +96,20 @@ EXAMPLES = {
 }
 
 
-def problem_of(example: Example, samples: int) -> Problem:
+def build_problem(example: Example, samples: int) -> Problem:
     """The model on a smooth record of its sampling."""
     model = load_model(example.model)
     times = example.sample_time * np.arange(samples)
     phase = np.arange(samples) / 8
     inputs = [
-        Channel(one.name, times, example.input_scale * np.cos(phase), one.unit, hold=example.hold)
-        for one in model.inputs
+        Channel(
+            channel.name,
+            times,
+            example.input_scale * np.cos(phase),
+            channel.unit,
+            hold=example.hold,
+        )
+        for channel in model.inputs
     ]
     output = model.outputs[0]
     measured = Channel(output.name, times, 0.8 + 0.05 * np.sin(phase), output.unit)
@@ -113,8 +119,8 @@ def problem_of(example: Example, samples: int) -> Problem:
 def individuals(example: Example, count: int) -> FloatArray:
     """Candidates (P, D) with lags that the C code bears."""
     lower, upper = np.array(example.lower), np.array(example.upper)
-    drawn = np.random.default_rng(0).random((count, lower.size))
-    return np.ascontiguousarray(lower + drawn * (upper - lower))
+    uniform = np.random.default_rng(0).random((count, lower.size))
+    return np.ascontiguousarray(lower + uniform * (upper - lower))
 
 
 class Compiled:
@@ -157,10 +163,10 @@ class Compiled:
             address(fitness),
         )
         function = getattr(self._library, example.function)
-        kept = (rows, work)  # ctypes holds addresses only
+        buffers = (rows, work)  # ctypes holds addresses only
 
         def timed() -> object:
-            return function(*arguments), kept
+            return function(*arguments), buffers
 
         return timed, fitness
 

@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.equivalents import (
     EXAMPLES,
     Compiled,
+    build_problem,
     operations_a_step,
     operations_of_peak,
-    problem_of,
 )
 from benchmarks.equivalents import (
     individuals as candidates,
@@ -96,8 +96,8 @@ def reference() -> Callable[[int, int], float] | None:
     if specification.loader is None:
         return None
     specification.loader.exec_module(module)
-    made: Callable[[int, int], float] = module.reference_microseconds
-    return made
+    function: Callable[[int, int], float] = module.reference_microseconds
+    return function
 
 
 def against_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
@@ -131,7 +131,7 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
     turns = 10_000
     peak = operations_of_peak(turns) / microseconds(compiled.peak(turns), 5) / 1000
     for name, example in EXAMPLES.items():
-        built, theta = problem_of(example, 300), candidates(example, 48)
+        built, theta = build_problem(example, 300), candidates(example, 48)
         call, fitness = compiled.call(example, built, theta)
         call()
         if not np.allclose(fitness, built.evaluate_fitness(theta), rtol=1e-9):

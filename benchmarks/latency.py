@@ -96,7 +96,7 @@ def never_seen(count: int) -> list[Row]:
                 **os.environ,
                 "LAGID_CACHE_DIR": folder,
             }
-            for found in (cold, cached):
+            for seconds in (cold, cached):
                 ran = subprocess.run(
                     [sys.executable, "-c", NEVER_SEEN],
                     env=environment,
@@ -104,7 +104,7 @@ def never_seen(count: int) -> list[Row]:
                     capture_output=True,
                     text=True,
                 )
-                found.append(float(ran.stdout))
+                seconds.append(float(ran.stdout))
     return [
         Row("model never seen: equations to first fitness", statistics.median(cold), "s", 3.0),
         Row("the same in another process, from the cache", statistics.median(cached), "s", 0.2),

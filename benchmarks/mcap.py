@@ -19,7 +19,7 @@ SAMPLES = 1_000_000
 WRITE_BAR_S, READ_BAR_S = 0.60, 0.15
 
 
-def made_up(samples: int) -> Recording:
+def make_recording(samples: int) -> Recording:
     """Two channels of noise, the hardest to compress, at 1 kHz."""
     rng = np.random.default_rng(1)
     times = np.arange(samples, dtype=np.float64) * 1e-3
@@ -42,7 +42,7 @@ def main() -> None:
     """Measure and print."""
     options = parser(__doc__ or "").parse_args()
     repeats = 3 if options.quick else 9
-    recording = made_up(SAMPLES)
+    recording = make_recording(SAMPLES)
     file = BytesIO()
     write_recording(recording, file)
     content = file.getvalue()

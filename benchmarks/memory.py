@@ -61,8 +61,10 @@ def main() -> None:
         Row(f"{name}: peak (PSS), a job of {runs:,} runs", peaks[name], "MB", bar)
         for name, bar in BARS_MB.items()
     ]
-    for name, found in waits.items():
-        rows.append(Row(f"request of {name} meanwhile: median", statistics.median(found), "ms", 50))
+    for name, measured in waits.items():
+        rows.append(
+            Row(f"request of {name} meanwhile: median", statistics.median(measured), "ms", 50)
+        )
     rows.append(Row("submission", submitted, "s"))
     rows.append(Row("submission to the last stored result", whole, "s"))
     report("Memory", rows, [], options)

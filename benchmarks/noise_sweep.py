@@ -61,7 +61,7 @@ def compiled_seconds(count: int) -> float:
     """CPU seconds that a run of the sweep spends in compiled loops, mean over `count` draws."""
     model, clean, spent = load_model("duffing-eq16"), paper_example.record(1), 0.0
 
-    def carried_out(sigma: float, method: str, draw: int) -> None:
+    def run_cell(sigma: float, method: str, draw: int) -> None:
         noisy = add_output_noise(clean, Noise(sigma, draw))
         identify(model, noisy, GeneticAlgorithm(method=method), seed=draw)  # type: ignore[arg-type]
 
@@ -75,13 +75,13 @@ def compiled_seconds(count: int) -> float:
 
         return called
 
-    carried_out(0.0, METHODS[-1], 0)  # loads what is compiled
+    run_cell(0.0, METHODS[-1], 0)  # loads what is compiled
     with ExitStack() as patches:
         for module, name in COMPILED:
             patches.enter_context(patch.object(module, name, timed(getattr(module, name))))
         cells = [*product(SIGMAS, METHODS, range(count))]
         for cell in cells:
-            carried_out(*cell)
+            run_cell(*cell)
     return spent / len(cells)
 
 

@@ -20,7 +20,7 @@ def record(seed: int) -> Record:
     times: FloatArray = SAMPLE_TIME * np.arange(SAMPLES)
     force = Channel("q", times, 10 * np.cos(5 * times), "N")
     exact = simulate(load_model("duffing-eq16"), [force], TRUTH, times=times)
-    clean = next(one.values for one in exact.channels if one.name == "y")
+    clean = next(channel.values for channel in exact.channels if channel.name == "y")
     noise = np.random.default_rng(seed).normal(0.0, SIGMA, SAMPLES)
     return Record((force,), (Channel("y", times, clean + noise, "m"),))
 
@@ -32,8 +32,8 @@ def problem(seed: int) -> Problem:
 
 def write_csv(path: Path, seed: int) -> Path:
     """The record as a file."""
-    made = record(seed)
-    (force,), (measured,) = made.inputs, made.outputs
+    recording = record(seed)
+    (force,), (measured,) = recording.inputs, recording.outputs
     rows = zip(force.times, force.values, measured.values, strict=True)
     lines = [f"{t:.6f},{q:.12g},{y:.12g}" for t, q, y in rows]
     path.write_text("\n".join(["t,q [N],y [m]", *lines]) + "\n")

@@ -50,25 +50,25 @@ class Peer:
         return self.hits == self.runs
 
 
-def peers_of(done: Study, first: int, count: int) -> list[Peer]:
+def measure_peers(done: Study, first: int, count: int) -> list[Peer]:
     """Every installed peer on the first `count` records of a study."""
-    found = []
+    peers = []
     for name in PEERS:
         run_peer(name, done.system, first, done.goals[0])  # compiles and warms
         runs = [run_peer(name, done.system, first + i, done.goals[i]) for i in range(count)]
         hits = [evaluations for evaluations, _ in runs if evaluations is not None]
         cost = 1e3 * sum(seconds for _, seconds in runs) / max(len(hits), 1)
         middle = median(np.inf if evaluations is None else evaluations for evaluations, _ in runs)
-        found.append(Peer(name, len(hits), count, middle, cost if hits else np.inf))
-    return found
+        peers.append(Peer(name, len(hits), count, middle, cost if hits else np.inf))
+    return peers
 
 
-def rows_of(done: Study, peers: list[Peer]) -> list[Row]:
+def build_rows(done: Study, peers: list[Peer]) -> list[Row]:
     """Our figures against the fastest peer, then every peer's."""
     name, count = done.system.name, len(done.searches)
-    able = [one for one in peers if one.always_hits or name in EASY]
-    best = min((one.milliseconds for one in able), default=np.inf)
-    hits = sum(one.to_target is not None for one in done.searches)
+    able = [peer for peer in peers if peer.always_hits or name in EASY]
+    best = min((peer.milliseconds for peer in able), default=np.inf)
+    hits = sum(search.to_target is not None for search in done.searches)
     prorated, direct = done.milliseconds("prorated"), done.milliseconds("direct")
     rows = [
         Row(f"{name}: lagid, target hit", hits, f"of {count}", count, ">="),
@@ -83,13 +83,15 @@ def rows_of(done: Study, peers: list[Peer]) -> list[Row]:
         Row(f"{name}: lagid, CPU to the target, direct", direct, "ms"),
     ]
     if name in FASTEST_PEER:
-        told = FASTEST_PEER[name]
-        rows.append(Row(f"{name}: fastest in bench/peers, on its machine, prorated", told, "ms"))
-    for one in peers:
-        rows.append(Row(f"{name}: {one.name}, target hit", one.hits, f"of {one.runs}"))
-        if one.hits:
-            rows.append(Row(f"{name}: {one.name}, median simulations", one.evaluations, ""))
-            rows.append(Row(f"{name}: {one.name}, CPU to the target", one.milliseconds, "ms"))
+        published = FASTEST_PEER[name]
+        rows.append(
+            Row(f"{name}: fastest in bench/peers, on its machine, prorated", published, "ms")
+        )
+    for peer in peers:
+        rows.append(Row(f"{name}: {peer.name}, target hit", peer.hits, f"of {peer.runs}"))
+        if peer.hits:
+            rows.append(Row(f"{name}: {peer.name}, median simulations", peer.evaluations, ""))
+            rows.append(Row(f"{name}: {peer.name}, CPU to the target", peer.milliseconds, "ms"))
     return rows
 
 
@@ -101,13 +103,13 @@ def main(options: argparse.Namespace) -> None:
         if options.quick and system.name not in EASY:
             continue
         done = study(system, count, FIRST_SEED)
-        rows += rows_of(done, peers_of(done, FIRST_SEED, count))
+        rows += build_rows(done, measure_peers(done, FIRST_SEED, count))
     reason = "pip install -r benchmarks/requirements-peers.txt"
     skipped = [] if HAS_PYGMO else [Skipped("pygmo de1220, sade, cmaes", reason)]
     report("Beside other optimisers", rows, skipped, options)
 
 
 if __name__ == "__main__":
-    made = parser(__doc__ or "")
-    made.add_argument("--searches", type=int, metavar="N", help="searches per optimiser (20)")
-    main(made.parse_args())
+    arguments = parser(__doc__ or "")
+    arguments.add_argument("--searches", type=int, metavar="N", help="searches per optimiser (20)")
+    main(arguments.parse_args())

@@ -69,7 +69,7 @@ class Study:
     @property
     def successes(self) -> int:
         """Searches whose result is the optimum."""
-        return sum(one.distance <= NEAR for one in self.searches)
+        return sum(result.distance <= NEAR for result in self.searches)
 
     @property
     def misses(self) -> list[int]:
@@ -87,12 +87,12 @@ class Study:
     def milliseconds(self, which: Literal["direct", "prorated"]) -> float:
         """CPU time per hit: that of all searches, failures in full, over the hits."""
         total, hits = 0.0, 0
-        for one in self.searches:
-            hits += one.to_target is not None
-            if one.to_target is None:
-                total += one.seconds
+        for result in self.searches:
+            hits += result.to_target is not None
+            if result.to_target is None:
+                total += result.seconds
             else:
-                total += one.seconds_to_target if which == "direct" else one.prorated
+                total += result.seconds_to_target if which == "direct" else result.prorated
         return 1e3 * total / hits if hits else float("inf")
 
 
@@ -103,8 +103,8 @@ def _median(counts: list[int | None]) -> float:
 def study(system: System, count: int, first: int = FIRST_SEED) -> Study:
     """Search a system's records `count` times; the first search, which compiles, is repeated."""
     search(system, first)
-    found = [search(system, first + i) for i in range(count)]
-    return Study(system, first, tuple(s for s, _ in found), tuple(g for _, g in found))
+    pairs = [search(system, first + i) for i in range(count)]
+    return Study(system, first, tuple(s for s, _ in pairs), tuple(g for _, g in pairs))
 
 
 def own_rows(done: Study) -> Iterable[Row]:
@@ -115,8 +115,8 @@ def own_rows(done: Study) -> Iterable[Row]:
     yield Row(f"{name}: largest distance of these", max(reached, default=np.nan), "of RMS", NEAR)
     bar = PROTOTYPE.get(name)
     yield Row(f"{name}: median evaluations to the target", done.to_target(), "simulations", bar)
-    beside = done.side_by_side()
-    yield Row(f"{name}: the same, islands side by side", beside, "simulations")
+    parallel = done.side_by_side()
+    yield Row(f"{name}: the same, islands side by side", parallel, "simulations")
     most = max(s.evaluations for s in done.searches)
     yield Row(f"{name}: most evaluations of a search", most, "simulations", 20_000)
     bar_ms = FASTEST_PEER.get(name)
@@ -138,12 +138,12 @@ def peer_rows(done: Study, count: int) -> Iterable[Row]:
     for peer in PEERS if most else ():
         count = min(most, SLOW_PEERS.get(peer, most))
         run_peer(peer, done.system, done.first, done.goals[0])
-        found = [run_peer(peer, done.system, done.first + i, done.goals[i]) for i in range(count)]
-        hits = [evaluations for evaluations, _ in found if evaluations is not None]
-        seconds = sum(cost for _, cost in found)
+        runs = [run_peer(peer, done.system, done.first + i, done.goals[i]) for i in range(count)]
+        hits = [evaluations for evaluations, _ in runs if evaluations is not None]
+        seconds = sum(cost for _, cost in runs)
         yield Row(f"{done.system.name}: {peer}, target hit", len(hits), f"of {count}")
         if hits:
-            middle = median(e or np.inf for e, _ in found)
+            middle = median(e or np.inf for e, _ in runs)
             yield Row(f"{done.system.name}: {peer}, median evaluations", middle, "simulations")
             cost = 1e3 * seconds / len(hits)
             yield Row(f"{done.system.name}: {peer}, CPU to target", cost, "ms")
@@ -155,20 +155,20 @@ def paper_rows(first: int, count: int) -> Iterable[Row]:
         if system.samples > 300:
             continue
         for method in SEARCH_METHODS:
-            found = [search(system, first + i, method)[0] for i in range(count)]
-            middle = median(1 + one.distance for one in found)
+            searches = [search(system, first + i, method)[0] for i in range(count)]
+            middle = median(1 + result.distance for result in searches)
             yield Row(f"{system.name}: {method}, median RMS", middle, "of the optimum's")
 
 
 def main() -> None:
     """Print the table."""
-    made = parser(__doc__ or "")
-    made.add_argument("--peers", type=int, metavar="N", help="searches per peer (20)")
-    made.add_argument("--searches", type=int, metavar="N", help="searches per system (50)")
-    made.add_argument(
+    arguments = parser(__doc__ or "")
+    arguments.add_argument("--peers", type=int, metavar="N", help="searches per peer (20)")
+    arguments.add_argument("--searches", type=int, metavar="N", help="searches per system (50)")
+    arguments.add_argument(
         "--first-seed", type=int, default=FIRST_SEED, metavar="N", help="first seed of every system"
     )
-    options = made.parse_args()
+    options = arguments.parse_args()
     count, peers = (4, 1) if options.quick else (50, 20)
     count = options.searches or count
     peers = peers if options.peers is None else options.peers

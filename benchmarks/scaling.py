@@ -57,17 +57,17 @@ class Service:
         plain = {**paper_example.job(self.dataset, 0), "reuse": False, **changes}
         return plain if runs == 1 else {**plain, "sweep": {"axes": axes}}
 
-    def ended(self, job: str, pause: float = POLL_SECONDS) -> dict[str, Any]:
+    def wait_for_job(self, job: str, pause: float = POLL_SECONDS) -> dict[str, Any]:
         """Wait for a job, which takes the web process some time at every look."""
-        while (found := self.client.job(job))["state"] in ("queued", "running"):
+        while (answer := self.client.job(job))["state"] in ("queued", "running"):
             time.sleep(pause)
-        assert found["state"] == "succeeded", found
-        return found
+        assert answer["state"] == "succeeded", answer
+        return answer
 
     def sweep(self, runs: int, **changes: Any) -> Swept:
         """Carry a sweep out and measure it."""
         before = cpu_seconds()
-        job = self.ended(self.client.submit(self.body(runs, **changes))["id"], 0.2)
+        job = self.wait_for_job(self.client.submit(self.body(runs, **changes))["id"], 0.2)
         after = cpu_seconds()
         spent = {name: after[name] - before.get(name, 0.0) for name in after}
         begun, done = (datetime.fromisoformat(job[f"{end}_at"]) for end in ("started", "finished"))
@@ -76,7 +76,7 @@ class Service:
     def wait(self, **changes: Any) -> float:
         """How long a single identification takes, from submission to result, in s."""
         start = time.perf_counter()
-        self.ended(self.client.submit(self.body(1, **changes))["id"])
+        self.wait_for_job(self.client.submit(self.body(1, **changes))["id"])
         return time.perf_counter() - start
 
 
@@ -88,18 +88,19 @@ def service(cpus: int) -> Iterator[Service]:
         url = stack.enter_context(run_embedded_service(folder / "data", cpus=cpus))
         client = stack.enter_context(Client(url))
         path = paper_example.write_csv(folder / "record.csv", seed=1)
-        made = Service(client, client.add_dataset(path, name="example 1")["id"])
-        made.sweep(40)
-        yield made
+        started = Service(client, client.add_dataset(path, name="example 1")["id"])
+        started.sweep(40)
+        yield started
 
 
 def two_against_one(pairs: int, runs: Mapping[str, tuple[int, dict[str, Any]]]) -> list[Row]:
     """The same sweeps with one worker and with two, in turn: others on the machine hit both."""
     rows: list[Row] = []
-    with service(1) as one, service(2) as two:
+    with service(1) as single, service(2) as double:
         for name, (count, changes) in runs.items():
             both = [
-                (one.sweep(count, **changes), two.sweep(count, **changes)) for _ in range(pairs)
+                (single.sweep(count, **changes), double.sweep(count, **changes))
+                for _ in range(pairs)
             ]
             rows += _efficiency(name, [pair[0] for pair in both], [pair[1] for pair in both])
     return rows
@@ -107,14 +108,15 @@ def two_against_one(pairs: int, runs: Mapping[str, tuple[int, dict[str, Any]]]) 
 
 def _efficiency(name: str, alone: Sequence[Swept], both: Sequence[Swept]) -> list[Row]:
     # The fastest of each: others on the machine can only add to a time.
-    gain = min(one.wall for one in alone) / min(two.wall for two in both)
+    gain = min(swept.wall for swept in alone) / min(two.wall for two in both)
 
     def median(kind: str) -> float:
         return statistics.median(two.each(kind) for two in both)
 
     work, ours, rays = median("workers"), median("dispatcher"), median("Ray")
     inflation = statistics.median(
-        one.each("workers") / two.each("workers") for one, two in zip(alone, both, strict=True)
+        single.each("workers") / double.each("workers")
+        for single, double in zip(alone, both, strict=True)
     )
     cores = os.cpu_count() or 1
     bar = 0.92 if cores > 2 else None  # else the dispatcher shares the second worker's core
@@ -156,20 +158,20 @@ def cost_of_a_task(count: int) -> list[Row]:
         "initial": {"y": 0},
     }
     spec = RunSpec(ProblemSpec(document, "r"), algorithm)
-    crew = RayExecutor(ClusterSettings(cpus=2))
+    executor = RayExecutor(ClusterSettings(cpus=2))
     try:
-        crew.warm_up_workers()
-        shared = crew.share_records((record,))
+        executor.warm_up_workers()
+        shared = executor.share_records((record,))
 
         def rounds(number: int) -> None:
             sent = fetched = 0
             while fetched < number:
                 while sent < number and sent - fetched < 4:
                     item = AdvanceRun(f"r{sent}", spec, None, PACK_SECONDS)
-                    crew.submit_pack((item,), ("r",), (shared,))
+                    executor.submit_pack((item,), ("r",), (shared,))
                     sent += 1
-                for handle in crew.wait_for_packs(1.0):
-                    crew.fetch_results(handle)
+                for handle in executor.wait_for_packs(1.0):
+                    executor.fetch_results(handle)
                     fetched += 1
 
         rounds(50)
@@ -178,7 +180,7 @@ def cost_of_a_task(count: int) -> list[Row]:
         own = time.process_time() - own
         rays = cpu_seconds().get("Ray", 0.0) - before.get("Ray", 0.0)
     finally:
-        crew.close()
+        executor.close()
     return [
         Row("a task: CPU of the process that sends it", 1e3 * own / count, "ms"),
         Row("a task: CPU of Ray's own processes", 1e3 * rays / count, "ms"),
@@ -192,35 +194,35 @@ SINGLES: Mapping[str, dict[str, Any]] = {
 }
 
 
-def beside_a_sweep(runs: int, pairs: int) -> list[Row]:
+def measure_single_runs(runs: int, pairs: int) -> list[Row]:
     """How much longer a single identification takes beside a sweep.
 
     In pairs: what others on the machine take falls on both alike. The sweep is cancelled for the
     first of each pair, and resumed and past its head start for the second.
     """
     alone: dict[str, list[float]] = {name: [] for name in SINGLES}
-    beside: dict[str, list[float]] = {name: [] for name in SINGLES}
+    during: dict[str, list[float]] = {name: [] for name in SINGLES}
     at_first: list[float] = []
-    with service(2) as one:
+    with service(2) as site:
         start = time.perf_counter()
-        sweep = one.client.submit(one.body(runs))["id"]
+        sweep = site.client.submit(site.body(runs))["id"]
         submitted = time.perf_counter() - start
         for number in range(pairs):
-            _pause(one, sweep)
+            _pause(site, sweep)
             for name, changes in SINGLES.items():
-                alone[name].append(one.wait(seed=number, **changes))
-            begun = _finished(one, sweep)
-            one.client.resume(sweep)
-            while _finished(one, sweep) <= begun:
+                alone[name].append(site.wait(seed=number, **changes))
+            begun = _finished(site, sweep)
+            site.client.resume(sweep)
+            while _finished(site, sweep) <= begun:
                 time.sleep(POLL_SECONDS)
-            at_first.append(one.wait(seed=number))
+            at_first.append(site.wait(seed=number))
             time.sleep(HEADSTART_SECONDS)  # one worker's time: the other's covers for a busy core
             for name, changes in SINGLES.items():
-                beside[name].append(one.wait(seed=number, **changes))
-            assert _finished(one, sweep) < runs, "the sweep had ended: take more runs"
+                during[name].append(site.wait(seed=number, **changes))
+            assert _finished(site, sweep) < runs, "the sweep had ended: take more runs"
     rows = [Row(f"submission of a sweep of {runs} runs", submitted, "s")]
     for name in SINGLES:
-        delays = [more - less for more, less in zip(beside[name], alone[name], strict=True)]
+        delays = [more - less for more, less in zip(during[name], alone[name], strict=True)]
         rows += [
             Row(f"{name} single, without the sweep: median", statistics.median(alone[name]), "s"),
             Row(f"{name} single, without the sweep: longest", max(alone[name]), "s"),
@@ -234,13 +236,13 @@ def beside_a_sweep(runs: int, pairs: int) -> list[Row]:
     ]
 
 
-def _finished(one: Service, job: str) -> int:
-    return int(one.client.job(job)["progress"]["finished"])
+def _finished(service: Service, job: str) -> int:
+    return int(service.client.job(job)["progress"]["finished"])
 
 
-def _pause(one: Service, job: str) -> None:
-    one.client.cancel(job)
-    _until(lambda: one.client.job(job)["state"] == "cancelled")
+def _pause(service: Service, job: str) -> None:
+    service.client.cancel(job)
+    _until(lambda: service.client.job(job)["state"] == "cancelled")
 
 
 def _until(holds: Callable[[], bool]) -> None:
@@ -267,11 +269,11 @@ def main() -> None:
     rows = [
         *two_against_one(3 if few else 7, sweeps),
         *cost_of_a_task(300 if few else 2000),
-        *beside_a_sweep(100_000, 4 if few else 12),
+        *measure_single_runs(100_000, 4 if few else 12),
     ]
     report("Scaling", rows, [], options)
-    for one in skipped:
-        print(f"{one.name}: none, {one.reason}")
+    for skip in skipped:
+        print(f"{skip.name}: none, {skip.reason}")
 
 
 if __name__ == "__main__":

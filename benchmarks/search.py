@@ -33,7 +33,7 @@ def search_milliseconds(problem: Problem, algorithm: GeneticAlgorithm) -> tuple[
     return 1e3 * (time.process_time() - start), state.evaluations
 
 
-def drawn(problem: Problem, count: int) -> FloatArray:
+def draw_individuals(problem: Problem, count: int) -> FloatArray:
     """Candidates anywhere in the bounds."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     return lower + np.random.default_rng(0).random((count, lower.size)) * (upper - lower)
@@ -43,7 +43,7 @@ def searches(problem: Problem, repeats: int) -> tuple[list[Row], list[Skipped]]:
     """Each method's search beside its own simulations and beside C."""
     rows: list[Row] = []
     timed_c = reference()
-    children = drawn(problem, POPULATION // 2)
+    children = draw_individuals(problem, POPULATION // 2)
     for method in ("simple", "improved-paper", "improved"):
         algorithm = GeneticAlgorithm(
             method=method, population=POPULATION, generations=GENERATIONS, refine=False
@@ -78,8 +78,8 @@ def refinement(problem: Problem, repeats: int) -> Row:
 
     def work() -> object:
         with use_one_thread():  # as where a run is concluded
-            found = refine_candidates(problem, [start])[0]
-            return analyse_estimate(problem, start if found is None else found.theta)
+            end = refine_candidates(problem, [start])[0]
+            return analyse_estimate(problem, start if end is None else end.theta)
 
     work()
     spent = []

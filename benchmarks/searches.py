@@ -108,14 +108,14 @@ def optimum(problem: Problem, starts: list[FloatArray]) -> float:
     return least
 
 
-def goal_of(system: System, problem: Problem, found: FloatArray | None = None) -> Goal:
+def build_goal(system: System, problem: Problem, result: FloatArray | None = None) -> Goal:
     """The goal on a record, from least squares from the truth and from what was found."""
     truth = system.place(problem)
     names = problem.free_names
     tolerances = None
     if system.noise == 0:
         tolerances = np.array([TOLERANCES[system.name[0]][name] for name in names])
-    starts = [truth] if found is None else [truth, found]
+    starts = [truth] if result is None else [truth, result]
     best = 0.0 if system.noise == 0 else optimum(problem, starts)
     return Goal(best, system.level, names, truth, tolerances)
 
@@ -127,16 +127,16 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     start = time.process_time()
     state = advance_run(problem, algorithm, begin_run(problem, algorithm, seed))
     searched = time.process_time()
-    found = conclude_run(problem, algorithm, state)
+    result = conclude_run(problem, algorithm, state)
     seconds, after = searched - start, time.process_time() - searched
-    values = {estimate.name: estimate.value for estimate in found.estimates}
+    values = {estimate.name: estimate.value for estimate in result.estimates}
     best = np.array([values[name] for name in problem.free_names])
-    goal = goal_of(system, problem, best)
+    goal = build_goal(system, problem, best)
     generation = _hit(state, goal)
     if generation is None:
         hit, took = None, np.nan
-        if found.rms <= goal.rms and goal.tolerances is None:  # by the refinement alone
-            hit, took = found.evaluations, seconds + after
+        if result.rms <= goal.rms and goal.tolerances is None:  # by the refinement alone
+            hit, took = result.evaluations, seconds + after
         in_order = hit
     else:
         replayed, took = _replay(problem, algorithm, seed, generation)
@@ -145,9 +145,9 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     settled = state.generation < algorithm.generations and all(
         island.generation == state.generation for island in state.islands
     )
-    made = Search(
-        goal.distance(found.rms),
-        found.evaluations,
+    outcome = Search(
+        goal.distance(result.rms),
+        result.evaluations,
         hit,
         in_order,
         took,
@@ -156,7 +156,7 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
         after,
         settled,
     )
-    return made, goal
+    return outcome, goal
 
 
 def _hit(state: RunState, goal: Goal) -> int | None:
@@ -179,10 +179,10 @@ def _in_order(
     """Simulations of one process up to the target, as the counter of an optimiser gives them."""
     hits, every = _hits(state, goal), algorithm.migration.every
     begin_ = max(min(step.generation for _, step in hits) - 1, 0) // every * every
-    island, step = next(one for one in hits if one[1].generation <= begin_ + every)
+    island, step = next(hit for hit in hits if hit[1].generation <= begin_ + every)
     ended = _replay(problem, algorithm, seed, begin_ + every)[0].islands[:island]
     waiting = _replay(problem, algorithm, seed, begin_)[0].islands[island + 1 :] if begin_ else ()
-    return step.evaluations + sum(one.evaluations for one in (*ended, *waiting))
+    return step.evaluations + sum(island.evaluations for island in (*ended, *waiting))
 
 
 def _is_hit(step: Improvement, goal: Goal) -> bool:

@@ -66,7 +66,7 @@ class System:
     def clean(self) -> FloatArray:
         """The output without noise."""
         first = np.full(self.samples, self.start.get("y", 0.0))
-        problem = self._posed(first)
+        problem = self._build_problem(first)
         return problem.predict(self.place(problem)[None])[0]
 
     def place(self, problem: Problem) -> FloatArray:
@@ -77,19 +77,21 @@ class System:
         """The system's record with the noise of that seed, ready to be fitted."""
         scale = 1.0 if self.absolute else float(np.std(self.clean))
         draw = np.random.default_rng(seed).standard_normal(self.samples)
-        return self._posed(self.clean + self.noise * scale * draw)
+        return self._build_problem(self.clean + self.noise * scale * draw)
 
     @property
     def level(self) -> float:
         """RMS of the output without noise."""
         return rms(self.clean)
 
-    def _posed(self, y: FloatArray) -> Problem:
+    def _build_problem(self, y: FloatArray) -> Problem:
         times = self.step * np.arange(self.samples)
         inputs = []
         if self.drive is not None:
-            one = self.parsed.inputs[0]
-            inputs.append(Channel(one.name, times, self.drive(times), one.unit, hold=self.hold))  # type: ignore[arg-type]
+            signal = self.parsed.inputs[0]
+            inputs.append(
+                Channel(signal.name, times, self.drive(times), signal.unit, hold=self.hold)
+            )  # type: ignore[arg-type]
         output = Channel(self.parsed.outputs[0].name, times, y)
         return Problem.build(
             self.parsed, [Record(tuple(inputs), (output,))], parameters=self.parameters

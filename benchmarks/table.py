@@ -39,13 +39,13 @@ class Skipped:
 
 def parser(description: str) -> argparse.ArgumentParser:
     """Return a parser with the options of every benchmark: --quick, --json FILE, --check."""
-    made = argparse.ArgumentParser(description=description)
-    made.add_argument("--quick", action="store_true", help="fewer repetitions")
-    made.add_argument(
+    arguments = argparse.ArgumentParser(description=description)
+    arguments.add_argument("--quick", action="store_true", help="fewer repetitions")
+    arguments.add_argument(
         "--json", type=Path, metavar="FILE", help="write the figures as JSON, the table as FILE.md"
     )
-    made.add_argument("--check", action="store_true", help="exit 1 if a bar is missed")
-    return made
+    arguments.add_argument("--check", action="store_true", help="exit 1 if a bar is missed")
+    return arguments
 
 
 def markdown(title: str, rows: list[Row], skipped: list[Skipped]) -> str:
@@ -60,7 +60,7 @@ def markdown(title: str, rows: list[Row], skipped: list[Skipped]) -> str:
         bar = "" if row.bar is None else f"{row.relation} {row.bar:g}"
         verdict = "" if row.bar is None else ("yes" if row.holds else "**no**")
         lines.append(f"| {row.name} | {row.value:.5g} | {row.unit} | {bar} | {verdict} |")
-    lines += [f"| {one.name} | skipped | | | {one.reason} |" for one in skipped]
+    lines += [f"| {skip.name} | skipped | | | {skip.reason} |" for skip in skipped]
     return "\n".join(lines) + "\n"
 
 

@@ -91,18 +91,18 @@ class Torture:
                 "LAGID_WORKER_MEMORY_MB": str(WORKER_MEGABYTES),
             },
         )
-        self.met: dict[str, list[Met]] = {kind: [] for kind in self.known()}
+        self.met: dict[str, list[Met]] = {kind: [] for kind in self.list_faults()}
         self.at_risk: list[float] = []
         self.unrecovered = 0
 
-    def known(self) -> dict[str, Fault]:
+    def list_faults(self) -> dict[str, Fault]:
         """The faults that can be done here."""
-        found = dict(FAULTS)
+        faults = dict(FAULTS)
         if self._postgres is not None:
-            found |= POSTGRES_FAULTS
+            faults |= POSTGRES_FAULTS
         if self.disk is not None:
-            found |= DISK_FAULTS
-        return found
+            faults |= DISK_FAULTS
+        return faults
 
     def run(self, minutes: float, draw: random.Random) -> list[Row]:
         """Faults in random order, each kind as often as the others."""
@@ -118,8 +118,8 @@ class Torture:
             stuck = stream.finish()
             meter.stop()
         left = self.stand.leftovers()
-        for one in left:
-            print(f"{self.name}: left behind: {one}")
+        for leftover in left:
+            print(f"{self.name}: left behind: {leftover}")
         return self._rows(stream, stuck, len(left))
 
     def _separate_checkpoints(self) -> None:
@@ -137,33 +137,33 @@ class Torture:
             connection.execute(text("ALTER TABLE checkpoints SET TABLESPACE small"))
 
     def _break(self, stream: Stream, meter: Meter, seconds: float, draw: random.Random) -> None:
-        disks = tuple(one for one in (self.disk, self.table) if one is not None)
+        disks = tuple(disk for disk in (self.disk, self.table) if disk is not None)
         bench = Bench(self.stand, stream, self._postgres, self.clock, self.ray_away, disks)
         limit = time.monotonic() + seconds
-        known = self.known()
-        for kind, pause in _in_random_order(list(known), draw):
+        faults_by_kind = self.list_faults()
+        for kind, pause in _in_random_order(list(faults_by_kind), draw):
             time.sleep(pause)
             if time.monotonic() > limit:
                 return
             self.at_risk.append(stream.at_risk())
             before = meter.read()
             try:
-                took = known[kind](bench)
+                took = faults_by_kind[kind](bench)
             except TimeoutError as error:
                 print(f"{self.name}: {kind}: {error}", flush=True)
                 self.unrecovered += 1
                 continue
             met = Met(took, meter.read().since(before))
             self.met[kind].append(met)
-            print(f"{self.name}: {kind}: {took:.1f} s ({_told(met)})", flush=True)
+            print(f"{self.name}: {kind}: {took:.1f} s ({_format_processor_share(met)})", flush=True)
 
     def _rows(self, stream: Stream, stuck: int, left: int) -> list[Row]:
         counts = stream.counts
-        told = [kind for kind in counts if kind.startswith(("cancelled ", "full disks"))]
+        reported = [kind for kind in counts if kind.startswith(("cancelled ", "full disks"))]
         figures = [
             ("faults", sum(map(len, self.met.values())), None),
             ("faults without recovery", self.unrecovered, 0),
-            *((kind, counts[kind], None) for kind in sorted(told)),
+            *((kind, counts[kind], None) for kind in sorted(reported)),
             ("jobs ended", counts["jobs"], None),
             ("runs ended", counts["runs"], None),
             ("runs lost", counts["lost"], 0),
@@ -181,7 +181,7 @@ class Torture:
         for kind, met in self.met.items():
             if met:
                 bar = GCS_SECONDS if "GCS" in kind else RECOVERY_SECONDS
-                worst = max(one.seconds for one in met)
+                worst = max(meeting.seconds for meeting in met)
                 rows.append(Row(f"{self.name}: {kind}: recovery, worst", worst, "s", bar))
         return rows
 
@@ -195,15 +195,15 @@ class Torture:
         ]
         for kind, met in self.met.items():
             if met:
-                worst = max(met, key=lambda one: one.seconds)
-                median = statistics.median(one.seconds for one in met)
+                worst = max(met, key=lambda meeting: meeting.seconds)
+                median = statistics.median(meeting.seconds for meeting in met)
                 own, others = worst.reading.own, worst.reading.share_of_others
                 figures = f"{len(met)} | {median:.1f} | {worst.seconds:.1f} | {own:.1f}"
                 lines.append(f"| {kind} | {figures} | {others:.0%} |")
         return "\n".join(lines) + "\n"
 
 
-def _told(met: Met) -> str:
+def _format_processor_share(met: Met) -> str:
     reading = met.reading
     return f"{reading.own:.1f} s of processor, others had {reading.share_of_others:.0%}"
 
@@ -252,13 +252,13 @@ def main() -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__doc__ or "")
-    made.add_argument(
+    arguments = parser(__doc__ or "")
+    arguments.add_argument(
         "--minutes", type=float, default=10.0, help="duration of the faults per database"
     )
-    made.add_argument("--database", choices=("sqlite", "postgres", "both"), default="both")
-    made.add_argument("--seed", type=int, default=1, help="seed of the order of the faults")
-    return made.parse_args()
+    arguments.add_argument("--database", choices=("sqlite", "postgres", "both"), default="both")
+    arguments.add_argument("--seed", type=int, default=1, help="seed of the order of the faults")
+    return arguments.parse_args()
 
 
 if __name__ == "__main__":

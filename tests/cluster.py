@@ -17,14 +17,14 @@ FREE_SECONDS = 60.0
 def _ray() -> "Iterator[RayExecutor]":
     from workers.ray_executor import ClusterSettings, RayExecutor
 
-    crew = RayExecutor(ClusterSettings(cpus=CPUS))
-    crew.warm_up_workers()
-    yield crew
-    crew.close()
+    executor = RayExecutor(ClusterSettings(cpus=CPUS))
+    executor.warm_up_workers()
+    yield executor
+    executor.close()
 
 
 @pytest.fixture
-def ray_crew(_ray: "RayExecutor") -> "Iterator[RayExecutor]":
+def ray_executor(_ray: "RayExecutor") -> "Iterator[RayExecutor]":
     """Two workers of a local Ray; each test must leave both free."""
     yield _ray
     limit = time.monotonic() + FREE_SECONDS

@@ -111,9 +111,9 @@ class Place:
         return stored.dataset.id
 
 
-def carry_out(place: Place, job: str, crew: Executor) -> None:
-    """Run a dispatcher of this crew until the job has ended."""
-    dispatcher = Dispatcher(place.database, place.store, crew, HeldLeases(place.database, 30))
+def carry_out(place: Place, job: str, executor: Executor) -> None:
+    """Run a dispatcher of this executor until the job has ended."""
+    dispatcher = Dispatcher(place.database, place.store, executor, HeldLeases(place.database, 30))
 
     def stop_at_the_end() -> None:
         while place.job(job).state in OPEN_STATES:

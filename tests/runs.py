@@ -107,9 +107,9 @@ class Notebook:
         return self.is_stopped
 
 
-def carry_out(crew: Executor, specs: Mapping[str, RunSpec]) -> Notebook:
-    """Feed one job of these runs to the crew until it has ended."""
-    feeder, notebook = Scheduler(crew), Notebook()
+def carry_out(executor: Executor, specs: Mapping[str, RunSpec]) -> Notebook:
+    """Feed one job of these runs to the executor until it has ended."""
+    feeder, notebook = Scheduler(executor), Notebook()
     feeder.add_job("job", ListedRuns(QueuedRun(run, one) for run, one in specs.items()), notebook)
     limit = time.monotonic() + LIMIT_SECONDS
     while time.monotonic() < limit:

@@ -1,4 +1,4 @@
-"""A crew that computes nothing, in a time of its own: what the order of packs does to jobs."""
+"""A executor that computes nothing, in a time of its own: what the order of packs does to jobs."""
 
 import heapq
 from collections import deque
@@ -96,11 +96,11 @@ def _unfinished() -> RunState:
 
 
 class Theatre:
-    """A feeder with a simulated crew, and when each of its jobs ended."""
+    """A feeder with a simulated executor, and when each of its jobs ended."""
 
     def __init__(self, slots: int, **options: Any) -> None:
-        self.crew = SimulatedExecutor(slots)
-        self.feeder: Scheduler[str] = Scheduler(self.crew, **options)
+        self.executor = SimulatedExecutor(slots)
+        self.feeder: Scheduler[str] = Scheduler(self.executor, **options)
         self.ended: dict[str, float] = {}
 
     def add(self, job: str, runs: int, seconds: float, **rights: Any) -> None:
@@ -111,23 +111,23 @@ class Theatre:
 
     def play(self, seconds: float) -> None:
         """Let so much time pass."""
-        end = self.crew.now + seconds
-        while self.crew.now < end and self.feeder._jobs:
+        end = self.executor.now + seconds
+        while self.executor.now < end and self.feeder._jobs:
             self.step()
 
     def until(self, job: str) -> float:
         """Play until the job has ended; gives the time it took from now."""
-        begun = self.crew.now
+        begun = self.executor.now
         while job not in self.ended:
             self.step()
         return self.ended[job] - begun
 
     def step(self) -> None:
         for job in self.feeder.run_step(0.0):
-            self.ended[job] = self.crew.now
+            self.ended[job] = self.executor.now
 
     def had(self, job: str) -> float:
         """Compute time of a job so far."""
         return sum(
-            seconds for run, seconds in self.crew.computed.items() if run.startswith(f"{job}/")
+            seconds for run, seconds in self.executor.computed.items() if run.startswith(f"{job}/")
         )

@@ -49,14 +49,14 @@ class Finding:
     killed: tuple[bool, ...]
     unplotted: int
 
-    def beside(self, undisturbed: "Finding") -> str:
+    def list_differences(self, undisturbed: "Finding") -> str:
         """Which figures differ from those, and the first that does in both forms."""
         mine, theirs = json.loads(self.figures), json.loads(undisturbed.figures)
-        apart = [name for name in mine if mine[name] != theirs[name]]
-        shown = {name: f"{mine[name]} instead of {theirs[name]}" for name in apart}
-        return "; ".join(f"{name}: {text[:SHOWN]}" for name, text in shown.items())
+        names = [name for name in mine if mine[name] != theirs[name]]
+        differences = {name: f"{mine[name]} instead of {theirs[name]}" for name in names}
+        return "; ".join(f"{name}: {text[:SHOWN]}" for name, text in differences.items())
 
-    def given_up_beside(self, undisturbed: "Finding") -> int:
+    def count_given_up(self, undisturbed: "Finding") -> int:
         """Runs that were given up, alone or with the job, because they met too many faults."""
         if self.given_up:
             pairs = zip(self.states, undisturbed.states, strict=False)
@@ -64,7 +64,7 @@ class Finding:
         killed = zip(self.killed, undisturbed.killed, strict=False)
         return sum(mine and not theirs for mine, theirs in killed)
 
-    def lost_beside(self, undisturbed: "Finding") -> int:
+    def count_lost(self, undisturbed: "Finding") -> int:
         """Runs that did not come to the end they had there."""
         pairs = zip(self.states, undisturbed.states, strict=False)
         missing = max(0, len(undisturbed.states) - len(self.states))
@@ -88,9 +88,12 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     numbers = Counter(run.number for run in runs)
     doubled = sum(numbers.values()) - len(numbers) + max(0, job.n_done - job.n_runs)
     doubled += max(0, ended - ends)
-    summary = without_clock(stand.client.summary(job_id))
+    summary = remove_clock(stand.client.summary(job_id))
     total = sum(run.evaluations for run in runs)
-    estimates, reasons = [run.estimates for run in runs], [reason(run.error) for run in runs]
+    estimates, reasons = (
+        [run.estimates for run in runs],
+        [describe_reason(run.error) for run in runs],
+    )
     figures = {
         "summary": summary,
         "evaluations of the job": job.evaluations,
@@ -120,23 +123,23 @@ def _paths(session: Session, job_id: str) -> dict[str, str]:
         migrants[run].append(data)
     return {
         run: sha256(
-            repr([unpack_history("", found), unpack_migrants("", migrants[run])]).encode()
+            repr([unpack_history("", pages), unpack_migrants("", migrants[run])]).encode()
         ).hexdigest()
-        for run, found in points.items()
+        for run, pages in points.items()
     }
 
 
-def reason(error: str | None) -> str:
+def describe_reason(error: str | None) -> str:
     """Why a run failed, without the numbers of processes."""
     return (error or "").split(";")[0]
 
 
-def without_clock(document: Any) -> Any:
+def remove_clock(document: Any) -> Any:
     """The document without what tells of time and place."""
     if isinstance(document, dict):
-        return {k: without_clock(v) for k, v in document.items() if k not in CLOCKED}
+        return {k: remove_clock(v) for k, v in document.items() if k not in CLOCKED}
     if isinstance(document, list):
-        return [without_clock(one) for one in document]
+        return [remove_clock(item) for item in document]
     return document
 
 
@@ -149,7 +152,7 @@ def is_over(stand: Stand, job_id: str) -> bool:
         return False
 
 
-def steps(stand: Stand, jobs: list[str]) -> int | None:
+def count_steps(stand: Stand, jobs: list[str]) -> int | None:
     """A number that grows with the work on jobs; None while the database is away."""
     try:
         with stand.database.read_session() as session:
@@ -161,8 +164,8 @@ def steps(stand: Stand, jobs: list[str]) -> int | None:
         return None
 
 
-def owners(stand: Stand) -> set[str]:
+def list_owners(stand: Stand) -> set[str]:
     """Dispatchers that hold a lease."""
     with stand.database.read_session() as session:
         held = select(Job.lease_owner).where(Job.state == JobState.RUNNING)
-        return {str(one) for one in session.scalars(held)}
+        return {str(owner) for owner in session.scalars(held)}

@@ -61,15 +61,15 @@ def _cancelled(bench: Bench, is_time: Callable[[Bench, str], bool]) -> float:
 
 def _cancel_and_resume(bench: Bench, job: str) -> None:
     """Do both, and watch the job from then on; nothing is cancelled that has already ended."""
-    met = _job(bench, job)
+    met = _read_job(bench, job)
     try:
         _insist(lambda: bench.stand.client.cancel(job))
     except ProblemError:
         bench.stream.counts["cancelled too late"] += 1
         bench.stream.watch(job, "cancelled")
         return
-    until(lambda: _job(bench, job).state.is_terminal, "it was cancelled", LIMIT_SECONDS)
-    if _job(bench, job).state is not JobState.CANCELLED:  # it ended before anybody looked
+    until(lambda: _read_job(bench, job).state.is_terminal, "it was cancelled", LIMIT_SECONDS)
+    if _read_job(bench, job).state is not JobState.CANCELLED:  # it ended before anybody looked
         bench.stream.counts["cancelled too late"] += 1
         bench.stream.watch(job, "cancelled")
         return
@@ -78,22 +78,22 @@ def _cancel_and_resume(bench: Bench, job: str) -> None:
     try:
         _insist(lambda: bench.stand.client.resume(job))
     except ProblemError:  # the answer to an earlier try was lost
-        if _job(bench, job).state is JobState.CANCELLED:
+        if _read_job(bench, job).state is JobState.CANCELLED:
             raise
     bench.stream.watch(job, "cancelled", ends=2)
 
 
 def _has_begun(bench: Bench, job: str) -> bool:
-    found = _job(bench, job)
-    return found.state.is_terminal or (found.state is JobState.RUNNING and found.n_done > 0)
+    row = _read_job(bench, job)
+    return row.state.is_terminal or (row.state is JobState.RUNNING and row.n_done > 0)
 
 
 def _is_finishing(bench: Bench, job: str) -> bool:
-    found = _job(bench, job)
-    return found.state.is_terminal or found.n_done >= found.n_runs
+    row = _read_job(bench, job)
+    return row.state.is_terminal or row.n_done >= row.n_runs
 
 
-def _job(bench: Bench, job: str) -> Job:
+def _read_job(bench: Bench, job: str) -> Job:
     def read() -> Job:
         with bench.stand.database.read_session() as session:
             return session.get_one(Job, job)

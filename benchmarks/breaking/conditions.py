@@ -9,9 +9,16 @@ import time
 
 import httpx
 
-from benchmarks.breaking.audit import owners
-from benchmarks.breaking.disks import filled
-from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, known, renewal
+from benchmarks.breaking.audit import list_owners
+from benchmarks.breaking.disks import fill_folders
+from benchmarks.breaking.faults import (
+    LIMIT_SECONDS,
+    Bench,
+    goes_on,
+    kill,
+    list_known_dispatchers,
+    renewal,
+)
 from benchmarks.breaking.stand import until
 
 FULL_SECONDS = 8.0
@@ -25,7 +32,7 @@ FULL = ("the database does not answer", "are not stored", "no heartbeat could be
 def fill_disks(bench: Bench) -> float:
     """Leave no space for objects and checkpoints; a recording that comes now is refused."""
     before = _complaints(bench)
-    with filled(*bench.disks):
+    with fill_folders(*bench.disks):
         until(
             lambda: _is_refused(bench), "a recording was refused for want of space", LIMIT_SECONDS
         )
@@ -62,19 +69,23 @@ def withhold_ray(bench: Bench) -> float:
     """Kill the dispatcher while Ray cannot be started; meanwhile no job may be shown as running."""
     flag = bench.ray_away
     assert flag is not None
-    before, seen = bench.stand.log.count(REFUSED), known(bench)
+    before, before_dispatchers = bench.stand.log.count(REFUSED), list_known_dispatchers(bench)
     flag.touch()
     try:
         kill(bench.stand.family.dispatchers())
         until(lambda: bench.stand.log.count(REFUSED) >= before + TRIES, "tries", LIMIT_SECONDS)
-        if held := owners(bench.stand):
+        if held := list_owners(bench.stand):
             raise AssertionError(f"jobs are shown as running by {held}, and nobody runs them")
         if bench.stand.answers() != httpx.codes.OK:
             raise AssertionError("the web does not answer without Ray")
     finally:
         flag.unlink()
     begun = time.monotonic()
-    until(lambda: bool(owners(bench.stand) - seen), "another dispatcher", LIMIT_SECONDS)
+    until(
+        lambda: bool(list_owners(bench.stand) - before_dispatchers),
+        "another dispatcher",
+        LIMIT_SECONDS,
+    )
     return goes_on(bench, begun)
 
 

@@ -29,7 +29,7 @@ def small_disk(folder: Path, megabytes: int) -> Iterator[Path | None]:
 
 
 @contextmanager
-def filled(*folders: Path) -> Iterator[None]:
+def fill_folders(*folders: Path) -> Iterator[None]:
     """No space is left on the file systems of these folders for the length of the block."""
     ballast = [folder / "ballast" for folder in folders]
     try:

@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 from sqlalchemy import select
 
-from benchmarks.breaking.audit import owners, steps
+from benchmarks.breaking.audit import count_steps, list_owners
 from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import Stream
 from service.storage.tables import DispatcherHeartbeat
@@ -114,7 +114,7 @@ def pause_dispatcher(bench: Bench) -> float:
         try:
             held = f"-{first}-"
             until(
-                lambda: not any(held in owner for owner in owners(bench.stand)),
+                lambda: not any(held in owner for owner in list_owners(bench.stand)),
                 "the paused dispatcher's jobs were given to another",
                 LIMIT_SECONDS,
             )
@@ -148,21 +148,21 @@ def step_clock_and_kill(bench: Bench) -> float:
 
 def renewal(bench: Bench, fault: Callable[[], None]) -> float:
     """Of what only another dispatcher than the present one mends."""
-    before = known(bench)
+    before = list_known_dispatchers(bench)
     begun = time.monotonic()
     fault()
     until(
-        lambda: bool(owners(bench.stand) - before) and bench.stand.answers() == 200,
+        lambda: bool(list_owners(bench.stand) - before) and bench.stand.answers() == 200,
         "another dispatcher has the jobs",
         LIMIT_SECONDS,
     )
     return goes_on(bench, begun)
 
 
-def known(bench: Bench) -> set[str]:
+def list_known_dispatchers(bench: Bench) -> set[str]:
     """Dispatchers that were ever heard of."""
     with bench.stand.database.read_session() as session:
-        return {*session.scalars(select(DispatcherHeartbeat.owner)), *owners(bench.stand)}
+        return {*session.scalars(select(DispatcherHeartbeat.owner)), *list_owners(bench.stand)}
 
 
 def recovery(
@@ -182,7 +182,7 @@ def goes_on(bench: Bench, begun: float) -> float:
 
     def is_further() -> bool:
         for job in bench.stream.jobs():
-            now = steps(bench.stand, [job])
+            now = count_steps(bench.stand, [job])
             if now is not None and now > seen.setdefault(job, now):
                 return True
         return False

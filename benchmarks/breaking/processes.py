@@ -23,9 +23,13 @@ class Family:
             if process.info["status"] not in (None, psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
                 with suppress(ProcessLookupError, PermissionError):
                     alive[process] = os.getsid(process.pid)
-        marked = {one for one in alive if (one.info["environ"] or {}).get(MARK) == self._mark}
-        self._sessions |= {alive[one] for one in marked} - {os.getsid(0)}
-        return [one for one in alive if one in marked or alive[one] in self._sessions]
+        marked = {
+            process for process in alive if (process.info["environ"] or {}).get(MARK) == self._mark
+        }
+        self._sessions |= {alive[process] for process in marked} - {os.getsid(0)}
+        return [
+            process for process in alive if process in marked or alive[process] in self._sessions
+        ]
 
     def named(self, command: str) -> list[int]:
         """Members whose program's name begins so."""

@@ -150,11 +150,13 @@ class Stand:
         return left
 
     def _left(self) -> list[str]:
-        found = [f"process {one.pid} {one.info['name']}" for one in self.family.members()]
-        found += [f"shared memory {name}" for name in set(shared_memory()) - self._before]
-        found += [f"temporary {path.name}" for path in self.temporary.glob("*")]
+        leftovers = [
+            f"process {process.pid} {process.info['name']}" for process in self.family.members()
+        ]
+        leftovers += [f"shared memory {name}" for name in set(shared_memory()) - self._before]
+        leftovers += [f"temporary {path.name}" for path in self.temporary.glob("*")]
         unfinished = self.folder / "objects" / "tmp"
-        return found + [f"object {path.name}" for path in unfinished.glob("*")]
+        return leftovers + [f"object {path.name}" for path in unfinished.glob("*")]
 
     def _spawn(self) -> None:
         with (self.folder / "serve.log").open("ab") as log:
@@ -214,4 +216,6 @@ def until(holds: Callable[[], bool], what: str, seconds: float) -> float:
 def shared_memory() -> list[str]:
     """Names below ``/dev/shm`` that Ray or a pool of processes may have made."""
     folder = Path("/dev/shm")
-    return [one.name for one in folder.glob("*") if not one.name.startswith(("PostgreSQL", "sem"))]
+    return [
+        path.name for path in folder.glob("*") if not path.name.startswith(("PostgreSQL", "sem"))
+    ]

@@ -96,18 +96,20 @@ class Stream:
     def at_risk(self) -> float:
         """Seconds of work of the long run that are in no checkpoint: what a kill now repeats."""
         with self._lock:
-            job = next((job for job, one in self._open.items() if one.kind == "long"), None)
+            job = next(
+                (job for job, open_job in self._open.items() if open_job.kind == "long"), None
+            )
         if job is None:
             return 0.0
-        told, kept = self._evaluations(job)
-        return max(0, told - kept) / self._rate
+        done, saved = self._evaluations(job)
+        return max(0, done - saved) / self._rate
 
     def _evaluations(self, job: str) -> tuple[int, int]:
         """Those of a job of one run so far, and those in its checkpoint."""
         with self._stand.database.read_session() as session:
-            told = session.get_one(Job, job).evaluations
-            kept = select(Checkpoint.evaluations).where(Checkpoint.job_id == job)
-            return told, session.scalar(kept) or 0
+            done = session.get_one(Job, job).evaluations
+            saved = select(Checkpoint.evaluations).where(Checkpoint.job_id == job)
+            return done, session.scalar(saved) or 0
 
     def start(self) -> None:
         """Begin to submit."""
@@ -129,9 +131,9 @@ class Stream:
         """
         with self._lock:
             key = f"{kind}-{self._n_submitted}"
-            made = self._stand.client.submit(self._bodies[kind], idempotency_key=key)
+            answer = self._stand.client.submit(self._bodies[kind], idempotency_key=key)
             self._n_submitted += 1
-        return str(made["id"])
+        return str(answer["id"])
 
     def watch(self, job: str, kind: str, *, ends: int = 1) -> None:
         """Hold a job against the undisturbed one when it has ended, for the last of `ends`."""
@@ -156,7 +158,7 @@ class Stream:
         for job in self.jobs():
             with self._lock:
                 self._try(lambda job=job: self._compare(job))
-        there = {one.kind for one in self._open.values()}
+        there = {open_job.kind for open_job in self._open.values()}
         for kind in ALWAYS if submits else ():
             if kind not in there:
                 self._try(lambda kind=kind: self.watch(self.submit(kind), kind))
@@ -171,20 +173,22 @@ class Stream:
     def _compare(self, job: str) -> None:
         if not is_over(self._stand, job):
             return
-        one = self._open[job]
-        found = audit(self._stand, job, ends=one.ends)
-        wanted, counts = self.undisturbed[one.kind], self.counts
+        open_job = self._open[job]
+        finding = audit(self._stand, job, ends=open_job.ends)
+        wanted, counts = self.undisturbed[open_job.kind], self.counts
         counts["jobs"] += 1
-        counts[one.kind] += 1
-        counts["runs"] += len(found.states)
-        counts["doubled"] += found.doubled
-        counts["unplotted"] += found.unplotted
-        given_up = found.given_up_beside(wanted)
-        counts["given up"] += found.given_up
+        counts[open_job.kind] += 1
+        counts["runs"] += len(finding.states)
+        counts["doubled"] += finding.doubled
+        counts["unplotted"] += finding.unplotted
+        given_up = finding.count_given_up(wanted)
+        counts["given up"] += finding.given_up
         counts["runs given up"] += given_up
         if not given_up:
-            counts["lost"] += found.lost_beside(wanted)
-            if found.figures != wanted.figures:
+            counts["lost"] += finding.count_lost(wanted)
+            if finding.figures != wanted.figures:
                 self.different.append(job)
-                print(f"{one.kind} {job} differs: {found.beside(wanted)}", flush=True)
+                print(
+                    f"{open_job.kind} {job} differs: {finding.list_differences(wanted)}", flush=True
+                )
         del self._open[job]

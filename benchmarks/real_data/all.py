@@ -31,8 +31,8 @@ def measure(client: Client, folder: Path) -> list[Row]:
     """Rows of every program, each with the name of its data."""
     return [
         replace(row, name=f"{data}, {row.name}")
-        for data, one in PROGRAMS.items()
-        for row in one(client, folder)
+        for data, measure_data in PROGRAMS.items()
+        for row in measure_data(client, folder)
     ]
 
 

@@ -56,13 +56,13 @@ def measure(client: Client, folder: Path) -> list[Row]:
     document = asymmetric(client.model("emps")["document"])
     both = identify(client, {**common, "name": "EMPS, asymmetric friction", "model": document})
     print_estimates("EMPS, asymmetric friction and an offset", both)
-    told = [
-        one["name"]
-        for one in both["parameters"]
-        if one["name"] in ASYMMETRIC and one["status"] in ("group", "unidentifiable")
+    unidentified = [
+        parameter["name"]
+        for parameter in both["parameters"]
+        if parameter["name"] in ASYMMETRIC and parameter["status"] in ("group", "unidentifiable")
     ]
     print("\npublished, mm: linear 5.53, pNARX 5.17, CT-SUBNET 4.61, best 2.64")
-    rows.append(Row("of Fp, Fn and o reported as not identified", len(told), "1", 3, ">="))
+    rows.append(Row("of Fp, Fn and o reported as not identified", len(unidentified), "1", 3, ">="))
     return rows
 
 
@@ -72,7 +72,9 @@ def _print_ridge(client: Client, common: dict[str, Any]) -> None:
     for level in RIDGE:
         fixed = {**common, **SQUARES, "parameters": {"Fc": {"fixed": level}}}
         run = identify(client, {**fixed, "name": "ridge", "model": "emps"})
-        fv = next(one["value"] for one in run["parameters"] if one["name"] == "Fv")
+        fv = next(
+            parameter["value"] for parameter in run["parameters"] if parameter["name"] == "Fv"
+        )
         rms = [1e3 * run["agreement"][part][0]["rms"] for part in ("estimation", "validation")]
         print(f"| {level:g} | {fv:.1f} | {rms[0]:.3f} | {rms[1]:.3f} |")
 

@@ -34,22 +34,22 @@ def measure(client: Client, folder: Path) -> list[Row]:
 
 def pressures(source: Path) -> dict[float, list[float]]:
     """Nominal pressures (bar) of the fill phase at each length (m)."""
-    found: dict[float, set[float]] = defaultdict(set)
+    by_length: dict[float, set[float]] = defaultdict(set)
     with source.open(newline="") as lines:
         for row in csv.DictReader(lines):
             if row["phase"] == "fill":
-                found[float(row["length_m"])].add(float(row["p_nom_bar"]))
-    return {length: sorted(found[length]) for length in sorted(found)}
+                by_length[float(row["length_m"])].add(float(row["p_nom_bar"]))
+    return {length: sorted(by_length[length]) for length in sorted(by_length)}
 
 
 def _job(client: Client, raw: str, length: float, several: list[float]) -> dict[str, Any]:
     """A sweep over the pressures; a lag is sought up to half the record or the model's bound."""
     even = [pooled(client, raw, length, pressure, 0) for pressure in several]
     odd = [pooled(client, raw, length, pressure, 1) for pressure in several]
-    half = [min(one["duration"] / 2, 1.0) for one in even]
+    half = [min(dataset["duration"] / 2, 1.0) for dataset in even]
     values = {
-        "/datasets": [[one["id"]] for one in even],
-        "/validation/datasets": [[one["id"]] for one in odd],
+        "/datasets": [[dataset["id"]] for dataset in even],
+        "/validation/datasets": [[dataset["id"]] for dataset in odd],
         "/parameters/L/upper": half,
     }
     return {
@@ -108,16 +108,16 @@ def _rows(runs: Runs) -> list[Row]:
     lags: dict[float, tuple[float, float]] = {}
     for length, several in runs.items():
         fit = median(run["fit_percent"]["validation"] for run in several)
-        found = [parameter(run, "L") for run in several]
-        errors = [one["stderr"] for one in found if one["stderr"]]
+        estimates = [parameter(run, "L") for run in several]
+        errors = [estimate["stderr"] for estimate in estimates if estimate["stderr"]]
         # A median of n estimates of about equal error has pi/2 of the variance of their mean.
         error = median(errors) * sqrt(1.5708 / len(several)) if errors else float("nan")
-        lags[length] = (median(one["value"] for one in found), error)
+        lags[length] = (median(estimate["value"] for estimate in estimates), error)
         rows += [
             Row(f"{length:g} m, fit", fit, "%", 93.0 if length >= 3 else None, ">="),
             Row(f"{length:g} m, L", 1e3 * lags[length][0], "ms"),
             Row(f"{length:g} m, standard error of L", 1e3 * error, "ms"),
-            _told(length, several),
+            _row_of_warnings(length, several),
         ]
     slope, error = _slope({length: lag for length, lag in lags.items() if length >= 3})
     return [
@@ -128,7 +128,7 @@ def _rows(runs: Runs) -> list[Row]:
     ]
 
 
-def _told(length: float, several: Sequence[dict[str, Any]]) -> Row:
+def _row_of_warnings(length: float, several: Sequence[dict[str, Any]]) -> Row:
     """The part of the runs that warn; below 5 m the median one should."""
     part = sum(_ridge(run) for run in several) / len(several)
     bar = 0.5 if length < SEPARABLE_FROM_M else None

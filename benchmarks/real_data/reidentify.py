@@ -22,7 +22,7 @@ Batch = Sequence[tuple[float, Sequence[str]]]
 
 
 @dataclass(frozen=True)
-class Carried:
+class BatchResult:
     """A batch that is over: its job, its trend, the results of its runs by their length."""
 
     job: str
@@ -46,7 +46,7 @@ def measure(client: Client, folder: Path, *, quick: bool = False) -> list[Row]:
     return rows if quick else rows + _measured_tubes(client, folder / "pneuact_tube")
 
 
-def carried_out(client: Client, batch: Batch, **fields: Any) -> Carried:
+def run_batch(client: Client, batch: Batch, **fields: Any) -> BatchResult:
     """Submit a batch to the recipe and wait for it."""
     body = {
         "model": "tube",
@@ -56,11 +56,11 @@ def carried_out(client: Client, batch: Batch, **fields: Any) -> Carried:
         **fields,
     }
     job = client.reidentify(body)
-    ended = client.wait(job["id"], progress=lambda _: PEAK.sample())
-    if ended["state"] != "succeeded":
-        raise SystemExit(f"job {job['id']} {ended['state']}: {ended.get('error')}")
-    runs = [(one["labels"]["length_m"], client.run(one["id"])) for one in client.runs(job["id"])]
-    return Carried(job["id"], client.trend(job["id"]), runs)
+    job_end = client.wait(job["id"], progress=lambda _: PEAK.sample())
+    if job_end["state"] != "succeeded":
+        raise SystemExit(f"job {job['id']} {job_end['state']}: {job_end.get('error')}")
+    runs = [(run["labels"]["length_m"], client.run(run["id"])) for run in client.runs(job["id"])]
+    return BatchResult(job["id"], client.trend(job["id"]), runs)
 
 
 def _reference_tubes(client: Client, folder: Path) -> list[Row]:
@@ -76,21 +76,21 @@ def _reference_tubes(client: Client, folder: Path) -> list[Row]:
     for pattern in (1, 2):
         batch = [(float(length), [stored[length, pattern]]) for length in REFERENCE]
         shared = {"channels": CHANNELS, "reuse": False}
-        cold = carried_out(client, batch, **shared, warm_start="none")
-        warm = carried_out(client, batch, **shared, warm_start="previous")
+        cold = run_batch(client, batch, **shared, warm_start="none")
+        warm = run_batch(client, batch, **shared, warm_start="previous")
         rows += [row for x, run in warm.runs for row in _against_table(int(x), pattern, run)]
         rows.append(_apart(f"pattern {pattern}, warm from the neighbour", cold, warm))
         cold_all += cold.evaluations - cold.first  # the first of a chain has no neighbour
         warm_all += warm.evaluations - warm.first
         print_trend(f"tube reference, pattern {pattern}, fitted by itself", warm)
         if first is not None:
-            anew = carried_out(client, batch, **shared, reference=first)
-            rows.append(_apart(f"pattern {pattern}, warm from pattern 1 at 40 m", cold, anew))
-            cold_all, warm_all = cold_all + cold.evaluations, warm_all + anew.evaluations
+            again = run_batch(client, batch, **shared, reference=first)
+            rows.append(_apart(f"pattern {pattern}, warm from pattern 1 at 40 m", cold, again))
+            cold_all, warm_all = cold_all + cold.evaluations, warm_all + again.evaluations
         first = next(run["id"] for x, run in warm.runs if x == 40)
     jointly = [(float(length), [stored[length, 1], stored[length, 2]]) for length in REFERENCE]
     print_trend(
-        "tube reference, both patterns together", carried_out(client, jointly, channels=CHANNELS)
+        "tube reference, both patterns together", run_batch(client, jointly, channels=CHANNELS)
     )
     print(f"\nthe same runs: cold starts {cold_all} simulations, warm starts {warm_all}")
     return [*rows, Row("cold over warm simulations", cold_all / warm_all, "1", 2.0, ">=")]
@@ -98,11 +98,11 @@ def _reference_tubes(client: Client, folder: Path) -> list[Row]:
 
 def _against_table(length: int, pattern: int, run: Mapping[str, Any]) -> list[Row]:
     """Deviations from the reference, beyond what its printed digits leave open."""
-    constant, lag = REFERENCE[length][pattern - 1]
-    known = {one["name"]: one["value"] for one in run["parameters"]}
+    constant, delay = REFERENCE[length][pattern - 1]
+    estimates = {parameter["name"]: parameter["value"] for parameter in run["parameters"]}
     off = {
-        name: max(abs(known[name] - told) - LAST_DIGIT / 2, 0.0)
-        for name, told in (("T", constant), ("L", lag))
+        name: max(abs(estimates[name] - reference) - LAST_DIGIT / 2, 0.0)
+        for name, reference in (("T", constant), ("L", delay))
     }
     place = f"{length} m, pattern {pattern}"
     return [
@@ -111,11 +111,11 @@ def _against_table(length: int, pattern: int, run: Mapping[str, Any]) -> list[Ro
     ]
 
 
-def _apart(name: str, cold: Carried, warm: Carried) -> Row:
+def _apart(name: str, cold: BatchResult, warm: BatchResult) -> Row:
     """The largest difference of an estimate, in its standard errors."""
     largest = 0.0
-    for (_, one), (_, other) in zip(cold.runs, warm.runs, strict=True):
-        for a, b in zip(one["parameters"], other["parameters"], strict=True):
+    for (_, first), (_, second) in zip(cold.runs, warm.runs, strict=True):
+        for a, b in zip(first["parameters"], second["parameters"], strict=True):
             if a["stderr"]:
                 largest = max(largest, abs(a["value"] - b["value"]) / a["stderr"])
     return Row(f"{name}, estimates off the cold start's", largest, "standard errors", SAME)
@@ -129,10 +129,10 @@ def _measured_tubes(client: Client, folder: Path) -> list[Row]:
     batch, shortest = [], 2.0
     for length, several in pneuact_tube.pressures(source).items():
         for pressure in several if length >= SEPARABLE_FROM_M else ():
-            made = pneuact_tube.pooled(client, raw, length, pressure, 0)
-            shortest = min(shortest, made["duration"])
-            batch.append((length, [made["id"]]))
-    found = carried_out(
+            dataset = pneuact_tube.pooled(client, raw, length, pressure, 0)
+            shortest = min(shortest, dataset["duration"])
+            batch.append((length, [dataset["id"]]))
+    result = run_batch(
         client,
         batch,
         channels={"u": "p_in_bar", "y": "p_out_bar"},
@@ -140,8 +140,8 @@ def _measured_tubes(client: Client, folder: Path) -> list[Row]:
         loss={"kind": "soft-l1", "scale": 0.1},
         parameters={"L": {"upper": shortest / 2}},
     )
-    print_trend("pneuact, fill, 3 to 8 m", found)
-    law = next(law for law in _quantity(found, "L")["laws"] if law["law"] == "line")
+    print_trend("pneuact, fill, 3 to 8 m", result)
+    law = next(law for law in _quantity(result, "L")["laws"] if law["law"] == "line")
     slope = law["coefficients"][1]
     return [
         Row("pneuact, slope of L over 3-8 m", 1e3 * slope["value"], "ms/m", 2.6, ">="),
@@ -150,43 +150,46 @@ def _measured_tubes(client: Client, folder: Path) -> list[Row]:
     ]
 
 
-def _quantity(found: Carried, name: str) -> dict[str, Any]:
-    return next(dict(one) for one in found.trend["quantities"] if one["name"] == name)
+def _quantity(result: BatchResult, name: str) -> dict[str, Any]:
+    return next(
+        dict(quantity) for quantity in result.trend["quantities"] if quantity["name"] == name
+    )
 
 
-def print_trend(title: str, found: Carried) -> None:
+def print_trend(title: str, result: BatchResult) -> None:
     """Print the table of a batch, its laws and predictions."""
-    quantities = found.trend["quantities"]
+    quantities = result.trend["quantities"]
     names = [
-        f"{one['name']}{'' if one['unit'] == '1' else ', ' + one['unit']}" for one in quantities
+        f"{quantity['name']}{'' if quantity['unit'] == '1' else ', ' + quantity['unit']}"
+        for quantity in quantities
     ]
-    print(f"\n### {title}: {found.evaluations} simulations\n")
+    print(f"\n### {title}: {result.evaluations} simulations\n")
     print(f"| length, m | runs | {' | '.join(names)} | measured span |")
     print(f"|--:|--:|{'--:|' * len(names)}--:|")
-    for place in found.trend["labels"]:
-        cells = [_shown(one, place["x"]) for one in quantities]
-        span = "; ".join(f"{one['lower']:.6g} to {one['upper']:.6g}" for one in place["spans"])
+    for place in result.trend["labels"]:
+        cells = [_format_point(quantity, place["x"]) for quantity in quantities]
+        span = "; ".join(f"{span['lower']:.6g} to {span['upper']:.6g}" for span in place["spans"])
         print(f"| {place['x']:g} | {len(place['runs'])} | {' | '.join(cells)} | {span} |")
     print()
-    for one in quantities:
-        for law in one["laws"]:
-            known = ", ".join(
+    for quantity in quantities:
+        for law in quantity["laws"]:
+            coefficients = ", ".join(
                 f"{c['name']} = {c['value']:.4g} ± {c['stderr']:.2g}" for c in law["coefficients"]
             )
             chosen = ", chosen" if law["is_chosen"] else ""
             print(
-                f"- {one['name']} = {law['formula']}: {known}; AIC {law['aic']:.2f}, "
+                f"- {quantity['name']} = {law['formula']}: {coefficients}; AIC {law['aic']:.2f}, "
                 f"Birge ratio {law['birge']:.2f}{chosen}"
             )
-        for at in one["predictions"]:
+        for at in quantity["predictions"]:
             print(
-                f"- {one['name']} at {at['x']:g} m: {at['value']:.4g}, 95 % interval "
+                f"- {quantity['name']} at {at['x']:g} m: {at['value']:.4g}, 95 % interval "
                 f"{at['lower']:.4g} to {at['upper']:.4g}"
             )
 
 
-def _shown(one: Mapping[str, Any], x: float) -> str:
-    point = next((p for p in one["points"] if p["x"] == x), None)
+def _format_point(quantity: Mapping[str, Any], x: float) -> str:
+    point = next((p for p in quantity["points"] if p["x"] == x), None)
     if point is None or point["value"] is None:
         return "–"
     error = "" if point["stderr"] is None else f" ± {point['stderr']:.2g}"

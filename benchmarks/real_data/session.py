@@ -68,16 +68,17 @@ def print_estimates(title: str, run: Mapping[str, Any]) -> None:
     print(f"\n### {title}: {run['evaluations']} simulations, {run['seconds']:.1f} s\n")
     print("| parameter | estimate | standard error | unit | status |")
     print("|---|--:|--:|---|---|")
-    for one in run["parameters"]:
-        error = "–" if one["stderr"] is None else f"{one['stderr']:.4g}"
-        print(f"| {one['name']} | {one['value']:.6g} | {error} | {one['unit']} | {one['status']} |")
+    for parameter in run["parameters"]:
+        error = "–" if parameter["stderr"] is None else f"{parameter['stderr']:.4g}"
+        cells = [parameter["name"], f"{parameter['value']:.6g}", error]
+        print(f"| {' | '.join([*cells, parameter['unit'], parameter['status']])} |")
     for warning in run["warnings"]:
         print(f"- {warning}")
 
 
 def parameter(run: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return the entry of one parameter."""
-    return next(dict(one) for one in run["parameters"] if one["name"] == name)
+    return next(dict(entry) for entry in run["parameters"] if entry["name"] == name)
 
 
 def peak_memory_row() -> Row:

@@ -61,7 +61,7 @@ def measure(client: Client, folder: Path) -> list[Row]:
 
 
 def _rows(run: dict[str, Any], model: str, words: str) -> list[Row]:
-    rms = [1e3 * one["rms"] for one in run["agreement"]["validation"]]
+    rms = [1e3 * channel["rms"] for channel in run["agreement"]["validation"]]
     rows = [
         Row(f"RMS, {words}, {name}", value, "mV", bar)
         for (name, bar), value in zip(BARS_MV[model].items(), rms, strict=True)

@@ -56,11 +56,11 @@ def measure(client: Client, folder: Path) -> list[Row]:
 
 
 def _rows(name: str, tests: list[str], run: dict[str, Any]) -> list[Row]:
-    found = [1e3 * one["rms"] for one in run["agreement"]["validation"]]
+    rms = [1e3 * channel["rms"] for channel in run["agreement"]["validation"]]
     return [
         *(
             Row(f"{name}: RMS, {test}", value, "mV", BARS_MV[test])
-            for test, value in zip(tests, found, strict=True)
+            for test, value in zip(tests, rms, strict=True)
         ),
         Row(f"{name}: number of terms", len(run["selection"]), "1", 13),
         Row(f"{name}: run", run["seconds"], "s", SECONDS),
@@ -70,9 +70,9 @@ def _rows(name: str, tests: list[str], run: dict[str, Any]) -> list[Row]:
 def _print_selection(run: dict[str, Any]) -> None:
     print("\n| term | error-reduction ratio | left unexplained | coefficient before the search |")
     print("|---|--:|--:|--:|")
-    for one in run["selection"]:
-        left = 1.0 - one["cumulated"]
-        print(f"| {one['term']} | {one['err']:.3g} | {left:.3g} | {one['coefficient']:.6g} |")
+    for term in run["selection"]:
+        left = 1.0 - term["cumulated"]
+        print(f"| {term['term']} | {term['err']:.3g} | {left:.3g} | {term['coefficient']:.6g} |")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def measure(client: Client, folder: Path) -> list[Row]:
         for length, pattern in places
     ]
     sets = [client.add_dataset(source, name=source.stem)["id"] for source in sources]
-    axis = {"path": "/datasets", "values": [[one] for one in sets]}
+    axis = {"path": "/datasets", "values": [[run] for run in sets]}
     body = {
         "name": "tube reference",
         "model": "tube",

@@ -97,14 +97,16 @@ def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
 
 
 class Stand:
-    """A dispatcher in this process, with a crew and a clock that the test moves."""
+    """A dispatcher in this process, with a executor and a clock that the test moves."""
 
     def __init__(self, folder: Path, clock: Clock) -> None:
         self.place, self.clock = Place(folder), clock
-        self.crew = ScriptedExecutor(fails)
-        self.crew.is_slow = True
+        self.executor = ScriptedExecutor(fails)
+        self.executor.is_slow = True
         self.leases = leases_of(self.place.database, clock)
-        self.dispatcher = Dispatcher(self.place.database, self.place.store, self.crew, self.leases)
+        self.dispatcher = Dispatcher(
+            self.place.database, self.place.store, self.executor, self.leases
+        )
 
     def turn_until(self, job: str, state: JobState, attempt: int) -> None:
         for _ in range(200_000):
@@ -116,10 +118,10 @@ class Stand:
 
     def turn_until_sent(self, n_packs: int) -> None:
         for _ in range(200_000):
-            if len(self.crew.sent) == n_packs:
+            if len(self.executor.sent) == n_packs:
                 return
             self.dispatcher.run_round()
-        raise AssertionError(f"{len(self.crew.sent)} packs were sent")
+        raise AssertionError(f"{len(self.executor.sent)} packs were sent")
 
 
 @pytest.fixture
@@ -140,10 +142,10 @@ def test_a_job_whose_heartbeat_was_late_goes_on_and_meanwhile_nothing_is_written
     recorder.write_due = lambda: flushes.append(stand.clock.now)  # type: ignore[method-assign]
     for _ in range(20):
         stand.dispatcher.run_round()
-    assert (stand.crew.cancelled, flushes) == ([], [])
+    assert (stand.executor.cancelled, flushes) == ([], [])
     stand.leases.renew_leases()
     stand.dispatcher.run_round()
-    assert (stand.crew.cancelled, len(flushes)) == ([], 1)
+    assert (stand.executor.cancelled, len(flushes)) == ([], 1)
     row = stand.place.job(job)
     assert (row.state, row.attempt, row.lost_leases) == (JobState.RUNNING, 1, 0)
 
@@ -158,9 +160,9 @@ def test_a_job_that_was_lost_while_its_heartbeat_was_late_is_taken_up_again(
     stand.leases.renew_leases()
     for _ in range(200_000):
         stand.dispatcher.run_round()
-        if stand.crew.cancelled:
+        if stand.executor.cancelled:
             break
-    assert stand.crew.cancelled
+    assert stand.executor.cancelled
     assert stand.place.job(job).lost_leases == 1
     stand.turn_until(job, JobState.RUNNING, attempt=2)
 
@@ -284,11 +286,11 @@ def test_a_job_claimed_back_while_its_old_packs_fly_ends_once_under_its_new_atte
     stand.clock.advance(31)
     leases_of(stand.place.database, stand.clock).renew_leases()  # another reaps it
     stand.turn_until_sent(2)
-    assert len(stand.crew.packs) == 2
-    stand.crew.is_slow = False
+    assert len(stand.executor.packs) == 2
+    stand.executor.is_slow = False
     stand.turn_until(job, JobState.FAILED, attempt=2)
     (run,) = stand.place.runs(job)
     assert (run.state, run.attempt, run.error) == (JobState.FAILED, 2, "as told")
     for _ in range(3):
         stand.dispatcher.run_round()
-    assert stand.crew.packs == {}
+    assert stand.executor.packs == {}

@@ -16,8 +16,8 @@ from workers.tasks import process_pack
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 
 
-class CountingCrew(InlineExecutor):
-    """A crew that remembers which runs it was given."""
+class CountingExecutor(InlineExecutor):
+    """A executor that remembers which runs it was given."""
 
     def __init__(self):
         super().__init__()
@@ -42,9 +42,9 @@ def sweep(seeds, **changes):
 
 def carried_out(place, **body):
     """The job's runs once it is over, and those that a worker computed."""
-    job, crew = place.submit(**body), CountingCrew()
-    carry_out(place, job, crew)
-    return job, place.runs(job), list(dict.fromkeys(crew.computed))
+    job, executor = place.submit(**body), CountingExecutor()
+    carry_out(place, job, executor)
+    return job, place.runs(job), list(dict.fromkeys(executor.computed))
 
 
 def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):

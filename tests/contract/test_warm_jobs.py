@@ -21,8 +21,8 @@ from workers.protocol import RunNotReady
 QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 2}}
 
 
-class KeepingCrew(InlineExecutor):
-    """A crew that remembers what each run began with; `slots` decide how much is read ahead."""
+class KeepingExecutor(InlineExecutor):
+    """A executor that remembers what each run began with; `slots` decide how much is read ahead."""
 
     def __init__(self, slots):
         super().__init__(slots)
@@ -42,10 +42,10 @@ def place(tmp_path):
 
 def carried_out(place, slots=1, **body):
     """The job's runs once it is over, and what each began with."""
-    job, crew = place.submit(**{"algorithm": QUICK, **body}), KeepingCrew(slots)
-    carry_out(place, job, crew)
+    job, executor = place.submit(**{"algorithm": QUICK, **body}), KeepingExecutor(slots)
+    carry_out(place, job, executor)
     runs = place.runs(job)
-    return runs, [crew.warm.get(run.id) for run in runs]
+    return runs, [executor.warm.get(run.id) for run in runs]
 
 
 def values(run):

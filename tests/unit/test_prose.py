@@ -8,7 +8,7 @@ import pytest
 from tests.repository import ROOT
 from tests.sources import list_modules, read_facts
 
-MOST_WORDS, MEAN_WORDS = 25, 16
+MAX_WORDS, MEAN_WORDS = 25, 16
 PROGRAMS = (ROOT / "sysid/export/c.py", ROOT / "sysid/export/python.py")  # texts are code
 DOCUMENTS = sorted(
     path
@@ -36,7 +36,7 @@ def test_a_long_sentence_is_seen() -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_sentences_of_documents_are_short(path: Path) -> None:
     lengths = {one: len(one.split()) for one in sentences(path.read_text())}
-    assert {one: count for one, count in lengths.items() if count > MOST_WORDS} == {}
+    assert {one: count for one, count in lengths.items() if count > MAX_WORDS} == {}
     if lengths:
         assert sum(lengths.values()) / len(lengths) <= MEAN_WORDS
 
@@ -48,7 +48,7 @@ def test_sentences_of_messages_are_short() -> None:
         if path not in PROGRAMS
         for text, line in read_facts(path).messages
         for sentence in re.split(r"(?<=[.!?])\s+", text)
-        if len(sentence.split()) > MOST_WORDS
+        if len(sentence.split()) > MAX_WORDS
     ]
     assert long == []
 
@@ -91,7 +91,7 @@ def test_sentences_of_pages_are_short() -> None:
         f"{path.name}: {sentence}"
         for path, text in texts
         for sentence in re.split(r"(?<=[.!?:])\s+", text)
-        if len(sentence.split()) > MOST_WORDS
+        if len(sentence.split()) > MAX_WORDS
     ]
     assert texts
     assert long == []

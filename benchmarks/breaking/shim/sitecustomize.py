@@ -47,9 +47,9 @@ def _break_memory(module):
     advanced = module._advance_item
 
     def broken(item, *parts):
-        taken = []
+        blocks = []
         while item.spec.seed in greedy:
-            taken.append(b"x" * 2**24)
+            blocks.append(b"x" * 2**24)
         return advanced(item, *parts)
 
     module._advance_item = broken

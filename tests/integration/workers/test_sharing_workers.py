@@ -30,10 +30,12 @@ def sweep(runs: int) -> dict[str, Any]:
 @pytest.mark.ray
 @pytest.mark.slow
 def test_a_single_identification_gets_in_while_nine_sweeps_of_thousands_of_runs_go_on(
-    tmp_path: Path, ray_crew
+    tmp_path: Path, ray_executor
 ) -> None:
     place = Place(tmp_path / "data")
-    dispatcher = Dispatcher(place.database, place.store, ray_crew, HeldLeases(place.database, 60.0))
+    dispatcher = Dispatcher(
+        place.database, place.store, ray_executor, HeldLeases(place.database, 60.0)
+    )
     sweeps = [place.submit(sweep=sweep(2000), algorithm=QUICK) for _ in range(9)]
 
     def turn_until(job: str, *states: JobState) -> None:
@@ -106,7 +108,7 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
 @pytest.mark.ray
 @pytest.mark.slow
 def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
-    ray_crew, monkeypatch: pytest.MonkeyPatch
+    ray_executor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
@@ -114,7 +116,7 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     plain = carry_out(InlineExecutor(), {"r": one})
     flying: set[Any] = set()
     most = 0
-    submit, fetch = ray_crew.submit_pack, ray_crew.fetch_results
+    submit, fetch = ray_executor.submit_pack, ray_executor.fetch_results
 
     def counted(pack, keys, shared) -> Any:
         nonlocal most
@@ -128,17 +130,17 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
         flying.discard(handle)
         return fetch(handle)
 
-    monkeypatch.setattr(ray_crew, "submit_pack", counted)
-    monkeypatch.setattr(ray_crew, "fetch_results", fetched)
-    spread = carry_out(ray_crew, {"r": one})
-    assert most == ray_crew.slots
+    monkeypatch.setattr(ray_executor, "submit_pack", counted)
+    monkeypatch.setattr(ray_executor, "fetch_results", fetched)
+    spread = carry_out(ray_executor, {"r": one})
+    assert most == ray_executor.slots
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
 
 @pytest.mark.ray
 @pytest.mark.slow
-def test_a_short_job_passes_a_sweep_on_real_workers(ray_crew) -> None:
-    feeder: Scheduler[str] = Scheduler(ray_crew)
+def test_a_short_job_passes_a_sweep_on_real_workers(ray_executor) -> None:
+    feeder: Scheduler[str] = Scheduler(ray_executor)
     long, short = Notebook(), Notebook()
     runs = (QueuedRun(f"s{n}", spec(n)) for n in range(3000))
     feeder.add_job("sweep", ListedRuns(runs), long)

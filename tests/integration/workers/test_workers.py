@@ -15,21 +15,21 @@ from workers.scheduler import Scheduler
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 
-def test_many_small_runs_on_ray_give_the_bits_of_the_plain_loop(ray_crew) -> None:
+def test_many_small_runs_on_ray_give_the_bits_of_the_plain_loop(ray_executor) -> None:
     specs = {f"r{seed}": spec(seed, generations=20) for seed in range(1, 9)}
-    plain, spread = carry_out(InlineExecutor(), specs), carry_out(ray_crew, specs)
+    plain, spread = carry_out(InlineExecutor(), specs), carry_out(ray_executor, specs)
     assert plain.failures == spread.failures == {}
     for run in specs:
         assert [bits(one) for one in spread.results[run]] == [bits(plain.results[run][0])]
 
 
 def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
-    ray_crew, monkeypatch: pytest.MonkeyPatch
+    ray_executor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
     specs = {"r": spec(2, "long", generations=120, islands=4, migration=every(20))}
-    spread = carry_out(ray_crew, specs)
+    spread = carry_out(ray_executor, specs)
     assert spread.failures == {}
     assert len(spread.states["r"]) >= 4
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 1000.0)
@@ -39,19 +39,19 @@ def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
 
-def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(ray_crew) -> None:
+def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(ray_executor) -> None:
     one = spec(3, "long", generations=4000)
-    whole = carry_out(ray_crew, {"r": one})
+    whole = carry_out(ray_executor, {"r": one})
     middle = whole.states["r"][0]
-    feeder, notebook = Scheduler(ray_crew), Notebook()
+    feeder, notebook = Scheduler(ray_executor), Notebook()
     feeder.add_job("job", ListedRuns([QueuedRun("r", one, middle)]), notebook)
     while not feeder.run_step(0.05):
         pass
     assert bits(notebook.results["r"][0]) == bits(whole.results["r"][0])
 
 
-def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew) -> None:
-    feeder, notebook = Scheduler(ray_crew, grace_seconds=5.0), Notebook()
+def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_executor) -> None:
+    feeder, notebook = Scheduler(ray_executor, grace_seconds=5.0), Notebook()
     feeder.add_job(
         "job", ListedRuns([QueuedRun("r", spec(1, "long", generations=10**6))]), notebook
     )
@@ -61,12 +61,12 @@ def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew)
     begun = time.monotonic()
     while not feeder.run_step(0.05):
         assert time.monotonic() - begun < 60.0
-    assert carry_out(ray_crew, {"r": spec()}).failures == {}
+    assert carry_out(ray_executor, {"r": spec()}).failures == {}
 
 
-def test_a_run_survives_the_death_of_its_worker(ray_crew) -> None:
+def test_a_run_survives_the_death_of_its_worker(ray_executor) -> None:
     one = spec(4, "long", generations=4000)  # of many packs, each of which is fed from here
-    feeder, notebook = Scheduler(ray_crew), Notebook()
+    feeder, notebook = Scheduler(ray_executor), Notebook()
     feeder.add_job("job", ListedRuns([QueuedRun("r", one)]), notebook)
     killed: list[int] = []
     while not feeder.run_step(0.01):

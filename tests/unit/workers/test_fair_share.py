@@ -85,7 +85,7 @@ def test_a_project_cannot_get_more_by_cutting_its_sweep_into_short_jobs() -> Non
     theatre = Theatre(2)
     theatre.add("whole", SWEEP, 0.1, project="whole")
     number = 0
-    while theatre.crew.now < 300.0:
+    while theatre.executor.now < 300.0:
         while len(theatre.feeder._jobs) < 6:
             number += 1
             theatre.add(f"cut{number}", 20, 0.1, project="cut")
@@ -102,7 +102,7 @@ def test_a_project_cannot_get_more_by_sending_short_jobs_one_after_another(
     theatre = Theatre(slots)
     theatre.add("sweep", 5 * SWEEP, 0.1, project="sweep")
     number = 0
-    while theatre.crew.now < 600.0 / slots:
+    while theatre.executor.now < 600.0 / slots:
         if len(theatre.feeder._jobs) < 2:  # the last one has ended, and its project has no job
             number += 1
             theatre.add(f"short{number}", int(10 * seconds), 0.1, project="short")
@@ -200,8 +200,8 @@ def test_nobody_starves_under_a_stream_of_new_jobs() -> None:
     theatre.add("sweep", SWEEP, 0.1)
     theatre.play(HEADSTART_SECONDS + 1.0)
     before, number = theatre.had("sweep"), 0
-    begun = theatre.crew.now
-    while theatre.crew.now < begun + 160.0:
+    begun = theatre.executor.now
+    while theatre.executor.now < begun + 160.0:
         while len(theatre.feeder._jobs) < 3:
             number += 1
             theatre.add(f"new{number}", 1, 1.0)
@@ -229,14 +229,14 @@ def test_a_lonely_sweep_has_a_pack_waiting_at_every_core() -> None:
     theatre = Theatre(4)
     theatre.add("sweep", SWEEP, 0.1)
     theatre.play(20.0)
-    assert theatre.crew.most_waiting == (PACKS_PER_CPU - 1) * 4
+    assert theatre.executor.most_waiting == (PACKS_PER_CPU - 1) * 4
 
 
 def test_new_workers_are_given_work_at_once() -> None:
     theatre = Theatre(1)
     theatre.add("sweep", SWEEP, 0.1)
     theatre.play(10.0)
-    theatre.crew.slots = 3
+    theatre.executor.slots = 3
     before = theatre.had("sweep")
     theatre.play(20.0)
     assert theatre.had("sweep") - before == pytest.approx(60.0, abs=3.0)
@@ -261,7 +261,7 @@ def test_no_core_is_idle_while_work_waits_and_every_job_ends(
         theatre.step()
     assert len(theatre.ended) == len(sizes)
     longest = max(seconds for *_, seconds in sizes)
-    assert theatre.crew.now <= total / slots + longest + 3 * PACK_SECONDS
+    assert theatre.executor.now <= total / slots + longest + 3 * PACK_SECONDS
 
 
 @given(st.lists(st.floats(0.0, 100.0), max_size=20), st.sampled_from("abc"))

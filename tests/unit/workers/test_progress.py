@@ -84,26 +84,26 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
 
 
 def test_a_job_whose_results_are_not_told_yet_gets_no_more_packs(concluded: RunConclusion) -> None:
-    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.05))
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.05))
+    feeder = Scheduler(executor)
     notebook = jobs(feeder, a=500)["a"]
     most = 0
     for _ in steps(feeder):
-        flying = sum(len(pack) for pack in crew.packs.values())
+        flying = sum(len(pack) for pack in executor.packs.values())
         most = max(most, len(notebook.begun) - len(told(notebook)) - flying)
     # One core's pack above what it may leave, and those in flight when it came to that.
-    room = scheduler.MAX_UNREPORTED_SECONDS * crew.slots / 0.05
-    in_flight = scheduler.PACKS_PER_CPU * crew.slots * PACK_SECONDS / 0.05
+    room = scheduler.MAX_UNREPORTED_SECONDS * executor.slots / 0.05
+    in_flight = scheduler.PACKS_PER_CPU * executor.slots * PACK_SECONDS / 0.05
     assert room < most <= room + in_flight + 1
 
 
 def test_what_has_come_back_is_told_when_the_dispatcher_stops(concluded: RunConclusion) -> None:
-    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
+    feeder = Scheduler(executor)
     notebook = jobs(feeder, a=400)["a"]
     for _ in range(20):
         feeder.run_step(0.0)
-    flying = sum(len(pack) for pack in crew.packs.values())
+    flying = sum(len(pack) for pack in executor.packs.values())
     feeder.stop_jobs()
     assert len(told(notebook)) == len(notebook.begun) - flying > 20
 
@@ -111,12 +111,12 @@ def test_what_has_come_back_is_told_when_the_dispatcher_stops(concluded: RunConc
 def test_a_job_that_is_stopped_alone_still_tells_what_has_come_back(
     concluded: RunConclusion,
 ) -> None:
-    crew = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
+    feeder = Scheduler(executor)
     notebook = jobs(feeder, a=400)["a"]
     for _ in range(20):
         feeder.run_step(0.0)
-    come = len(notebook.begun) - sum(len(pack) for pack in crew.packs.values())
+    come = len(notebook.begun) - sum(len(pack) for pack in executor.packs.values())
     feeder.stop_jobs(["a"])
     for _ in steps(feeder):
         pass

@@ -1,4 +1,4 @@
-"""The driver of a crew, with a crew that answers as the test says; no Ray, no numerics."""
+"""The driver of a executor, with a executor that answers as the test says; no Ray, no numerics."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -107,23 +107,23 @@ def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
 
 
 def test_the_packs_in_flight_are_shared_between_jobs() -> None:
-    crew = ScriptedExecutor(fails)
-    crew.is_slow = True
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(fails)
+    executor.is_slow = True
+    feeder = Scheduler(executor)
     jobs(feeder, a=100, b=100)
     feeder.run_step(0.0)
-    assert len(crew.packs) == PACKS_PER_CPU * crew.slots
-    names = [pack[0][0] for pack in crew.sent]
+    assert len(executor.packs) == PACKS_PER_CPU * executor.slots
+    names = [pack[0][0] for pack in executor.sent]
     assert names.count("a") == names.count("b")
 
 
 def test_runs_of_known_cost_share_a_pack() -> None:
-    crew = ScriptedExecutor(fails)
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(fails)
+    feeder = Scheduler(executor)
     jobs(feeder, a=100)
     finish(feeder)
-    assert len(crew.sent) < 40
-    assert max(map(len, crew.sent)) > 1
+    assert len(executor.sent) < 40
+    assert max(map(len, executor.sent)) > 1
 
 
 def test_runs_of_different_records_do_not_share_a_pack() -> None:
@@ -169,24 +169,24 @@ def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
 
 
 def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blamed() -> None:
-    crew = ScriptedExecutor(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
+    feeder = Scheduler(executor)
     notebook = jobs(feeder, a=100)["a"]
     finish(feeder)
-    shared = [set(pack) for pack in crew.sent if len(pack) > 1]
+    shared = [set(pack) for pack in executor.sent if len(pack) > 1]
     mates = next(runs for runs in shared if "a40" in runs)
-    alone = [pack[0] for pack in crew.sent if len(pack) == 1]
+    alone = [pack[0] for pack in executor.sent if len(pack) == 1]
     assert all(alone.count(mate) == 1 for mate in mates - {"a40"})
     assert notebook.kills == {"a40": [1, 2]}
     assert len(notebook.failures) == 100
 
 
 def test_a_death_counted_by_a_dispatcher_before_is_counted_on() -> None:
-    crew = ScriptedExecutor(lambda item: WorkerDied("killed"))
-    feeder, notebook = Scheduler(crew), Notebook()
+    executor = ScriptedExecutor(lambda item: WorkerDied("killed"))
+    feeder, notebook = Scheduler(executor), Notebook()
     feeder.add_job("a", ListedRuns([QueuedRun("a0", spec(), kills=1)]), notebook)
     finish(feeder)
-    assert len(crew.sent) == 1
+    assert len(executor.sent) == 1
     assert notebook.kills == {"a0": [2]}
 
 
@@ -234,31 +234,31 @@ def test_work_whose_turn_did_not_come_is_sent_again() -> None:
 
 
 def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
-    crew = ScriptedExecutor(fails)
-    crew.is_slow = True
-    feeder = Scheduler(crew, grace_seconds=60.0)
+    executor = ScriptedExecutor(fails)
+    executor.is_slow = True
+    feeder = Scheduler(executor, grace_seconds=60.0)
     notebook = jobs(feeder, a=100)["a"]
     feeder.run_step(0.0)
-    sent = len(crew.sent)
+    sent = len(executor.sent)
     notebook.is_stopped = True
     feeder.run_step(0.0)
-    assert sorted(crew.cancelled) == [(handle, False) for handle in range(sent)]
-    crew.is_slow, crew.answer = False, lambda item: PackCancelled("cancelled")
+    assert sorted(executor.cancelled) == [(handle, False) for handle in range(sent)]
+    executor.is_slow, executor.answer = False, lambda item: PackCancelled("cancelled")
     assert finish(feeder) == ["a"]
-    assert len(crew.sent) == sent
+    assert len(executor.sent) == sent
     assert notebook.failures == {}
 
 
 def test_a_pack_that_outlives_the_grace_period_is_killed() -> None:
-    crew = ScriptedExecutor(fails)
-    crew.is_slow = True
-    feeder = Scheduler(crew, grace_seconds=0.0)
+    executor = ScriptedExecutor(fails)
+    executor.is_slow = True
+    feeder = Scheduler(executor, grace_seconds=0.0)
     notebook = jobs(feeder, a=1)["a"]
     feeder.run_step(0.0)
     notebook.is_stopped = True
     for _ in range(3):
         feeder.run_step(0.0)
-    assert crew.cancelled == [(0, False), (0, True)]
+    assert executor.cancelled == [(0, False), (0, True)]
 
 
 def test_a_run_without_records_fails_with_the_reason() -> None:
@@ -289,12 +289,12 @@ def test_a_job_ends_when_nothing_of_it_is_left(n_runs: int) -> None:
 
 
 def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
-    crew = ScriptedExecutor(fails)
-    feeder = Scheduler(crew)
+    executor = ScriptedExecutor(fails)
+    feeder = Scheduler(executor)
     notebook = jobs(feeder, a=1)["a"]
-    crew.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), ())
+    executor.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), ())
     assert finish(feeder) == ["a"]
-    assert (crew.packs, list(notebook.failures)) == ({}, ["a0"])
+    assert (executor.packs, list(notebook.failures)) == ({}, ["a0"])
     assert "a pack of no job came back" in caplog.messages
 
 
@@ -324,22 +324,22 @@ def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedExecutor,
     monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
     one = spec(islands=4)
     kept = begin_run(build_pack_problems(one.problem, RECORDS)[0], one.algorithm, 1)
-    crew, notebook = ScriptedExecutor(fails), Notebook()
-    work = JobQueue(ListedRuns([QueuedRun("a0", one, kept)]), notebook, crew)
+    executor, notebook = ScriptedExecutor(fails), Notebook()
+    work = JobQueue(ListedRuns([QueuedRun("a0", one, kept)]), notebook, executor)
     assert work.read_ahead(1, 0.0)
     work.send_next_pack(2)
     assert sorted(map(len, work.in_flight.values())) == [2, 2]
-    return work, crew, notebook
+    return work, executor, notebook
 
 
 def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    work, crew, _ = spread(monkeypatch)
+    work, executor, _ = spread(monkeypatch)
     first, second = work.in_flight
     work.requeue_lost_pack(second, "killed")
     assert work.has_waiting_runs
-    island = crew.packs[first][0]
+    island = executor.packs[first][0]
     assert isinstance(island, EvolveIsland)
     done = (
         ItemResult("a0", IslandProgress(island.island, island.target), 0.1),

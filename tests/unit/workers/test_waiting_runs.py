@@ -31,11 +31,11 @@ class Chained:
 
 
 def test_a_chain_is_sent_run_by_run() -> None:
-    crew, notebook = ScriptedExecutor(fails), Notebook()
-    feeder: Scheduler[str] = Scheduler(crew)
+    executor, notebook = ScriptedExecutor(fails), Notebook()
+    feeder: Scheduler[str] = Scheduler(executor)
     feeder.add_job("chain", Chained(notebook, 5), notebook)
     assert finish(feeder) == ["chain"]
-    assert crew.sent == [(f"chain{number}",) for number in range(5)]
+    assert executor.sent == [(f"chain{number}",) for number in range(5)]
 
 
 def test_a_job_that_waits_does_not_keep_others_from_the_workers() -> None:
@@ -81,11 +81,11 @@ class SeveralChains:
 
 @pytest.mark.parametrize("chain", [ChainLayout(1, 5), ChainLayout(4, 5)])
 def test_chains_go_side_by_side_and_each_run_by_run(chain: ChainLayout) -> None:
-    crew, notebook = ScriptedExecutor(fails), Notebook()
-    feeder: Scheduler[str] = Scheduler(crew)
+    executor, notebook = ScriptedExecutor(fails), Notebook()
+    feeder: Scheduler[str] = Scheduler(executor)
     feeder.add_job("chains", SeveralChains(notebook, chain, 20), notebook)
     assert finish(feeder) == ["chains"]
-    numbers = [int(run.split("-")[1]) for pack in crew.sent for run in pack]
+    numbers = [int(run.split("-")[1]) for pack in executor.sent for run in pack]
     assert sorted(numbers) == list(range(20))
     firsts = {numbers.index(chain.list_runs(key)[0]) for key in range(4)}
     last_steps = [numbers.index(chain.list_runs(key)[-1]) for key in range(4)]
@@ -95,8 +95,8 @@ def test_chains_go_side_by_side_and_each_run_by_run(chain: ChainLayout) -> None:
 
 
 def test_runs_that_nothing_follows_at_present_are_shared_by_all_cores() -> None:
-    crew, notebook = ScriptedExecutor(fails), Notebook()
-    feeder: Scheduler[str] = Scheduler(crew)
+    executor, notebook = ScriptedExecutor(fails), Notebook()
+    feeder: Scheduler[str] = Scheduler(executor)
     feeder.add_job("chains", SeveralChains(notebook, ChainLayout(1, 5), 20), notebook)
     finish(feeder)
-    assert max(map(len, crew.sent)) <= 2
+    assert max(map(len, executor.sent)) <= 2

@@ -20,25 +20,25 @@ def until(holds: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def aside() -> Iterator[BackgroundJobs[str]]:
+def jobs() -> Iterator[BackgroundJobs[str]]:
     made: BackgroundJobs[str] = BackgroundJobs()
     yield made
     made.stop()
 
 
-def test_the_last_step_gives_the_document(aside: BackgroundJobs[str]) -> None:
+def test_the_last_step_gives_the_document(jobs: BackgroundJobs[str]) -> None:
     def steps() -> Iterator[Document | None]:
         yield None
         yield {"a": 1}
 
-    aside.start_job("a", steps)
-    assert "a" in aside
-    until(lambda: aside.list_done() == ("a",))
-    assert aside.take_result("a") == {"a": 1}
-    assert aside.pending_keys == ()
+    jobs.start_job("a", steps)
+    assert "a" in jobs
+    until(lambda: jobs.list_done() == ("a",))
+    assert jobs.take_result("a") == {"a": 1}
+    assert jobs.pending_keys == ()
 
 
-def test_a_short_document_does_not_wait_for_a_long_one(aside: BackgroundJobs[str]) -> None:
+def test_a_short_document_does_not_wait_for_a_long_one(jobs: BackgroundJobs[str]) -> None:
     may_go_on = threading.Event()
     told: list[str] = []
 
@@ -53,15 +53,15 @@ def test_a_short_document_does_not_wait_for_a_long_one(aside: BackgroundJobs[str
         told.append("short")
         yield {}
 
-    aside.start_job("long", long)
-    aside.start_job("short", short)
+    jobs.start_job("long", long)
+    jobs.start_job("short", short)
     may_go_on.set()
-    until(lambda: set(aside.list_done()) == {"long", "short"})
+    until(lambda: set(jobs.list_done()) == {"long", "short"})
     assert told == ["long", "short", *["long"] * 4]
 
 
 def test_an_error_is_raised_where_the_document_is_taken_and_ends_nothing_else(
-    aside: BackgroundJobs[str],
+    jobs: BackgroundJobs[str],
 ) -> None:
     def broken() -> Iterator[Document | None]:
         yield None
@@ -70,15 +70,15 @@ def test_an_error_is_raised_where_the_document_is_taken_and_ends_nothing_else(
     def sound() -> Iterator[Document | None]:
         yield {"b": 2}
 
-    aside.start_job("a", broken)
-    aside.start_job("b", sound)
-    until(lambda: set(aside.list_done()) == {"a", "b"})
+    jobs.start_job("a", broken)
+    jobs.start_job("b", sound)
+    until(lambda: set(jobs.list_done()) == {"a", "b"})
     with pytest.raises(ZeroDivisionError):
-        aside.take_result("a")
-    assert aside.take_result("b") == {"b": 2}
+        jobs.take_result("a")
+    assert jobs.take_result("b") == {"b": 2}
 
 
-def test_what_is_dropped_or_stopped_is_made_no_further(aside: BackgroundJobs[str]) -> None:
+def test_what_is_dropped_or_stopped_is_made_no_further(jobs: BackgroundJobs[str]) -> None:
     steps_taken: list[int] = []
 
     def endless() -> Iterator[Document | None]:
@@ -86,13 +86,13 @@ def test_what_is_dropped_or_stopped_is_made_no_further(aside: BackgroundJobs[str
             steps_taken.append(1)
             yield None
 
-    aside.start_job("a", endless)
+    jobs.start_job("a", endless)
     until(lambda: len(steps_taken) > 3)
-    aside.cancel_job("a")
-    aside.cancel_job("a")
-    assert aside.pending_keys == ()
-    aside.start_job("b", endless)
-    aside.stop()
+    jobs.cancel_job("a")
+    jobs.cancel_job("a")
+    assert jobs.pending_keys == ()
+    jobs.start_job("b", endless)
+    jobs.stop()
     count = len(steps_taken)
     time.sleep(0.02)
     assert len(steps_taken) == count
