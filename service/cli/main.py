@@ -80,9 +80,6 @@ def main() -> None:
         _exit_with_message(str(error), 2 if isinstance(error, NotFinite) else 1)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(1)
     except Exception as error:  # the process border; other than user's mistakes, errors go on
         sentence = _user_message(error)
         if sentence is None:

@@ -13,6 +13,8 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse
 
 from service.api.app import create_app
 from service.client.embedded import find_free_port
@@ -374,18 +376,20 @@ def _wait_until_answering(url: str) -> None:
 
 
 def test_a_reader_that_goes_away_ends_a_command_without_a_message() -> None:
-    """As in `lagid models list | head -1`."""
+    """As in `lagid export … | head -1`."""
+    app = FastAPI()
+    app.get("/v1/runs/run_1/export")(lambda: PlainTextResponse("line\n" * 1000))
     reading, writing = os.pipe()
     os.close(reading)
-    with os.fdopen(writing, "wb") as closed:
+    with serve_in_thread(app) as url, os.fdopen(writing, "wb") as closed:
         done = subprocess.run(
-            [*PROGRAM, "--help"],
+            [*PROGRAM, "export", "run_1"],
             stdout=closed,
             stderr=subprocess.PIPE,
             text=True,
             timeout=LIMIT_SECONDS,
             check=False,
-            env=make_environment({}),
+            env=make_environment({"LAGID_URL": url}),
         )
     assert (done.returncode, done.stderr) == (1, "")
 

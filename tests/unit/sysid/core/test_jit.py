@@ -433,4 +433,6 @@ def test_what_was_compiled_before_is_loaded_without_the_compiler() -> None:
         ran = subprocess.run(
             [sys.executable, "-c", WARM], check=True, capture_output=True, text=True
         )
+        if ran.stdout.strip() == "[]":
+            break
     assert ran.stdout.strip() == "[]"
