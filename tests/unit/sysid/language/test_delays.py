@@ -3,6 +3,7 @@
 import pytest
 
 from sysid.language.checker import check_expression
+from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Number, PastValue, Symbol
@@ -73,6 +74,17 @@ def test_an_index_is_split_into_whole_samples_and_an_unknown_lag(
         assert found.delay == lag
     else:  # between 0 and 2 samples: nothing of it is fixed
         assert format_expression(found) == "q(k-2 - -z)"
+
+
+@pytest.mark.parametrize(("lower", "offset"), [(0.0, 0), (0.5, 0), (0.999, 0), (1.0, 1), (3.0, 1)])
+def test_a_whole_sample_is_split_off_only_if_the_delay_is_never_shorter(
+    lower: float, offset: int
+) -> None:
+    scope = Scope("difference", inputs=("q",), parameters={"d": (lower, 20.0)})
+    found = past("q(k - d)", scope)
+    assert found.offset == offset
+    assert found.delay is not None
+    assert bound_expression(found.delay, scope.parameters) == (lower - offset, 20.0 - offset)
 
 
 @pytest.mark.parametrize(
