@@ -118,6 +118,14 @@ CASES = {
         5e-3,
         initial={"w(0)": -0.6, "x(0)": -0.1},
     ),
+    "ipdt": Case(
+        {"K": 0.8, "L": 0.22},
+        0.05,
+        500,
+        levels(0.6, -1.5, 1.5),
+        sigma=1e-4,
+        initial={"y(0)": 0.5},
+    ),
     "exponential": Case({"L": 0.8}, 0.01, 200),
     "silverbox": Case(
         SILVERBOX, 1 / 610.35, 1500, noise(0.05), "band-limited", 1e-6, 1e-2, initial=REST

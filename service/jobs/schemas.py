@@ -313,6 +313,10 @@ class JobOut(Answer):
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
+    seconds: float | None = Field(
+        default=None,
+        description="wall time from the first start to the end, or to now; null while queued",
+    )
     attempt: int = Field(description="number of starts, resumptions included")
     error: str | None = None
     model: str

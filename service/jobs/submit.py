@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
 from typing import Any
 
@@ -28,6 +29,7 @@ from service.queue.admission import count_unfinished
 from service.queue.run_writes import NewRun, insert_runs
 from service.repositories.jobs import JobRepository, NewJob, Submission
 from service.repositories.lineage import LineageRepository
+from service.storage.columns import utc_now
 from service.storage.sessions import Database
 from service.storage.tables import Dataset, Job
 
@@ -165,8 +167,14 @@ def clone_job(database: Database, job_id: str, settings: Settings) -> JobOut:
     return submit_job(database, body, settings)
 
 
-def to_job_out(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
-    """Build the answer for a job."""
+def to_job_out(
+    job: Job,
+    *,
+    with_request: bool = False,
+    rms_unit: str | None = None,
+    now: datetime | None = None,
+) -> JobOut:
+    """Build the answer for a job, as of `now` (by default the present time)."""
     model = job.spec["model"]
     return JobOut.from_source(
         job,
@@ -180,7 +188,15 @@ def to_job_out(job: Job, *, with_request: bool = False, rms_unit: str | None = N
         ),
         request=job.spec if with_request else None,
         rms_unit=rms_unit,
+        seconds=measure_seconds(job, now or utc_now()),
     )
+
+
+def measure_seconds(job: Job, now: datetime) -> float | None:
+    """Return the wall time of a job from its first start to its end or to now; None if queued."""
+    if job.state is JobState.QUEUED or job.started_at is None:
+        return None
+    return max(((job.finished_at or now) - job.started_at).total_seconds(), 0.0)
 
 
 def list_jobs(

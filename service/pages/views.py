@@ -58,7 +58,7 @@ class RunView(Answer):
 
 
 class JobView(JobOut):
-    """View of a job: its REST document and further texts of the pages, as of `now`.
+    """View of a job: its REST document and further texts of the pages.
 
     The runs of a batch see different recordings, so their RMS cannot be compared. A batch therefore
     has no best RMS.
@@ -67,7 +67,6 @@ class JobView(JobOut):
     request: dict[str, Any]
     lost_leases: int
     max_attempts: int
-    now: datetime
 
     @property
     def is_open(self) -> bool:
@@ -90,16 +89,9 @@ class JobView(JobOut):
         return None if self.is_batch else self.progress.best_rms
 
     @property
-    def took(self) -> float | None:
-        """Seconds from the job's start to its end, or to now."""
-        if self.started_at is None:
-            return None
-        return max(((self.finished_at or self.now) - self.started_at).total_seconds(), 0.0)
-
-    @property
     def rate(self) -> float | None:
         """Evaluations per second."""
-        seconds, evaluations = self.took, self.progress.evaluations
+        seconds, evaluations = self.seconds, self.progress.evaluations
         return evaluations / seconds if seconds and evaluations else None
 
     @property
@@ -145,10 +137,8 @@ class EventView:
 
 def to_job_view(job: Job, unit: str, now: datetime) -> JobView:
     """Build the view of a job; `unit` is the unit of its RMS."""
-    document = to_job_out(job, with_request=True, rms_unit=unit)
-    return JobView.from_source(
-        document, lost_leases=job.lost_leases, max_attempts=job.max_attempts, now=now
-    )
+    document = to_job_out(job, with_request=True, rms_unit=unit, now=now)
+    return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 
 def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:

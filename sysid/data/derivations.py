@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
+from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.units import (
     describe_difference,
     find_conversion_factor,
@@ -206,6 +206,34 @@ def subtract_offset(recording: Recording, arguments: StepArguments) -> Recording
     )
 
 
+def clip_channels(recording: Recording, arguments: StepArguments) -> Recording:
+    """Limit the values of named channels to `min` and `max`, in the channel's unit."""
+    limits = {
+        name: _read_limits(StepArguments(arguments.pointer + join_pointer(name), value))
+        for name, value in arguments.get_items()
+    }
+    return _change_channels(
+        recording,
+        list(limits),
+        lambda channel: change_values(
+            channel, lambda _, values: np.clip(values, *limits[channel.name])
+        ),
+    )
+
+
+def _read_limits(arguments: StepArguments) -> tuple[float, float]:
+    arguments.reject_others("min", "max")
+    if not arguments.has_argument("min") and not arguments.has_argument("max"):
+        arguments.fail("", "need min, max, or both")
+    low, high = (
+        arguments.read_number(name) if arguments.has_argument(name) else limit
+        for name, limit in (("min", -np.inf), ("max", np.inf))
+    )
+    if high < low:
+        arguments.fail("max", f"found {high!r}; need min or more, {low!r}")
+    return low, high
+
+
 def set_hold(recording: Recording, arguments: StepArguments) -> Recording:
     """Set the intersample behaviour of named channels, for use as inputs."""
     return recording.replace_holds(
@@ -277,6 +305,7 @@ STEPS: Mapping[str, StepFunction] = {
     "trim": trim_recording,
     "detrend": detrend_channels,
     "offset": subtract_offset,
+    "clip": clip_channels,
     "split": split_recording,
     "select": select_segments,
     "pool": pool_segments,

@@ -253,3 +253,21 @@ def test_the_start_of_a_later_segment_is_a_parameter_wherever_the_run_is_shown(
     told = drawn.text
     assert "x(0)[2]" in told
     assert "x(0)[3]" not in told  # it is fixed
+
+
+def test_the_wall_time_of_a_job_is_null_while_it_waits_and_stands_still_at_its_end(
+    own: TestClient,
+) -> None:
+    dataset = own.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+    job = submit(own, dataset)
+    assert job["seconds"] is None
+    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    with parts.database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("test")
+        assert claim is not None
+    first, second = (own.get(f"/v1/jobs/{job['id']}").json()["seconds"] for _ in range(2))
+    assert 0 <= first < second
+    with parts.database.write_session() as session:
+        LeaseQueue(session).finish_job(claim.lease, JobState.CANCELLED)
+    ended, later = (own.get(f"/v1/jobs/{job['id']}").json()["seconds"] for _ in range(2))
+    assert second <= ended == later

@@ -60,6 +60,7 @@ CASES = {
     "emps": Case({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
     "exponential": Case({"L": 0.8}, 0.02),
     "fopdt": Case({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
+    "ipdt": Case({"K": 0.8, "L": 0.2337, "y(0)": 0.3}),
     "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
     "narx": Case({**NARX, "y(0)": 0.3}),
     "silverbox": Case(

@@ -1,5 +1,6 @@
 """Derivations: what each step keeps and changes, and that each bad setting is told."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,26 @@ def test_segments_are_selected_by_their_labels(condition: dict[str, Any], kept: 
         np.testing.assert_array_equal(values(piece, "u"), values(whole, "u"))
 
 
+def test_clipping_limits_samples_history_and_no_other_channel_and_keeps_gaps() -> None:
+    made = recording()
+    y = made.channel("y")
+    gap = np.where(np.arange(y.values.size) == 70, np.nan, y.values)
+    made = replace(made, channels=(made.channel("u"), replace(y, values=gap)))
+    part = derive_recording(made, [{"trim": {"rows": [50, 100]}}])
+    low, high = np.nanquantile(values(part, "y"), [0.2, 0.6])
+    clipped = derive_recording(part, [{"clip": {"y": {"min": low, "max": high}}}])
+    expected = np.minimum(np.maximum(values(part, "y"), low), high)
+    np.testing.assert_array_equal(values(clipped, "y"), expected)
+    assert np.isnan(expected).sum() == 1
+    before, after = (one.channel("y").history for one in (part, clipped))
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(after.values, np.clip(before.values, low, high))
+    assert clipped.channel("u") is part.channel("u")
+    above = derive_recording(part, [{"clip": {"y": {"min": low}}}])
+    assert np.nanmax(values(above, "y")) == np.nanmax(values(part, "y"))
+
+
 def test_pooling_puts_every_output_sample_at_its_own_time() -> None:
     made = derive_recording(repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
     assert made.segments == ()
@@ -289,6 +310,12 @@ def test_pooled_outputs_are_of_segments_that_exist() -> None:
         ([{"detrend": {"channels": []}}], "/steps/0/detrend/channels"),
         ([{"offset": {}}], "/steps/0/offset"),
         ([{"offset": {"y": True}}], "/steps/0/offset/y"),
+        ([{"clip": {}}], "/steps/0/clip"),
+        ([{"clip": {"y": {}}}], "/steps/0/clip/y"),
+        ([{"clip": {"y": [0, 1]}}], "/steps/0/clip/y"),
+        ([{"clip": {"y": {"low": 0}}}], "/steps/0/clip/y/low"),
+        ([{"clip": {"y": {"min": 2, "max": 1}}}], "/steps/0/clip/y/max"),
+        ([{"clip": {"z": {"min": 0}}}], "/steps/0/clip"),
         ([{"split": {"fraction": 1.5, "part": "validation"}}], "/steps/0/split/fraction"),
         ([{"split": {"fraction": 0.5, "part": "test"}}], "/steps/0/split/part"),
         ([{"hold": {"u": "second"}}], "/steps/0/hold/u"),

@@ -26,6 +26,7 @@ BUILT_IN = (
     "emps",
     "exponential",
     "fopdt",
+    "ipdt",
     "mackey-glass",
     "narx",
     "silverbox",
