@@ -212,12 +212,19 @@ def _unreadable_reason(cause: BaseException | None) -> str | None:
     return None
 
 
+def _find_position(text: str, index: int) -> str:
+    """Return line and column of a character, both from 1."""
+    before = text[:index]
+    return f"line {before.count(chr(10)) + 1}, column {index - before.rfind(chr(10))}"
+
+
 def _to_field_errors(request: Request, error: RequestValidationError) -> Iterator[FieldError]:
     entries = []
     for entry in error.errors():
         source, loc = entry["loc"][0], entry["loc"][1:]
         if entry["type"] == "json_invalid":
-            yield FieldError("", f"the body is not JSON: {entry['ctx']['error']} at {loc[0]}")
+            position = _find_position(str(error.body), int(loc[0]))
+            yield FieldError("", f"the body is not JSON: {position}: {entry['ctx']['error']}")
         elif source == "body":
             entries.append({**entry, "loc": loc})
         else:

@@ -361,11 +361,15 @@ def _extract_records(
     from service.datasets.signal_channels import map_channels
 
     channels = map_channels(model, body.channels, body.hold)
-    for signal, channel in channels.by_signal.items():
-        if channel not in recording.names:
-            option = f"--channels {signal}" if signal in body.channels else "--channels"
-            fail(
-                f"{option}: {path} has no channel {channel!r} for signal {signal!r} of the model"
-                f"{suggest_name(channel, recording.names)}"
-            )
+    missing = {
+        signal: f"channel {channel!r} for signal {signal!r}{suggest_name(channel, recording.names)}"
+        for signal, channel in channels.by_signal.items()
+        if channel not in recording.names
+    }
+    if missing:
+        options = " ".join(f"--channels {signal}=NAME" for signal in missing)
+        fail(
+            f"--channels: {path} has no {', no '.join(missing.values())}. "
+            f"Name the channels of the file: {options}"
+        )
     return list(channels.cut_records(recording, path.stem))

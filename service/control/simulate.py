@@ -84,14 +84,17 @@ def simulate_run(
         if body.store
         else None
     )
-    return RunSimulationOut.from_source(
-        loop,
+    return RunSimulationOut(
         id=run_id,
         parameters=request.values,
         outputs=[to_series(channel, max_points) for channel in result.outputs],
         inputs=[to_series(channel, max_points) for channel in result.inputs],
         reference=None if reference is None else to_series(reference, max_points),
         command=to_series(loop.command, max_points) if loop else None,
+        metrics=loop.metrics if loop else None,
+        controller=loop.controller if loop else None,
+        tuning=loop.tuning if loop else None,
+        margins=loop.margins if loop else None,
         notes=result.notes,
         dataset=dataset,
     )

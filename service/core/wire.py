@@ -54,11 +54,15 @@ class Answer(BaseModel):
 
     @classmethod
     def from_source(cls, source: object, **fields: Any) -> Self:
-        """Build the response from the attributes of a row or value, replaced by `fields`."""
+        """Build the response from the attributes of a row or value, replaced by `fields`.
+
+        Raises
+        ------
+        AttributeError
+            If neither has a field of the response.
+        """
         attributes = {
-            name: getattr(source, name)
-            for name in cls.model_fields
-            if name not in fields and hasattr(source, name)
+            name: getattr(source, name) for name in cls.model_fields if name not in fields
         }
         return cls.model_validate(attributes | fields)
 

@@ -161,4 +161,7 @@ def _suggest_cause(text: str, column: CsvColumn, convert: Callable[[str], float]
         return "; decimal points and commas are mixed"
     if column.role == "time":
         return "; times are in seconds"
-    return "; name columns of labels with segments, or leave the column out"
+    return (
+        "; leave the field empty if the value is missing; if the column is a label, name it in "
+        "segments"
+    )

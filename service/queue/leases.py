@@ -313,8 +313,7 @@ class LeaseQueue:
             Job.state == JobState.RUNNING, _ends_too_late(now, current_owners)
         )
         ends = _choose_by_owner(
-            {owner: now + length for owner, length in current_owners.lease_lengths.items()},
-            now + DEFAULT_LEASE,
+            {owner: now + length for owner, length in current_owners.lease_lengths.items()}, now
         )
         self._session.execute(ahead.values(lease_until=ends), execution_options=RETURNING_OPTIONS)
         expired = (
@@ -411,12 +410,14 @@ def _is_expired(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:
 
 
 def _ends_too_late(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:
-    """Return the condition that a lease ends later than any that its owner could get now."""
+    """Return the condition that a lease ends later than any that its owner could get now.
+
+    An owner without a row among the dispatchers has no known length, so its leases are left.
+    """
     latest = {
         owner: now + MAX_LEASE_LENGTHS * length for owner, length in owners.lease_lengths.items()
     }
-    other = now + MAX_LEASE_LENGTHS * DEFAULT_LEASE
-    return Job.lease_until > _choose_by_owner(latest, other)
+    return and_(Job.lease_owner.in_(latest), Job.lease_until > _choose_by_owner(latest, now))
 
 
 def _choose_by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnElement[datetime]:

@@ -185,7 +185,9 @@ def _to_point_out(
     judged = {} if influence is None else influence._asdict()
     return PointOut.from_source(
         point,
-        **{name: judged[name] for name in ("studentised", "p_value", "is_outlier") if judged},
+        studentised=judged.get("studentised"),
+        p_value=judged.get("p_value"),
+        is_outlier=judged.get("is_outlier", False),
         stderr=None if point.estimate is None else point.estimate.stderr,
         is_used=has_laws and point.estimate is not None,
         drifts=drifts,

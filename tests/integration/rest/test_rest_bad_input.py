@@ -309,6 +309,16 @@ def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
     assert answer.json()["detail"].startswith("the body is not JSON")  # and no empty place
 
 
+def test_a_fault_of_json_has_its_line_and_column(server: TestClient) -> None:
+    answer = server.post(
+        "/v1/jobs",
+        content=b'{\n "model": "fopdt",\n "datasets": x\n}',
+        headers={"content-type": "application/json"},
+    )
+    (fault,) = refused(answer, 422, "invalid")
+    assert fault["detail"] == "the body is not JSON: line 3, column 14: Expecting value"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
