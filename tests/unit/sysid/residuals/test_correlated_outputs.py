@@ -129,3 +129,25 @@ def test_the_same_noise_in_two_outputs_counts_once() -> None:
     assert found is not None
     assert found.equivalent_samples == pytest.approx(TIMES.size)
     assert found.degrees == pytest.approx(TIMES.size - 4)
+
+
+@pytest.mark.parametrize("late", [0, 40])
+def test_the_middle_has_the_cross_terms_of_samples_at_the_same_times(late: int) -> None:
+    n, draw = TIMES.size, np.random.default_rng(3)
+    data = [Channel("y", TIMES, CLEAN[0].values, "m")]
+    data += [Channel("z", TIMES[late:], CLEAN[1].values[late:], "m")]
+    problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
+    first, second = noise(2, 0.9)
+    errors = np.concatenate([first, second[late:]])
+    columns = draw.standard_normal((errors.size, 4))
+    found = estimate_joint_covariance(problem, errors, columns)
+    assert found is not None
+    same = n - late  # samples of y from `late` on have the times of all of z
+    cross = columns[late:n].T @ columns[n:] * (errors[late:n] @ errors[n:]) / same
+    expected = np.mean(errors**2) * columns.T @ columns + cross + cross.T
+    np.testing.assert_allclose(found.middle, expected)
+    correlation = (errors[late:n] @ errors[n:]) / np.sqrt(
+        (errors[late:n] @ errors[late:n]) * (errors[n:] @ errors[n:])
+    )
+    independent = errors.size**2 / (errors.size + 2 * same * correlation**2)
+    assert found.equivalent_samples == pytest.approx(independent)
