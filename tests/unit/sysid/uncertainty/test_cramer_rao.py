@@ -155,3 +155,27 @@ def test_the_floor_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them()
     first, second = np.array(noises)[:, :200].ravel(), np.array(noises)[:, 200:].ravel()
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(first.size)
     np.testing.assert_allclose(np.std(estimates, axis=0), 0.1 * found.stderr, rtol=0.12)
+
+
+@pytest.mark.parametrize("at_bound", [False, True])
+def test_a_rounded_lag_has_no_floor_and_the_others_keep_theirs(at_bound):
+    """The response jumps with it, on both sides or at a bound on one."""
+    document = {**LAGGED, "solver": {"interpolation": "nearest"}, "initial": {"x": 0}}
+    times = 0.1 * np.arange(100)
+    u = np.sign(np.sin(2.0 * times) + 0.3 * np.cos(5.0 * times))
+    record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, np.sin(times)),))
+    found = {}
+    for lag in ({"lower": 0.2 if at_bound else 0.0, "upper": 1.0}, {"fixed": 0.2}):
+        posed = Problem.build(
+            parse_model(document), [record], weights={"y": 1.0}, parameters={"L": lag}
+        )
+        truth = {"K": 0.5, "T": 1.0, "L": 0.2, "y0": 0.1}
+        bound = cramer_rao_bound(posed, np.array([truth[name] for name in posed.free_names]))
+        found[len(bound.names)] = dict(zip(bound.names, bound.stderr.tolist(), strict=True))
+    assert np.isinf(found[4].pop("L"))
+    assert np.all(np.isfinite(list(found[3].values())))
+    if at_bound:
+        assert found[4] == pytest.approx(found[3], rel=1e-6)
+    else:
+        assert min(found[4][name] / value for name, value in found[3].items()) >= 1.0 - 1e-6
+        assert max(found[4].values()) < np.inf
