@@ -169,7 +169,7 @@ class _OutputProbe:
     def __init__(self, problem: Problem, theta: FloatArray, max_simulations: int | None) -> None:
         if max_simulations is not None and max_simulations < 1:
             raise BudgetSpentError(0, None)
-        self._problem, self._most = problem, max_simulations
+        self._problem, self._theta, self._most = problem, theta, max_simulations
         self.weight = problem.evaluator.weight[problem.scored_rows]
         self.measured = problem.evaluator.measured[problem.scored_rows]
         self.place = to_unit(problem.evaluator, theta[None])[0]
@@ -182,13 +182,20 @@ class _OutputProbe:
         return np.asarray(self.weight * (self.predicted - self.measured))
 
     def simulate_steps(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Simulate steps, cut off at the bounds: steps taken and outputs (n, len(which))."""
+        """Simulate steps, cut off at the bounds: steps taken and outputs (n, len(which)).
+
+        The other parameters keep their bits. Converted to places and back they might be rounded,
+        and the output would seem to change on a plateau.
+        """
         if self._most is not None and self.evaluations + which.size > self._most:
             raise BudgetSpentError(self.evaluations, self.residuals)
         moved = np.clip(self.place[which] + steps, 0.0, 1.0)
-        around = np.repeat(self.place[None], which.size, axis=0)
-        around[np.arange(which.size), which] = moved
-        predicted = self._problem.predict(from_unit(self._problem.evaluator, around))
+        rows = np.arange(which.size)
+        places = np.repeat(self.place[None], which.size, axis=0)
+        places[rows, which] = moved
+        around = np.repeat(self._theta[None], which.size, axis=0)
+        around[rows, which] = from_unit(self._problem.evaluator, places)[rows, which]
+        predicted = self._problem.predict(around)
         self.evaluations += which.size
         scored = predicted[:, self._problem.scored_rows]
         return moved - self.place[which], np.ascontiguousarray(scored.T)

@@ -10,6 +10,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import from_unit, to_unit
 from sysid.simulation.simulate import simulate
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -280,6 +281,18 @@ def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
         errors.append(found.stderr)
     expected = np.hypot(0.02 / np.sqrt(12), BOUND["L"])
     assert errors == pytest.approx([expected] * len(errors), rel=0.1)
+
+
+def test_a_plateau_is_seen_although_the_place_of_another_parameter_is_rounded() -> None:
+    """Estimates lie anywhere, and few of them stay the same as a place and back."""
+    problem = rounded()
+    thetas = np.array([[0.2, 0.5, b, 1.0] for b in np.linspace(4.99, 5.01, 50)])
+    back = from_unit(problem.evaluator, to_unit(problem.evaluator, thetas))
+    theta = thetas[np.argmax(back[:, 2] != thetas[:, 2])]
+    assert from_unit(problem.evaluator, to_unit(problem.evaluator, theta[None]))[0, 2] != theta[2]
+    found = by_name(analyse_estimate(problem, theta).estimates)["L"]
+    assert found.status == "identified"
+    assert found.stderr == pytest.approx(np.hypot(0.02 / np.sqrt(12), BOUND["L"]), rel=0.1)
 
 
 def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended() -> None:
