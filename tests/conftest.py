@@ -1,4 +1,4 @@
-"""What holds for every test: the threads it has, how long it may take, the shared fixtures."""
+"""What holds for every test: the threads it has, the shared fixtures."""
 
 import os
 
@@ -7,10 +7,4 @@ import os
 # thread as well.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from hypothesis import HealthCheck, settings
-
-# How long an example takes tells of the machine's load, not of the program.
-settings.register_profile("lagid", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("lagid")
-
-pytest_plugins = ["tests.database", "tests.cluster", "tests.needs"]
+pytest_plugins = ["tests.profiles", "tests.database", "tests.cluster", "tests.needs"]

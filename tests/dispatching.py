@@ -117,7 +117,7 @@ def carry_out(place: Place, job: str, executor: Executor) -> None:
 
     def stop_at_the_end() -> None:
         while place.job(job).state in OPEN_STATES:
-            time.sleep(0.01)
+            time.sleep(0.03)
         dispatcher.stopping.set()
 
     watcher = threading.Thread(target=stop_at_the_end)

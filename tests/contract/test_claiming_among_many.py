@@ -21,10 +21,10 @@ PROJECTS = [f"p{number}" for number in range(4)]
 N_ENDED, N_QUEUED, N_RUNNING = 4000, 400, 128
 
 
-@pytest.fixture
-def crowded(database):
+@pytest.fixture(scope="module")
+def crowded(module_database):
     """A database with thousands of ended jobs, hundreds of queued ones, and many that run."""
-    return add_crowd(database)
+    return add_crowd(module_database)
 
 
 @pytest.fixture

@@ -99,9 +99,7 @@ def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
     assert {run.state for run in place.runs(noisy)} == {JobState.SUCCEEDED}
 
 
-@pytest.mark.parametrize(
-    "error", [np.linalg.LinAlgError("as told"), ZeroDivisionError(), MemoryError(), ValueError()]
-)
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("as told"), MemoryError()])
 def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypatch, error):
     def broken(problem, theta):
         raise error

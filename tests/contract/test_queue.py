@@ -65,7 +65,7 @@ def test_a_claimed_job_runs_under_its_first_attempt(database, clock):
 
 
 def test_no_two_claimers_ever_get_the_same_job(database):
-    jobs = {submit(database) for _ in range(40)}
+    jobs = {submit(database) for _ in range(24)}
     taken, start = [], threading.Barrier(4)
 
     def work(owner):

@@ -104,20 +104,17 @@ def test_reuse_can_be_declined(place):
     assert all("reused_from" not in run.result for run in runs)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_another_specification_is_computed(place):
+    carried_out(place, **sweep(1))
+    for changes in (
         {"noise": {"sigma": 0.1}},
         {"skip": 1},
         {"parameters": {"T": {"upper": 9.0}}},
         {"algorithm": {**SMALL, "bits": 20}},
         {"loss": {"kind": "soft-l1", "scale": 0.5}},
-    ],
-)
-def test_another_specification_is_computed(place, changes):
-    carried_out(place, **sweep(1))
-    _, _, computed = carried_out(place, **{**sweep(1), **changes})
-    assert len(computed) == 1
+    ):
+        _, _, computed = carried_out(place, **{**sweep(1), **changes})
+        assert len(computed) == 1, changes
 
 
 def test_a_run_that_the_clock_may_end_is_computed_again(place):

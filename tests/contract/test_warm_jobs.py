@@ -126,23 +126,20 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
     assert told.history[0].by == "me"
 
 
-@pytest.mark.parametrize(
-    ("warm", "said"),
-    [
-        ("previous", "needs a sweep"),
-        ("run_unknown", "there is no run run_unknown"),
-        ("reference:tupe", "there is no reference 'tupe'; did you mean 'tube'"),
-    ],
-)
-def test_a_warm_start_that_is_not_there_is_told(place, warm, said):
+def test_a_warm_start_that_is_not_there_is_told(place):
     (first,), _ = carried_out(place)
     with place.database.write_session() as session:
         accept_reference(session, "tube", ReferenceIn(run=first.id))
-    with pytest.raises(InvalidRequest) as caught:
-        place.submit(warm_start=warm)
-    (fault,) = caught.value.errors
-    assert fault.pointer == "/warm_start"
-    assert said in fault.detail
+    for warm, said in [
+        ("previous", "needs a sweep"),
+        ("run_unknown", "there is no run run_unknown"),
+        ("reference:tupe", "there is no reference 'tupe'; did you mean 'tube'"),
+    ]:
+        with pytest.raises(InvalidRequest) as caught:
+            place.submit(warm_start=warm)
+        (fault,) = caught.value.errors
+        assert fault.pointer == "/warm_start"
+        assert said in fault.detail
 
 
 def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
@@ -160,7 +157,7 @@ def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
 
 
 LABELLED = {**NOISE, "labels": [{"x": 1}, {"x": 2}, {"x": 3}]}
-SEEDS = {"path": "/seed", "values": [1, 2, 3, 4]}
+SEEDS = {"path": "/seed", "values": [1, 2]}
 
 
 def before_the_first_wait(place, body):
@@ -177,7 +174,7 @@ def before_the_first_wait(place, body):
 
 
 @pytest.mark.parametrize(
-    ("axes", "first"), [([SEEDS, LABELLED], [0, 3, 6, 9]), ([LABELLED, SEEDS], [0, 1, 2, 3])]
+    ("axes", "first"), [([SEEDS, LABELLED], [0, 3]), ([LABELLED, SEEDS], [0, 1])]
 )
 def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, first):
     assert before_the_first_wait(place, chained(*axes)) == first
@@ -187,7 +184,7 @@ def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeyp
     monkeypatch.setattr("service.jobs.submit.CELLS_AT_SUBMISSION", 2)
     monkeypatch.setattr("service.dispatch.job_runs.CHUNK_ROWS", 2)
     runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
-    assert [one == () for one in warm] == [True, False, False] * 4
+    assert [one == () for one in warm] == [True, False, False] * 2
     assert {run.state for run in runs} == {JobState.SUCCEEDED}
 
 

@@ -13,9 +13,9 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_play
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.core.settings import Settings
-from tests.e2e.filled import Filled, fill
+from tests.e2e.filled import Filled, copy_filled
 from tests.needs import report_missing
+from tests.rest import settings_of
 
 CHROMIUM = Path("/usr/bin/chromium")
 ARGUMENTS = [
@@ -35,33 +35,45 @@ LIMIT_MILLISECONDS = 1000 * LIMIT_SECONDS
 
 
 @dataclass(frozen=True)
-class Site:
-    """A running server, its parts, and what its data folder holds."""
+class Server:
+    """A running server and its parts."""
 
     url: str
     parts: Parts
+
+
+@dataclass(frozen=True)
+class Site(Server):
+    """The same, and what its data folder holds."""
+
     filled: Filled
 
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """The service over a data folder that was used for a while, only to be looked at."""
-    with _serving(tmp_path_factory.mktemp("site")) as served:
+    with _serve_filled(tmp_path_factory.mktemp("site")) as served:
         yield served
 
 
 @pytest.fixture
 def own_site(tmp_path: Path) -> Iterator[Site]:
     """The same, for a test that changes something."""
-    with _serving(tmp_path) as served:
+    with _serve_filled(tmp_path) as served:
         yield served
 
 
 @contextmanager
-def _serving(folder: Path) -> Iterator[Site]:
-    # Jobs are claimed here without a heartbeat: the lease is long.
-    settings = Settings(data_dir=folder, poll_seconds=0.05, lease_seconds=3600)
-    app = create_app(settings)
+def _serve_filled(folder: Path) -> Iterator[Site]:
+    filled = copy_filled(folder)
+    with serve_folder(folder) as server:
+        yield Site(server.url, server.parts, filled)
+
+
+@contextmanager
+def serve_folder(folder: Path) -> Iterator[Server]:
+    """The service over a data folder, on a port of its own."""
+    app = create_app(settings_of(folder, poll_seconds=0.05))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
@@ -71,9 +83,7 @@ def _serving(folder: Path) -> Iterator[Site]:
             assert thread.is_alive()
             time.sleep(0.01)
         port = server.servers[0].sockets[0].getsockname()[1]
-        parts: Parts = app.state.parts
-        filled = fill(parts.database, parts.store, settings)
-        yield Site(f"http://127.0.0.1:{port}", parts, filled)
+        yield Server(f"http://127.0.0.1:{port}", app.state.parts)
     finally:
         if hasattr(app.state, "parts"):
             app.state.parts.stopping.set()

@@ -4,9 +4,14 @@ The rows are written by the repositories, as the dispatcher would write them. Th
 up by a closed formula, so that every test run sees the same pages.
 """
 
+import atexit
 import io
+import shutil
+import tempfile
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +26,11 @@ from service.queue.leases import Claim, JobProgress, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.runs import RunRepository
-from service.storage.objects import ObjectStore
+from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
 from sysid.data.records import Channel, Recording
+from tests.database import migrated_sqlite
+from tests.rest import settings_of
 
 MODEL = {
     "name": "lagged-tube",
@@ -60,7 +67,24 @@ class Filled:
     lease: Claim
 
 
-def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
+def copy_filled(folder: Path) -> Filled:
+    """Copy the data folder, which is filled once in a session."""
+    template, filled = _filled_template()
+    shutil.copytree(template, folder, dirs_exist_ok=True)
+    return filled
+
+
+@cache
+def _filled_template() -> tuple[Path, Filled]:
+    folder = Path(tempfile.mkdtemp(prefix="lagid-filled-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    settings, database = settings_of(folder), migrated_sqlite(folder)
+    filled = _fill(database, open_store(settings.resolved_store_url), settings)
+    database.dispose()  # the last connection folds the write-ahead log into the file
+    return folder, filled
+
+
+def _fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     """Write everything; the job that runs can be driven on with `progress`."""
     recording = _recording()
     dataset = add_recording(
@@ -156,7 +180,7 @@ def _simulated(u: np.ndarray) -> np.ndarray:
 def _claimed(database: Database, settings: Settings, body: JobIn) -> Claim:
     submit.submit_job(database, body, settings)
     with database.write_session() as session:
-        claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
+        claim = LeaseQueue(session).claim_job("test", timedelta(days=1))
     assert claim is not None
     return claim
 

@@ -1,12 +1,13 @@
 """A large sweep in Chromium: Figure 15, and the grid of its cells instead of a list of its runs."""
 
 import re
+from collections.abc import Iterator
 
 import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.e2e.conftest import LIMIT_SECONDS, Site
+from tests.e2e.conftest import LIMIT_SECONDS, serve_folder
 from tests.identified import carried_out
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -28,20 +29,20 @@ BODY = {
 PLOT = '[data-figure="summary"]'
 
 
-@pytest.fixture
-def job(own_site: Site) -> str:
-    """A sweep of 52 runs that has ended."""
-    answer = httpx.post(f"{own_site.url}/v1/recipes/noise-sweep", json=BODY, timeout=LIMIT_SECONDS)
-    assert answer.status_code == 202, answer.text
-    name: str = answer.json()["id"]
-    carried_out(own_site.parts, name)
-    return name
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a sweep of 52 runs that has ended."""
+    with serve_folder(tmp_path_factory.mktemp("sweep")) as server:
+        url = f"{server.url}/v1/recipes/noise-sweep"
+        answer = httpx.post(url, json=BODY, timeout=LIMIT_SECONDS)
+        assert answer.status_code == 202, answer.text
+        name: str = answer.json()["id"]
+        carried_out(server.parts, name)
+        yield f"{server.url}/jobs/{name}"
 
 
-def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(
-    own_site: Site, page: Page, job: str
-) -> None:
-    page.goto(f"{own_site.url}/jobs/{job}")
+def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(page: Page, job: str) -> None:
+    page.goto(job)
     page.wait_for_selector(f"{PLOT} .main-svg")
     drawn = page.locator(PLOT).evaluate("plot => plot.data.map(one => one.legendgroup)")
     assert set(drawn) == {"simple", "improved", "Cramér–Rao bound (of parameters: 5 and 95 %)"}
@@ -61,11 +62,9 @@ def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(
     expect(page.locator("table.runs")).to_have_count(0)
 
 
-def test_the_plots_of_a_narrow_page_stand_below_each_other(
-    own_site: Site, page: Page, job: str
-) -> None:
+def test_the_plots_of_a_narrow_page_stand_below_each_other(page: Page, job: str) -> None:
     page.set_viewport_size({"width": 420, "height": 900})
-    page.goto(f"{own_site.url}/jobs/{job}")
+    page.goto(job)
     page.wait_for_selector(f"{PLOT} .main-svg")
     domains = page.locator(PLOT).evaluate(
         "plot => Object.keys(plot.layout).filter(one => one.startsWith('xaxis'))"

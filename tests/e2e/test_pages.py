@@ -42,33 +42,39 @@ def test_the_list_is_filtered_by_state(site: Site, page: Page) -> None:
     expect(page.locator("table.jobs")).to_contain_text("a model that diverges")
 
 
-def test_a_finished_job_shows_estimates_and_plots_and_opens_no_stream(
+def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
     site: Site, page: Page
 ) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
+    page.emulate_media(color_scheme="light")
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    height = "document.documentElement.scrollHeight"
+    before = page.evaluate(height)
     rows = page.locator("table.estimates tbody tr")
     expect(rows).to_have_count(len(TRUE))
     expect(rows.nth(1)).to_have_text(re.compile(r"T\s*0\.34890\s*± 0\.00041\s*s.*identified", re.S))
     assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
-    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
     assert page.locator(f"{figure(page, 'convergence')} {LINES}").count() == 4 * len(TRUE)
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
+    assert page.locator(f"{figure(page, 'residuals')} .barlayer .trace").count() == 2
     assert page.locator(f"{figure(page, 'correlation')} .hm").count() == 1
     assert page.locator(f"{figure(page, 'waterfall')} {LINES}").count() == 2
+    assert page.evaluate(height) == before  # plots take the room that was left for them
     expect(page.get_by_text("strongly correlated")).to_be_visible()
-    assert [url for url in asked if url.endswith("/events")] == []
+    assert_residual_tests(page)
+    assert red_of(page) <= 128  # dark letters on a light page
+    assert [url for url in asked if url.endswith("/events")] == []  # nothing more is to come
     assert [url for url in asked if not url.startswith(site.url)] == []
 
 
-def test_residual_tests_show_their_bands_and_verdicts(site: Site, page: Page) -> None:
-    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+def assert_residual_tests(page: Page) -> None:
+    """Bands and verdicts of the residual tests."""
     rows = page.locator("table.tests tbody tr")
     expect(rows).to_have_count(2)
     expect(rows.nth(0)).to_have_text(re.compile(r"p\s*white.*passed", re.S))
     expect(rows.nth(1)).to_have_text(re.compile(r"independent of u.*passed", re.S))
     plot = page.locator(figure(page, "residuals"))
-    assert plot.locator(".barlayer .trace").count() == 2
     bars = "plot => plot.data.filter(one => one.type === 'bar').map(one => one.x.length)"
     assert plot.evaluate(bars) == [25, 51]  # lags 1 … 25, and -25 … 25
     outside = (
@@ -80,8 +86,27 @@ def test_residual_tests_show_their_bands_and_verdicts(site: Site, page: Page) ->
     expect(page.locator("dl.findings")).to_contain_text("Onset delay, p behind u")
 
 
-def test_profiles_are_computed_and_drawn_on_request(site: Site, page: Page) -> None:
+def red_of(page: Page) -> int:
+    """How much red a title of the history's plot has."""
+    title = page.locator(f"{figure(page, 'history')} .xtitle")
+    return int(re.findall(r"\d+", title.evaluate("node => getComputedStyle(node).fill"))[0])
+
+
+def test_plots_of_a_finished_job_follow_the_keyboard_the_scheme_and_the_wish_for_profiles(
+    site: Site, page: Page
+) -> None:
+    page.emulate_media(color_scheme="dark")
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    plot = figure(page, "history")
+    assert red_of(page) > 128
+    button = page.get_by_role("button", name="evaluations")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator(f"{plot} .xtitle")).to_have_text("evaluations")
+    expect(button).to_have_attribute("aria-pressed", "true")
+    link = page.locator('[data-csv="history"]').get_attribute("href")
+    assert link is not None
+    assert "abscissa=evaluations" in link
     page.get_by_role("button", name="compute").click()
     page.wait_for_selector("[data-profile-plot] .main-svg")
     assert page.locator(f"[data-profile-plot] {LINES}").count() == len(TRUE)
@@ -97,29 +122,6 @@ def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
     page.locator("table.runs tbody a").first.click()
     expect(page.locator('tr[aria-current="true"]')).to_contain_text("run ")
-
-
-def test_plots_take_the_room_that_was_left_for_them(site: Site, page: Page) -> None:
-    page.goto(f"{site.url}/jobs/{site.filled.finished}")
-    height = "document.documentElement.scrollHeight"
-    before = page.evaluate(height)
-    names = ("history", "convergence", "response", "residuals", "correlation", "waterfall")
-    for name in names:
-        figure(page, name)
-    assert page.evaluate(height) == before
-
-
-def test_the_abscissa_of_the_history_can_be_chosen_by_keyboard(site: Site, page: Page) -> None:
-    page.goto(f"{site.url}/jobs/{site.filled.finished}")
-    plot = figure(page, "history")
-    button = page.get_by_role("button", name="evaluations")
-    button.focus()
-    page.keyboard.press("Enter")
-    expect(page.locator(f"{plot} .xtitle")).to_have_text("evaluations")
-    expect(button).to_have_attribute("aria-pressed", "true")
-    link = page.locator('[data-csv="history"]').get_attribute("href")
-    assert link is not None
-    assert "abscissa=evaluations" in link
 
 
 def test_a_running_job_is_redrawn_as_events_arrive_and_nothing_moves(
@@ -252,16 +254,6 @@ def test_the_page_of_a_dataset_draws_its_channels_and_a_zoom_brings_more_samples
     )
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_figures_follow_the_paper(site: Site, page: Page, scheme: str) -> None:
-    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
-    page.goto(f"{site.url}/jobs/{site.filled.finished}")
-    plot = figure(page, "history")
-    colour = page.locator(f"{plot} .xtitle").evaluate("node => getComputedStyle(node).fill")
-    red = int(re.findall(r"\d+", colour)[0])
-    assert (red > 128) == (scheme == "dark")
-
-
 def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     answer = page.request.get(f"{site.url}/v1/jobs/{site.filled.finished}/report")
     assert answer.ok
@@ -325,16 +317,17 @@ def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
     expect(page.locator("[name=gain]")).to_have_attribute("aria-invalid", "true")
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
-)
+PATHS = ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
+
+
 def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(
-    site: Site, page: Page, path: str
+    site: Site, page: Page
 ) -> None:
     page.set_viewport_size({"width": 390, "height": 900})
-    page.goto(site.url + path.format(**vars(site.filled)))
-    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
-    headings = "() => [...document.querySelectorAll('h1, h2, h3')].map(one => +one.tagName[1])"
-    levels = page.evaluate(headings)
-    assert levels.count(1) == 1
-    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+    for path in PATHS:
+        page.goto(site.url + path.format(**vars(site.filled)))
+        assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), path
+        headings = "() => [...document.querySelectorAll('h1, h2, h3')].map(one => +one.tagName[1])"
+        levels = page.evaluate(headings)
+        assert levels.count(1) == 1, path
+        assert all(after <= before + 1 for before, after in itertools.pairwise(levels)), path

@@ -1,32 +1,29 @@
 """The trend on a job's page, in a browser: drawn, told, and a run accepted from it."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.e2e.conftest import LIMIT_SECONDS, Site
-from tests.identified import carried_out
-from tests.integration.rest.test_rest_reidentify import BODY, LENGTHS, recorded
-from tests.rest import CSV
+from tests.batches import LENGTHS, copy_batch
+from tests.e2e.conftest import LIMIT_SECONDS, serve_folder
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
-def batch_of(site: Site) -> str:
-    """A batch of four lengths that is over."""
-    with httpx.Client(base_url=site.url, timeout=LIMIT_SECONDS) as client:
-        experiments = []
-        for x in LENGTHS:
-            stored = client.post(f"/v1/datasets?name=e2e-{x:g}", content=recorded(x), headers=CSV)
-            experiments.append({"x": x, "datasets": [stored.json()["id"]]})
-        answer = client.post("/v1/recipes/reidentify", json={**BODY, "batch": experiments})
-        job = str(answer.json()["id"])
-    carried_out(site.parts, job)
-    return job
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[tuple[str, str]]:
+    """The address of a service with a batch of four lengths that is over, and of its job."""
+    batch = copy_batch(tmp_path)
+    with serve_folder(tmp_path) as served:
+        yield served.url, f"{served.url}/jobs/{batch.job}"
 
 
-def test_the_trend_is_drawn_and_a_run_accepted(own_site: Site, page: Page) -> None:
-    page.goto(f"{own_site.url}/jobs/{batch_of(own_site)}")
+def test_the_trend_is_drawn_and_a_run_accepted(server: tuple[str, str], page: Page) -> None:
+    url, job = server
+    page.goto(job)
     trend = page.locator("#trend")
     expect(trend.locator(".js-plotly-plot")).to_be_visible()
     expect(trend.locator(".plot .xtitle").first).to_have_text("length_m")
@@ -35,9 +32,7 @@ def test_the_trend_is_drawn_and_a_run_accepted(own_site: Site, page: Page) -> No
     trend.get_by_label("Accept the run").select_option(index=2)
     trend.get_by_role("button", name="Accept").click()
     expect(trend.locator("[data-accepted]")).to_contain_text("seen in a browser is now run_")
-    told = httpx.get(
-        f"{own_site.url}/v1/references/seen in a browser", timeout=LIMIT_SECONDS
-    ).json()
+    told = httpx.get(f"{url}/v1/references/seen in a browser", timeout=LIMIT_SECONDS).json()
     assert told["labels"] == {"length_m": LENGTHS[2]}
     trend.get_by_label("as the reference").fill(" blank")
     trend.get_by_role("button", name="Accept").click()

@@ -12,6 +12,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from tests.profiles import scale_examples
 
 TIMES = 0.05 * np.arange(120.0)
 LAG = load_model("fopdt")
@@ -42,7 +43,7 @@ def record() -> Record:
 
 
 @pytest.mark.parametrize("model", [LAG, polynomial()], ids=["lag", "polynomial"])
-@settings(max_examples=25)
+@settings(max_examples=scale_examples(25))
 @given(
     budget=st.integers(24, 900),
     method=st.sampled_from(SEARCH_METHODS),

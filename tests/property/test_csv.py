@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
+from tests.profiles import scale_examples
 
 VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=30)
 
@@ -41,7 +42,7 @@ def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
 @example(b't,u\n0,"' + b"x" * 200_000, None, ())
 @example(b'"' + b"x" * 200_000, None, ())
 @example(b'"t","u"x\n0,1\n', None, ())
-@settings(max_examples=400)
+@settings(max_examples=scale_examples(400))
 def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]
 ) -> None:

@@ -12,6 +12,7 @@ from sysid.models.model import Model
 from sysid.simulation.problem import Problem
 from tests import reference
 from tests.models import difference, differential, individuals, record
+from tests.profiles import scale_examples
 
 LAGGED = {
     "x": "v",
@@ -121,7 +122,7 @@ def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=15, derandomize=True)
+@settings(max_examples=scale_examples(15))
 @given(st.recursive(_leaves, _grown, max_leaves=6))
 def test_any_expression_equals_its_twin(text: str) -> None:
     model: Model = difference({"x": f"0.5*x(k-1) + 0.3*tanh({text})"}, "x")

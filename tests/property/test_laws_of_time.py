@@ -11,6 +11,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.simulate import simulate
+from tests.profiles import scale_examples
 
 PERIOD, SAMPLES, QUIET = 0.05, 120, 40
 SYSTEMS: dict[str, dict[str, float]] = {
@@ -38,7 +39,7 @@ def quiet_first(seed: int) -> FloatArray:
     return np.where(np.arange(SAMPLES) < QUIET, 0.0, walk)
 
 
-@settings(max_examples=12)
+@settings(max_examples=scale_examples(12))
 @given(
     st.sampled_from(sorted(SYSTEMS)),
     st.sampled_from(["zero", "first"]),

@@ -14,6 +14,7 @@ from service.formats.mcap import read_recording
 from service.formats.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
+from tests.profiles import scale_examples
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=False)
 TIMES = st.one_of(
@@ -43,7 +44,7 @@ def recordings(draw: st.DrawFn) -> Recording:
 
 
 @given(recordings(), st.integers(1, 40))
-@settings(max_examples=120)
+@settings(max_examples=scale_examples(120))
 def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chunk: int) -> None:
     with mock.patch.object(mcap_writer, "CHUNK_SAMPLES", chunk):
         content = recorded(recording)
@@ -60,7 +61,7 @@ def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chun
 
 
 @given(recordings())
-@settings(max_examples=25)
+@settings(max_examples=scale_examples(25))
 def test_the_plain_reader_counts_the_same_samples(recording: Recording) -> None:
     reader = make_reader(BytesIO(recorded(recording)), validate_crcs=True)
     counts: dict[str, int] = {}
@@ -73,7 +74,7 @@ def test_the_plain_reader_counts_the_same_samples(recording: Recording) -> None:
 
 
 @given(st.integers(2, 5000), st.sampled_from([0.01, 0.001, 1 / 610.35, 0.08, 1 / 3]))
-@settings(max_examples=50)
+@settings(max_examples=scale_examples(50))
 def test_computed_and_printed_times_need_no_field_of_their_own(samples: int, step: float) -> None:
     computed = np.arange(samples) * step
     assert choose_clock(computed)[0].rule != "field"

@@ -14,6 +14,7 @@ from sysid.search.slopes import evaluate_partial_fitness
 from sysid.simulation.evaluator import predict_partially
 from sysid.simulation.problem import Problem, compute_record_progress
 from sysid.simulation.scaling import from_unit
+from tests.profiles import scale_examples
 from tests.searching import example, record
 
 
@@ -41,7 +42,7 @@ def candidates(problem: Problem, seed: int) -> FloatArray:
     return np.asarray(from_unit(problem.evaluator, places))
 
 
-@settings(max_examples=30)
+@settings(max_examples=scale_examples(30))
 @given(st.sampled_from(sorted(POSED)), st.floats(0.01, 1.0), st.integers(0, 99))
 def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
     name: str, horizon: float, seed: int

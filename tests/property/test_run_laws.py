@@ -33,6 +33,7 @@ from sysid.search.island import Island, evolve
 from sysid.search.operators import decode
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
+from tests.profiles import scale_examples
 from tests.searching import bits, example
 
 METHOD = st.sampled_from(SEARCH_METHODS)
@@ -59,7 +60,7 @@ def alone(method: SearchMethod, seed: int, **changes: object) -> tuple[Island, o
     return create_islands(problem(), algorithm, seed)[1], make_plans(problem(), algorithm, seed)[1]
 
 
-@settings(max_examples=25)
+@settings(max_examples=scale_examples(25))
 @given(METHOD, st.integers(0, 2**63 - 1), st.integers(0, 30), st.integers(0, 30))
 def test_evolving_twice_is_evolving_the_sum(
     method: SearchMethod, seed: int, first: int, second: int
@@ -82,7 +83,7 @@ def test_a_sequence_search_can_be_cut_anywhere(kind: str) -> None:
     assert "sequence" in {step.phase for step in stepwise.history}
 
 
-@settings(max_examples=25)
+@settings(max_examples=scale_examples(25))
 @given(METHOD, st.integers(0, 1000), st.integers(0, 60))
 def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) -> None:
     island, plan = alone(method, seed)
@@ -93,7 +94,7 @@ def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) 
     assert after.fitness[0] <= before.fitness[0]
 
 
-@settings(max_examples=20)
+@settings(max_examples=scale_examples(20))
 @given(METHOD, st.integers(0, 1000), st.integers(0, 60))
 def test_fitness_is_that_of_the_chromosome_and_ascends(
     method: SearchMethod, seed: int, age: int

@@ -6,12 +6,12 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from service.core.settings import Settings
+from tests.rest import settings_of
 
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> TestClient:
-    return TestClient(create_app(Settings(data_dir=tmp_path_factory.mktemp("reference"))))
+    return TestClient(create_app(settings_of(tmp_path_factory.mktemp("reference"))))
 
 
 def test_every_operation_of_the_openapi_document_is_on_the_page(client: TestClient) -> None:

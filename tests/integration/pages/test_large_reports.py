@@ -20,7 +20,7 @@ from service.queue.leases import Claim, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from tests.rest import recording, settings_of
+from tests.rest import parts_of, recording, settings_of, store_csv
 
 N_SIGMA, N_SEEDS = 40, 105  # times the two methods: 8,400 asked for, the first 2,000 of them made
 WHY = "the model diverged <everywhere>"
@@ -38,10 +38,8 @@ class Large:
 def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
     settings = settings_of(tmp_path_factory.mktemp("large"))
     with TestClient(create_app(settings)) as client:
-        parts = client.app.state.parts  # type: ignore[attr-defined]
-        stored = client.post(
-            "/v1/datasets?name=step", content=recording(), headers={"content-type": "text/csv"}
-        ).json()["id"]
+        parts = parts_of(client)
+        stored = store_csv(client, recording())
         body = JobIn.model_validate(
             {
                 "name": "large",

@@ -10,29 +10,32 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
-from service.core.settings import Settings
 from service.datasets.datasets import add_recording
 from service.pages import render
 from service.storage.tables import Job
 from sysid.data.records import Channel, Recording
-from tests.e2e.filled import Filled, fill
+from tests.e2e.filled import Filled, copy_filled
+from tests.rest import parts_of, settings_of
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    folder = tmp_path_factory.mktemp("pages")
-    with TestClient(create_app(Settings(data_dir=folder))) as opened:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pages")
+
+
+@pytest.fixture(scope="module")
+def filled(folder: Path) -> Filled:
+    return copy_filled(folder)
+
+
+@pytest.fixture(scope="module")
+def client(folder: Path, filled: Filled) -> Iterator[TestClient]:
+    with TestClient(create_app(settings_of(folder))) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def filled(client: TestClient) -> Filled:
-    parts = client.app.state.parts  # type: ignore[attr-defined]
-    return fill(parts.database, parts.store, parts.settings)
-
-
 def test_an_empty_service_has_a_page_that_says_how_to_begin(tmp_path: Path) -> None:
-    with TestClient(create_app(Settings(data_dir=tmp_path))) as client:
+    with TestClient(create_app(settings_of(tmp_path))) as client:
         answer = client.get("/")
     assert answer.status_code == 200
     assert "No identification yet" in answer.text
@@ -173,7 +176,7 @@ def test_the_list_tells_how_runs_of_a_sweep_ended_and_the_rms_of_single_ones(
 def test_starts_are_told_apart_from_dispatchers_that_were_lost(
     client: TestClient, filled: Filled
 ) -> None:
-    parts = client.app.state.parts  # type: ignore[attr-defined]
+    parts = parts_of(client)
     page = client.get(f"/jobs/{filled.finished}").text
     assert "<dt>Started</dt>" in page
     assert "dispatchers lost" not in page
@@ -184,9 +187,9 @@ def test_starts_are_told_apart_from_dispatchers_that_were_lost(
 
 
 def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: Path) -> None:
-    with TestClient(create_app(Settings(data_dir=tmp_path))) as client:
+    with TestClient(create_app(settings_of(tmp_path))) as client:
         assert "No recording is stored yet" in client.get("/datasets").text
-        parts = client.app.state.parts  # type: ignore[attr-defined]
+        parts = parts_of(client)
         for number in range(52):
             channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, number]), "V")
             add_recording(

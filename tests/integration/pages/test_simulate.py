@@ -22,8 +22,9 @@ from sysid.models.catalogue.load import load_model
 from sysid.search import refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from tests.e2e.filled import copy_filled
 from tests.identified import identified
-from tests.rest import refused, settings_of
+from tests.rest import parts_of, refused, settings_of, store_csv
 
 INPUT = {"kind": "binary", "period": 2}
 TRUE = {"K": 2.0, "T": 1.0, "L": 0.5}
@@ -68,7 +69,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
             "parameters": {"L": {"upper": 2}},
             "algorithm": {"stop": {"evaluations": 6000}},
         }
-        _, [run] = identified(client.app.state.parts, body)  # type: ignore[attr-defined]
+        _, [run] = identified(parts_of(client), body)
         yield Place(client, run, other, faster, answer.json()["id"], f"/runs/{run}/simulate")
 
 
@@ -94,11 +95,7 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
 ) -> None:
     rows = ["series,t,u,y"]
     rows += [f"{n},{0.1 * k:.1f},{(k // 9) % 2},{n * 0.9**k}" for n in range(5) for k in range(60)]
-    answer = place.client.post(
-        "/v1/datasets?name=five&segments=series",
-        content="\n".join(rows).encode(),
-        headers={"content-type": "text/csv"},
-    )
+    stored = store_csv(place.client, "\n".join(rows).encode(), "five", ["series"])
     searched = []
 
     def noted(problem: Problem, *arguments: Any) -> Any:
@@ -106,7 +103,7 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
         return refine_candidates(problem, *arguments)
 
     monkeypatch.setattr(refine, "refine_candidates", noted)
-    found = validated(place, dataset=answer.json()["id"]).json()
+    found = validated(place, dataset=stored).json()
     assert searched == 5 * [["x(0)"]]
     assert list(found["starts"]) == ["x(0)", *(f"x(0)[{n}]" for n in range(2, 6))]
     starts = list(found["starts"].values())
@@ -371,11 +368,8 @@ def test_a_run_that_is_not_there_is_not_found(place: Place) -> None:
 
 
 def test_a_run_without_estimates_says_so(tmp_path: Path) -> None:
-    from tests.e2e.filled import fill
-
+    filled = copy_filled(tmp_path)
     with TestClient(create_app(settings_of(tmp_path))) as client:
-        parts = client.app.state.parts  # type: ignore[attr-defined]
-        filled = fill(parts.database, parts.store, parts.settings)
         answer = client.get(f"/runs/{filled.running_run}/simulate")
     assert answer.status_code == 200
     assert "has no estimates" in answer.text

@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.rest import CSV, recording, settings_of
+from tests.rest import recording, settings_of, store_csv
 
 
 @pytest.fixture(scope="module")
@@ -21,9 +21,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 @pytest.fixture(scope="module")
 def dataset(server: TestClient) -> str:
     """Identifier of a stored recording of 30 s with channels u and y."""
-    answer = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV)
-    assert answer.status_code == 201, answer.text
-    return str(answer.json()["id"])
+    return store_csv(server, recording())
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from service.client.calls import ProblemError
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, recording, settings_of
+from tests.rest import recording, settings_of, store_csv
 
 MODEL: dict[str, Any] = {
     "name": "lagged",
@@ -47,7 +47,7 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("shown")))
     with TestClient(app) as server:
-        data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+        data = store_csv(server, recording())
         axis = {
             "path": "/datasets",
             "values": [[data], [data]],

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from tests.rest import refused
+from tests.rest import refused, store_csv
 
 SWEEP = {"sigma": [0.1], "replicates": 2}
 TRUTH = {
@@ -173,8 +173,7 @@ def test_faults_of_a_model_document_in_a_noise_sweep_are_told_once_at_the_model(
 
 def test_units_and_missing_channels_are_told_in_one_answer(server: TestClient) -> None:
     text = b"t,u [V],x [K]\n" + b"".join(b"%d,%d,%d\n" % (n, n % 3, n % 5) for n in range(60))
-    stored = server.post("/v1/datasets", content=text, headers={"content-type": "text/csv"})
-    name = stored.json()["id"]
+    name = store_csv(server, text)
     own = {
         "name": "own",
         "form": "differential",

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
+from tests.profiles import scale_examples
+
 TRUTH = {
     "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
     "samples": 90,
@@ -120,7 +122,7 @@ def changed(body: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[st
 
 
 @pytest.mark.parametrize(("path", "body"), BODIES)
-@settings(max_examples=60)
+@settings(max_examples=scale_examples(30))
 @given(st.data())
 def test_any_value_anywhere_is_taken_or_refused_with_a_sentence(
     server: TestClient, dataset: str, path: str, body: dict[str, Any], data: st.DataObject

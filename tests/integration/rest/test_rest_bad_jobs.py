@@ -11,7 +11,7 @@ from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.cli.main import app as lagid
 from tests.identified import identified
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import recording, refused, settings_of, store_csv
 
 SMALL = {"population": 20, "generations": 20, "islands": 1}
 FIRST: dict[str, Any] = {
@@ -45,16 +45,10 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient
         yield client, app.state.parts
 
 
-def stored(client: TestClient, content: bytes) -> str:
-    answer = client.post("/v1/datasets?name=one", content=content, headers=CSV)
-    assert answer.status_code in (200, 201), answer.text
-    return str(answer.json()["id"])
-
-
 def ended(parts: tuple[TestClient, Parts], content: bytes, **fields: Any) -> dict[str, Any]:
     """The one run of a job on that recording, carried out."""
     client, inside = parts
-    body = {"model": FIRST, "datasets": [stored(client, content)], "algorithm": SMALL, **fields}
+    body = {"model": FIRST, "datasets": [store_csv(client, content)], "algorithm": SMALL, **fields}
     _, (run,) = identified(inside, body)
     answer = client.get(f"/v1/runs/{run}")
     assert answer.status_code == 200, answer.text
@@ -108,7 +102,7 @@ def test_fewer_scored_samples_than_parameters_are_refused(
     parts: tuple[TestClient, Parts], fields: dict[str, Any]
 ) -> None:
     client, _ = parts
-    body = {"model": FIRST, "datasets": [stored(client, recording())], **fields}
+    body = {"model": FIRST, "datasets": [store_csv(client, recording())], **fields}
     (fault,) = refused(client.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == "/datasets"
     assert "2 scored samples for 3 free parameters" in fault["detail"]
@@ -147,7 +141,7 @@ def test_what_would_have_no_effect_is_refused_with_its_place(
         "terms": ["y(k-1)"],
         "coefficients": {"lower": -2, "upper": 2},
     }
-    data = stored(parts[0], recording())
+    data = store_csv(parts[0], recording())
     for body, pointer, words in (
         ({"model": dead}, "/parameters/q", "no equation and no output of model 'first' uses 'q'"),
         ({"model": terms}, "/parameters/d", "no term of model 'terms' uses 'd'"),
@@ -166,7 +160,7 @@ def test_a_lag_that_the_record_has_no_room_for_is_refused_by_its_name(
     parts: tuple[TestClient, Parts],
 ) -> None:
     own = parts[0]
-    short = stored(own, recording(40))
+    short = store_csv(own, recording(40))
     body: dict[str, Any] = {"model": "fopdt", "datasets": [short]}
     fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/datasets/0"

@@ -4,43 +4,28 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
 from service.cli.main import app as lagid
-from tests.integration.rest.test_rest_reidentify import (
-    BODY,
-    LENGTHS,
-    Served,
-    batch_of,
-    quantity,
-    run_at,
-    stored,
-    trend,
-)
-from tests.rest import refused, settings_of
+from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch, serve_batch
+from tests.integration.rest.test_rest_reidentify import quantity, run_at, trend
+from tests.rest import refused
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Four lengths, two experiments each; the first are a batch whose 8 m are a reference."""
-    app = create_app(settings_of(tmp_path_factory.mktemp("compared")))
-    with TestClient(app, raise_server_exceptions=False) as server:
-        datasets = {x: [stored(server, x, seed) for seed in (1, 2)] for x in LENGTHS}
-        parts = app.state.parts
-        batch = [{"x": x, "datasets": datasets[x][:1]} for x in LENGTHS]
-        found = Served(server, parts, datasets, batch_of(server, parts, batch=batch))
-        told = server.put("/v1/references/tube", json={"run": run_at(found, found.job, 8.0)})
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBatch]:
+    """The batch, whose run at 8 m is a reference."""
+    with serve_batch(tmp_path_factory.mktemp("compared")) as found:
+        told = found.server.put("/v1/references/tube", json={"run": run_at(found, found.job, 8.0)})
         assert told.status_code == 200, told.text
         yield found
 
 
-def against(served: Served, **fields: Any) -> dict[str, Any]:
+def against(served: ServedBatch, **fields: Any) -> dict[str, Any]:
     """The trend of the second experiments, compared with the reference."""
     batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS]
     body = {"batch": batch, "reference": "tube", **fields}
-    return trend(served, batch_of(served.server, served.parts, **body))
+    return trend(served, identify_batch(served.server, **body))
 
 
 def drifts(found: dict[str, Any], name: str) -> dict[tuple[float, str], dict[str, Any]]:
@@ -51,7 +36,7 @@ def drifts(found: dict[str, Any], name: str) -> dict[tuple[float, str], dict[str
     }
 
 
-def test_a_file_of_another_length_is_told_as_drifted_in_every_quantity(served: Served) -> None:
+def test_a_file_of_another_length_is_told_as_drifted_in_every_quantity(served: ServedBatch) -> None:
     batch = [
         {"x": x, "datasets": served.datasets[4.0 if x == 8 else x][1:]} for x in LENGTHS if x != 4
     ]
@@ -63,7 +48,7 @@ def test_a_file_of_another_length_is_told_as_drifted_in_every_quantity(served: S
         assert not any(one["drifted"] for (x, _), one in told.items() if x != 8), name
 
 
-def test_the_onset_delay_is_compared_with_the_reference_run_too(served: Served) -> None:
+def test_the_onset_delay_is_compared_with_the_reference_run_too(served: ServedBatch) -> None:
     found = against(served)
     told = drifts(found, "onset delay")[8.0, "run"]
     first = quantity(trend(served, served.job), "onset delay")["points"][2]
@@ -71,7 +56,7 @@ def test_the_onset_delay_is_compared_with_the_reference_run_too(served: Served) 
     assert abs(told["z"]) < told["limit"]
 
 
-def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: Served) -> None:
+def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: ServedBatch) -> None:
     found = against(served)
     assert found["reference_names"] == ["tube"]
     page = served.server.get(f"/jobs/{found['job']}").text
@@ -79,7 +64,7 @@ def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: Serve
     assert "drift is flagged where z, in standard errors, exceeds" in page
 
 
-def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> None:
+def test_what_the_reference_was_made_with_otherwise_is_told(served: ServedBatch) -> None:
     assert against(served)["notes"] == []
     other = against(
         served,
@@ -99,7 +84,7 @@ def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> N
         assert told in note
 
 
-def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
+def test_why_there_is_nothing_to_compare_with_is_told(served: ServedBatch) -> None:
     found = against(served, label="bore_mm")
     (note,) = found["notes"]
     assert note == (
@@ -108,11 +93,10 @@ def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
     )
 
 
-def fopdt_run(served: Served) -> str:
+def fopdt_run(served: ServedBatch) -> str:
     """A run of a model that has the tube's parameters and another."""
-    job = batch_of(
+    job = identify_batch(
         served.server,
-        served.parts,
         model="fopdt",
         trend_parameters=["L"],
         batch=[{"x": 8.0, "datasets": served.datasets[8.0][:1]}],
@@ -120,7 +104,7 @@ def fopdt_run(served: Served) -> str:
     return run_at(served, job, 8.0)
 
 
-def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: Served) -> None:
+def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: ServedBatch) -> None:
     run = fopdt_run(served)
     (fault,) = refused(served.server.put("/v1/references/tube", json={"run": run}), 422, "invalid")
     assert fault["pointer"] == "/run"
@@ -130,7 +114,9 @@ def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: Served) 
     assert served.server.put("/v1/references/lag", json={"run": run}).status_code == 200
 
 
-def test_a_batch_is_not_begun_at_or_compared_with_a_run_of_another_model(served: Served) -> None:
+def test_a_batch_is_not_begun_at_or_compared_with_a_run_of_another_model(
+    served: ServedBatch,
+) -> None:
     run = fopdt_run(served)
     batch = [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]
     for warm in ("reference", "none"):
@@ -146,7 +132,7 @@ def test_a_batch_is_not_begun_at_or_compared_with_a_run_of_another_model(served:
 
 
 def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_model(
-    served: Served,
+    served: ServedBatch,
 ) -> None:
     document = served.server.get("/v1/models/tube").json()["document"]
     document = {**document, "name": "my-tube", "description": "mine"}
@@ -186,7 +172,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     assert said in " ".join(told.output.split())
 
 
-def test_one_recording_under_two_labels_is_refused(served: Served) -> None:
+def test_one_recording_under_two_labels_is_refused(served: ServedBatch) -> None:
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS]
     batch[0]["datasets"] = ["tube-16-1-0"]  # by its name what the last entry gives by its id
     answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
@@ -195,7 +181,7 @@ def test_one_recording_under_two_labels_is_refused(served: Served) -> None:
     assert "is the same recording as 'tube-16-1-0' at length_m = 2.0" in fault["detail"]
 
 
-def test_report_and_page_of_a_batch_name_every_dataset_and_no_best_rms(served: Served) -> None:
+def test_report_and_page_of_a_batch_name_every_dataset_and_no_best_rms(served: ServedBatch) -> None:
     report = served.server.get(f"/v1/jobs/{served.job}/report").text
     page = served.server.get(f"/jobs/{served.job}").text
     for x in LENGTHS:
@@ -206,7 +192,7 @@ def test_report_and_page_of_a_batch_name_every_dataset_and_no_best_rms(served: S
 
 
 def test_the_run_at_the_reference_is_offered_under_its_name_else_the_one_in_the_middle(
-    served: Served,
+    served: ServedBatch,
 ) -> None:
     for job, x, name in ((against(served)["job"], 8.0, "tube"), (served.job, 8.0, "")):
         page = served.server.get(f"/jobs/{job}").text
@@ -215,11 +201,11 @@ def test_the_run_at_the_reference_is_offered_under_its_name_else_the_one_in_the_
 
 
 def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    served: ServedBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
     reference = run_at(served, served.job, 2.0)
-    job = batch_of(served.server, served.parts, batch=batch, reference=reference)
+    job = identify_batch(served.server, batch=batch, reference=reference)
     monkeypatch.setattr("service.trends.trend.MAX_RUNS", 3)
     found = trend(served, job)
     (note,) = found["notes"]

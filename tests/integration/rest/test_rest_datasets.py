@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.formats.mcap import read_recording
-from tests.rest import CSV, recording, refused
+from tests.rest import CSV, recording, refused, store_csv
 
 SIMULATION: dict[str, Any] = {
     "name": "example",
@@ -294,9 +294,9 @@ def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
     server: TestClient,
 ) -> None:
     rows = ["t,P [kPa]", *(f"{0.1 * k:.1f},{int(k >= 10)}" for k in range(40))]
-    added = server.post("/v1/datasets?name=P", content="\n".join(rows).encode(), headers=CSV)
+    added = store_csv(server, "\n".join(rows).encode(), "P")
     held = server.post(
-        f"/v1/datasets/{added.json()['id']}:derive", json={"steps": [{"hold": {"P": "zero"}}]}
+        f"/v1/datasets/{added}:derive", json={"steps": [{"hold": {"P": "zero"}}]}
     ).json()["id"]
     model = {
         "name": "gauge",

@@ -20,7 +20,7 @@ from service.client.client import Client
 from tests.exporting import in_control, in_python
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, awaited, recording, refused, settings_of
+from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
 
 SMALL = {"population": 16, "generations": 20, "islands": 1}
 POLYNOMIAL = {
@@ -55,8 +55,8 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("exports")))
     with TestClient(app) as server:
-        data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
-        parts = server.app.state.parts  # type: ignore[attr-defined]
+        data = store_csv(server, recording())
+        parts = parts_of(server)
         body = {
             "model": "fopdt",
             "datasets": [data],

@@ -4,12 +4,11 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from service.api.dependencies import Parts
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
-from tests.rest import CSV, recording, refused
+from tests.rest import parts_of, recording, refused, store_csv
 
 
 def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
@@ -140,7 +139,7 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
         },
     )
     job = submit(own, answer.json()["id"])["id"]
-    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    parts = parts_of(own)
     with parts.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("test")
         assert claim is not None
@@ -169,7 +168,7 @@ def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None
         },
     )
     job = submit(own, answer.json()["id"])["id"]
-    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    parts = parts_of(own)
     parts.stopping.set()
     assert events(own, job) == []  # the stream would not end otherwise: the job is queued
 
@@ -187,9 +186,8 @@ def test_an_axis_over_an_object_gives_each_run_the_whole_object(
 
 
 def test_a_cancelled_run_keeps_the_best_it_had_found(own: TestClient) -> None:
-    stored = own.post("/v1/datasets", content=recording(), headers=CSV).json()
-    job = submit(own, stored["id"], parameters={"L": {"upper": 1.0}})["id"]
-    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    job = submit(own, store_csv(own, recording()), parameters={"L": {"upper": 1.0}})["id"]
+    parts = parts_of(own)
     (run,) = own.get(f"/v1/jobs/{job}/runs").json()["items"]
     names = own.get(f"/v1/runs/{run['id']}/history").json()["names"]
     assert names == ["K", "T", "L", "y0", "x(0)"]
@@ -242,9 +240,9 @@ def test_the_start_of_a_later_segment_is_a_parameter_wherever_the_run_is_shown(
         f"{0.1 * k:.1f},{repeat},{k // 7 % 2},{k % 7}" for repeat in (1, 2, 3) for k in range(80)
     ]
     text = "\n".join(["t,repeat,u,y", *rows])
-    stored = server.post("/v1/datasets?segments=repeat", content=text, headers=CSV).json()
+    stored = store_csv(server, text.encode(), segments=["repeat"])
     starts = {"L": {"upper": 2}, "x(0)[3]": {"fixed": 0.9}}
-    job = submit(server, stored["id"], parameters=starts)
+    job = submit(server, stored, parameters=starts)
     (run,) = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
     for path in (f"/jobs/{job['id']}", f"/v1/jobs/{job['id']}/report", f"/runs/{run['id']}"):
         assert server.get(path).status_code == 200, path

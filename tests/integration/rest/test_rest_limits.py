@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import recording, refused, settings_of, store_csv
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def limited(tmp_path: Path) -> Iterator[TestClient]:
     """An application that allows two open jobs and 12 open runs, with a recording in it."""
     settings = settings_of(tmp_path, max_open_jobs=2, max_open_runs=12)
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
-        client.post("/v1/datasets?name=steps", content=recording(), headers=CSV)
+        store_csv(client, recording())
         yield client
 
 

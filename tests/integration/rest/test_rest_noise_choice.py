@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from tests.identified import identified
-from tests.rest import CSV, refused, settings_of
+from tests.rest import parts_of, refused, settings_of, store_csv
 from tests.unit.sysid.identification.test_noise_model_choice import (
     LAG,
     STEP,
@@ -43,7 +43,7 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("noise")))
     with TestClient(app) as server:
-        parts = server.app.state.parts  # type: ignore[attr-defined]
+        parts = parts_of(server)
         names = []
         quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
         outputs = {"tank": disturbed(2), "lag": disturbed(2, 1.0 / TIME_CONSTANT), "quiet": quiet}
@@ -53,9 +53,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
                 "t,u,y",
                 *(f"{k * STEP:.6g},{u},{float(y)!r}" for k, (u, y) in enumerate(pairs)),
             ]
-            text = "\n".join(lines)
-            answer = server.post(f"/v1/datasets?name={name}", content=text.encode(), headers=CSV)
-            names.append(answer.json()["id"])
+            names.append(store_csv(server, "\n".join(lines).encode(), name))
         yield Served(server, parts, *names)
 
 

@@ -8,7 +8,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from tests.identified import identified
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import parts_of, recording, refused, settings_of, store_csv
 
 HALF = "\ud800"
 SMALL = {"population": 16, "generations": 5, "islands": 1}
@@ -95,9 +95,9 @@ def test_a_very_long_value_is_not_repeated_in_full(server: TestClient) -> None:
 
 def test_times_at_the_ends_of_what_doubles_can_hold_are_simulated_or_refused(tmp_path: Any) -> None:
     with TestClient(create_app(settings_of(tmp_path)), raise_server_exceptions=False) as server:
-        steps = server.post("/v1/datasets", content=recording(), headers=CSV).json()["id"]
+        steps = store_csv(server, recording())
         job = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
-        _, [run] = identified(server.app.state.parts, job)  # type: ignore[attr-defined]
+        _, [run] = identified(parts_of(server), job)
         for times, status in (([0, 1e-320], 200), ([1e-320, 2e-320], 200), ([-1e308, 0], 422)):
             series = {"kind": "series", "times": times, "values": [0, 1], "hold": "zero"}
             body = {"inputs": {"u": series}, "samples": 51, "sample_time": 0.1}

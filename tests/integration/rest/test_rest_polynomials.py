@@ -10,7 +10,7 @@ from service.jobs.stored_run import StoredRun
 from service.storage.tables import Job, Run
 from sysid.models.parse import keep_terms, parse_model
 from tests.polynomials import document, frols
-from tests.rest import CSV, recording, refused
+from tests.rest import recording, refused, store_csv
 
 
 def job(server: TestClient, dataset: str, terms: Any, **changes: Any) -> Any:
@@ -50,8 +50,7 @@ def test_a_rule_with_faults_is_refused_where_they_are(
 
 
 def test_more_candidates_than_samples_are_refused_when_the_job_is_sent(server: TestClient) -> None:
-    answer = server.post("/v1/datasets?name=few", content=recording(n=12), headers=CSV)
-    few = answer.json()["id"]
+    few = store_csv(server, recording(n=12), "few")
     (fault,) = refused(job(server, few, frols(3)), 422, "invalid")
     assert fault["pointer"] == "/model/terms"
     assert "14 candidates cannot be distinguished with 12 samples" in fault["detail"]

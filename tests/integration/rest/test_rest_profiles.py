@@ -13,7 +13,7 @@ from service.cli.runs import app as runs_app
 from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import parts_of, recording, refused, settings_of, store_csv
 
 SMALL = {"population": 20, "generations": 60, "islands": 1}
 MODEL: dict[str, Any] = {
@@ -38,7 +38,7 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("profiles")))
     with TestClient(app) as server:
-        data = server.post("/v1/datasets?name=s", content=recording(), headers=CSV).json()["id"]
+        data = store_csv(server, recording())
         body = {
             "model": MODEL,
             "datasets": [data],
@@ -48,7 +48,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "hold": {"u": "zero"},
             "validation": {"fraction": 0.2},
         }
-        parts = server.app.state.parts  # type: ignore[attr-defined]
+        parts = parts_of(server)
         _, runs = identified(parts, body)
         yield Served(server, runs[0])
 

@@ -2,92 +2,39 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import pytest
-from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.app import create_app
-from service.api.dependencies import Parts
 from service.cli import reidentify
 from service.cli import reidentify as reidentifying
 from service.cli.main import app as lagid
 from service.client.client import Client
+from tests.batches import (
+    BODY,
+    LENGTHS,
+    ServedBatch,
+    identify_batch,
+    make_recording,
+    serve_batch,
+    store_tube,
+)
 from tests.identified import carried_out
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, refused, settings_of
+from tests.rest import refused
 
-LENGTHS = (2.0, 4.0, 8.0, 16.0)
 HALF_A_SAMPLE = 0.005  # the steps are taken for ramps from one sample to the next
-QUICK = {"population": 20, "islands": 2, "stop": {"settled": 3}}
-BODY: dict[str, Any] = {
-    "model": "tube",
-    "label": "length_m",
-    "algorithm": QUICK,
-    "trend_parameters": ["L", "T"],
-}
-
-
-def recorded(length: float, seed: int = 1, longer: float = 0.0) -> bytes:
-    """A tube of that length: T = 0.06 s·m^½, dead time 20 ms + 10 ms/m; holds of 2 s."""
-    draw = np.random.default_rng(1000 * seed + round(10 * length))
-    t = np.arange(1000) * 0.01
-    u = np.repeat([1.0, 4.0, 2.0, 5.0, 3.0], 200)
-    lag = round((0.02 + 0.01 * length + longer) / 0.01)
-    delayed = np.concatenate([np.full(lag, u[0]), u[: u.size - lag]])
-    y, share = np.full(t.size, u[0]), np.exp(-0.01 / (0.06 * length**0.5))
-    for k in range(1, t.size):
-        y[k] = share * y[k - 1] + (1 - share) * delayed[k - 1]
-    y += 0.01 * draw.normal(size=t.size)
-    rows = ["t,u [bar],y [bar]"]
-    rows += [f"{a:.6g},{b:.6g},{c:.6g}" for a, b, c in zip(t, u, y, strict=True)]
-    return "\n".join(rows).encode()
-
-
-@dataclass(frozen=True)
-class Served:
-    server: TestClient
-    parts: Parts
-    datasets: dict[float, list[str]]
-    job: str
-
-
-def stored(server: TestClient, length: float, seed: int, longer: float = 0.0) -> str:
-    answer = server.post(
-        f"/v1/datasets?name=tube-{length:g}-{seed}-{longer:g}",
-        content=recorded(length, seed, longer),
-        headers=CSV,
-    )
-    assert answer.status_code in (200, 201), answer.text
-    return str(answer.json()["id"])
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Four lengths, two experiments each, and the job of the first batch, in reverse order."""
-    app = create_app(settings_of(tmp_path_factory.mktemp("batch")))
-    with TestClient(app, raise_server_exceptions=False) as server:
-        parts: Parts = app.state.parts
-        datasets = {x: [stored(server, x, seed) for seed in (1, 2)] for x in LENGTHS}
-        batch = [{"x": x, "datasets": datasets[x][:1]} for x in reversed(LENGTHS)]
-        job = batch_of(server, parts, batch=batch, predict=[10, 32])
-        yield Served(server, parts, datasets, job)
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedBatch]:
+    with serve_batch(tmp_path_factory.mktemp("batch")) as found:
+        yield found
 
 
-def batch_of(server: TestClient, parts: Parts, **fields: Any) -> str:
-    answer = server.post("/v1/recipes/reidentify", json={**BODY, **fields})
-    assert answer.status_code == 202, answer.text
-    job = str(answer.json()["id"])
-    assert answer.headers["location"] == f"/v1/jobs/{job}"
-    carried_out(parts, job)
-    return job
-
-
-def trend(served: Served, job: str) -> dict[str, Any]:
+def trend(served: ServedBatch, job: str) -> dict[str, Any]:
     answer = served.server.get(f"/v1/jobs/{job}/trend")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
@@ -101,12 +48,12 @@ def chosen(one: dict[str, Any]) -> dict[str, Any]:
     return next(dict(law) for law in one["laws"] if law["is_chosen"])
 
 
-def run_at(served: Served, job: str, x: float) -> str:
+def run_at(served: ServedBatch, job: str, x: float) -> str:
     place = next(one for one in trend(served, job)["labels"] if one["x"] == x)
     return str(place["runs"][0])
 
 
-def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: Served) -> None:
+def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: ServedBatch) -> None:
     found = trend(served, served.job)
     assert [one["x"] for one in found["labels"]] == list(LENGTHS)
     assert [one["name"] for one in found["quantities"]] == ["L", "T", "onset delay"]
@@ -123,14 +70,14 @@ def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: S
     assert found["missing"] == 0
 
 
-def test_runs_begin_at_their_neighbours(served: Served) -> None:
+def test_runs_begin_at_their_neighbours(served: ServedBatch) -> None:
     request = served.server.get(f"/v1/jobs/{served.job}").json()["request"]
     assert request["warm_start"] == "previous"
     labels = request["sweep"]["axes"][0]["labels"]
     assert [one["length_m"] for one in labels] == list(LENGTHS)
 
 
-def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: Served) -> None:
+def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: ServedBatch) -> None:
     found = trend(served, served.job)
     delay, constant = quantity(found, "L"), quantity(found, "T")
     assert chosen(delay)["law"] == "line"
@@ -145,12 +92,12 @@ def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: Served) -> 
     assert all(place["lower"] <= place["value"] <= place["upper"] for place in delay["band"])
 
 
-def test_experiments_of_one_length_are_fitted_together_or_pooled(served: Served) -> None:
+def test_experiments_of_one_length_are_fitted_together_or_pooled(served: ServedBatch) -> None:
     both = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
-    jointly = trend(served, batch_of(served.server, served.parts, batch=both))
+    jointly = trend(served, identify_batch(served.server, batch=both))
     assert quantity(jointly, "L")["between_runs"] is None
     apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served.datasets[x]]
-    pooled = trend(served, batch_of(served.server, served.parts, batch=apart))
+    pooled = trend(served, identify_batch(served.server, batch=apart))
     assert quantity(pooled, "L")["between_runs"] > 0
     for one, two in zip(
         quantity(jointly, "L")["points"], quantity(pooled, "L")["points"], strict=True
@@ -159,15 +106,14 @@ def test_experiments_of_one_length_are_fitted_together_or_pooled(served: Served)
         assert one["value"] == pytest.approx(two["value"], abs=4 * two["stderr"])
 
 
-def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: Served) -> None:
+def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: ServedBatch) -> None:
     reference = run_at(served, served.job, 8.0)
     accepted = served.server.put("/v1/references/tube", json={"run": reference, "by": "me"})
     assert accepted.status_code == 200, accepted.text
-    changed = stored(served.server, 8.0, 3, longer=0.05)
+    changed = store_tube(served.server, 8.0, 3, longer=0.05)
     batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS if x != 8.0]
-    job = batch_of(
+    job = identify_batch(
         served.server,
-        served.parts,
         reference="tube",
         batch=[*batch, {"x": 8.0, "datasets": [changed]}],
     )
@@ -191,7 +137,7 @@ def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: Ser
     assert request["warm_start"] == request["trend"]["reference"] == reference
 
 
-def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> None:
+def test_references_keep_their_history_and_say_what_is_wrong(served: ServedBatch) -> None:
     first, second = (run_at(served, served.job, x) for x in (2.0, 4.0))
     for run in (first, second, second):
         answer = served.server.put("/v1/references/kept", json={"run": run})
@@ -208,7 +154,7 @@ def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> 
     assert "did you mean 'kept'" in missing.json()["detail"]
 
 
-def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: Served) -> None:
+def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: ServedBatch) -> None:
     batch = [
         {"x": 3, "datasets": ["ds_c"]},
         {"x": 1, "datasets": ["ds_a"]},
@@ -230,15 +176,19 @@ def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: Served) -
     assert len(faults) == 3
 
 
-def test_a_warm_start_that_was_asked_for_is_told_also_for_a_batch_of_one(served: Served) -> None:
+def test_a_warm_start_that_was_asked_for_is_told_also_for_a_batch_of_one(
+    served: ServedBatch,
+) -> None:
     batch = [{"x": 2.0, "datasets": served.datasets[2.0][:1]}]
-    job = batch_of(served.server, served.parts, batch=batch, warm_start="previous")
+    job = identify_batch(served.server, batch=batch, warm_start="previous")
     told = served.server.get(f"/v1/jobs/{job}").json()
     assert (told["state"], told["request"]["warm_start"]) == ("succeeded", "previous")
 
 
 @pytest.mark.parametrize("name", ["run_mine", "reference:x", "a/b", "..", " blank", "n" * 101])
-def test_a_name_that_means_something_else_is_refused_at_the_path(served: Served, name: str) -> None:
+def test_a_name_that_means_something_else_is_refused_at_the_path(
+    served: ServedBatch, name: str
+) -> None:
     run = run_at(served, served.job, 2.0)
     path = f"/v1/references/{quote(name, safe='')}".replace("..", "%2E%2E")
     (fault,) = refused(served.server.put(path, json={"run": run}), 422, "invalid")
@@ -247,7 +197,7 @@ def test_a_name_that_means_something_else_is_refused_at_the_path(served: Served,
     assert "need" in fault["detail"]
 
 
-def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
+def test_references_are_paged_and_a_new_note_is_kept(served: ServedBatch) -> None:
     run = run_at(served, served.job, 2.0)
     for name in ("p1", "p2", "p3"):
         for note in ("first", "second"):
@@ -278,7 +228,7 @@ def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
     ],
 )
 def test_a_fault_is_told_at_its_place_in_the_recipe(
-    served: Served, fields: dict[str, Any], pointer: str, said: str
+    served: ServedBatch, fields: dict[str, Any], pointer: str, said: str
 ) -> None:
     batch = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
     answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch, **fields})
@@ -298,7 +248,7 @@ def test_a_fault_is_told_at_its_place_in_the_recipe(
     ],
 )
 def test_labels_missing_for_a_trend_are_told(
-    served: Served, labels: Any, pointer: str, said: str
+    served: ServedBatch, labels: Any, pointer: str, said: str
 ) -> None:
     values = [served.datasets[2.0][:1], served.datasets[4.0][:1]]
     axis = {"path": "/datasets", "values": values, "labels": labels}
@@ -313,23 +263,23 @@ def test_labels_missing_for_a_trend_are_told(
     assert said in fault["detail"]
 
 
-def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: Served) -> None:
+def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: ServedBatch) -> None:
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:2]]
-    found = trend(served, batch_of(served.server, served.parts, batch=batch))
+    found = trend(served, identify_batch(served.server, batch=batch))
     assert quantity(found, "L")["laws"] == []
     assert "needs 3" in quantity(found, "L")["reason"]
 
 
-def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: Served) -> None:
+def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: ServedBatch) -> None:
     sizes = (-1e99, 1.0, 2.0, 1e99)
     recordings = [served.datasets[x][:1] for x in LENGTHS]
     batch = [{"x": x, "datasets": one} for x, one in zip(sizes, recordings, strict=True)]
-    job = batch_of(served.server, served.parts, batch=batch)
+    job = identify_batch(served.server, batch=batch)
     assert [one["x"] for one in trend(served, job)["labels"]] == list(sizes)
     assert served.server.get(f"/jobs/{job}").status_code == 200
 
 
-def test_a_job_without_a_trend_says_so(served: Served) -> None:
+def test_a_job_without_a_trend_says_so(served: ServedBatch) -> None:
     body = {"model": "tube", "datasets": served.datasets[2.0]}
     job = served.server.post("/v1/jobs", json=body).json()["id"]
     refused(served.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
@@ -337,7 +287,7 @@ def test_a_job_without_a_trend_says_so(served: Served) -> None:
     assert figure["data"] == []
 
 
-def test_figure_page_and_report_show_the_trend(served: Served) -> None:
+def test_figure_page_and_report_show_the_trend(served: ServedBatch) -> None:
     figure = served.server.get(f"/v1/jobs/{served.job}/figures/trend").json()
     points = [one for one in figure["data"] if one["name"].endswith("estimate ± standard error")]
     assert [one["x"] for one in points] == [list(LENGTHS)] * 3
@@ -351,7 +301,7 @@ def test_figure_page_and_report_show_the_trend(served: Served) -> None:
 
 
 @pytest.fixture
-def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
+def command(served: ServedBatch, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
     """The command line against this server; jobs are carried out while it waits."""
 
     def connected(*_: object) -> Client:
@@ -368,7 +318,7 @@ def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
 
 
 def test_the_command_uploads_prints_and_accepts(
-    served: Served, command: CliRunner, tmp_path: Any
+    served: ServedBatch, command: CliRunner, tmp_path: Any
 ) -> None:
     words = [
         "reidentify",
@@ -387,7 +337,7 @@ def test_the_command_uploads_prints_and_accepts(
     ]
     for x in LENGTHS[:3]:
         file = tmp_path / f"{x:g}.csv"
-        file.write_bytes(recorded(x, 5))
+        file.write_bytes(make_recording(x, 5))
         words.append(f"{x:g}={file}")
     out = tmp_path / "trend.json"
     told = command.invoke(

@@ -23,7 +23,7 @@ from service.storage.objects import ObjectStore
 from sysid.data.records import Recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, awaited, refused, settings_of
+from tests.rest import awaited, parts_of, refused, settings_of, store_csv
 
 N, STEP, NOISE = 500, 0.05, 0.02
 SMALL = {"population": 20, "generations": 40, "islands": 1}
@@ -77,11 +77,8 @@ def recording(seed: int) -> bytes:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("residuals")))
     with TestClient(app) as server:
-        data = [
-            server.post(f"/v1/datasets?name=d{k}", content=recording(k), headers=CSV).json()["id"]
-            for k in (1, 2)
-        ]
-        parts = server.app.state.parts  # type: ignore[attr-defined]
+        data = [store_csv(server, recording(k), f"d{k}") for k in (1, 2)]
+        parts = parts_of(server)
         body = {
             "model": "fopdt",
             "datasets": data[:1],

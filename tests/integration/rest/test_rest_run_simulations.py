@@ -17,7 +17,7 @@ from service.client.client import Client
 from service.formats.mcap import read_recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import recording, refused, settings_of, store_csv
 
 SMALL = {"population": 16, "generations": 25, "islands": 1}
 ARM = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3}
@@ -68,7 +68,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "algorithm": SMALL,
             "parameters": {**NEAR, "theta(0)": {"fixed": 0}},
         }
-        steps = server.post("/v1/datasets", content=recording(), headers=CSV).json()["id"]
+        steps = store_csv(server, recording())
         lag = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
         _, [first] = identified(parts, arm)
         _, [second] = identified(parts, lag)

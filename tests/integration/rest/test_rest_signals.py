@@ -14,7 +14,7 @@ from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
-from tests.rest import CSV, recording, settings_of
+from tests.rest import recording, settings_of, store_csv
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 SIGMAS = [0.0, 0.1, 0.2]
@@ -31,10 +31,9 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("data")))
     with TestClient(app) as server:
-        stored = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()
         body = {
             "model": "fopdt",
-            "datasets": [stored["id"]],
+            "datasets": [store_csv(server, recording())],
             "algorithm": SMALL,
             "reuse": False,
             "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},

@@ -55,10 +55,11 @@ def test_upgrading_again_changes_nothing(database):
     assert migrate.read_current_revision(database) == before
 
 
-def test_a_missing_table_is_a_difference(database):
-    with database.engine.begin() as connection:
+def test_a_missing_table_is_a_difference(empty_database):
+    migrate.upgrade_database(empty_database)
+    with empty_database.engine.begin() as connection:
         connection.execute(text("DROP TABLE dispatchers"))
-    assert any("dispatchers" in one for one in migrate.list_differences(database))
+    assert any("dispatchers" in one for one in migrate.list_differences(empty_database))
 
 
 def test_a_migration_that_fails_leaves_the_database_as_it_was(empty_database):
@@ -100,7 +101,8 @@ def _start_service(url, start, results):
 
 @pytest.mark.slow
 def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_database):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])  # imported once for all
     start, results = context.Barrier(3), context.Queue()
     url = empty_database.engine.url.render_as_string(hide_password=False)
     processes = [

@@ -1,6 +1,7 @@
 """The measured records, as far as they are there: reading, trimming, pooling."""
 
 import csv
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,8 +16,12 @@ LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
 pytestmark = pytest.mark.data
 
 
+@cache
+def read_tubes() -> Recording:
+    return read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)[0]
+
+
 def tube(remainder: int) -> Recording:
-    recording, _ = read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)
     chosen = {
         "length_m": 8,
         "p_nom_bar": 5,
@@ -24,7 +29,7 @@ def tube(remainder: int) -> Recording:
         "repeat": {"modulus": 2, "remainder": remainder},
     }
     pooled = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
-    return derive_recording(recording, [{"select": chosen}, {"pool": pooled}])
+    return derive_recording(read_tubes(), [{"select": chosen}, {"pool": pooled}])
 
 
 @pytest.mark.parametrize("remainder", [0, 1])
@@ -37,7 +42,8 @@ def test_pooled_repeats_are_what_a_plain_loop_finds(remainder: int) -> None:
             and int(row["repeat"]) % 2 == remainder
             and 0 <= float(row["t"]) < 1
         ]
-    inlet, outlet = (tube(remainder).channel(name) for name in ("p_in_bar", "p_out_bar"))
+    pooled = tube(remainder)
+    inlet, outlet = pooled.channel("p_in_bar"), pooled.channel("p_out_bar")
     by_time = sorted(rows, key=lambda row: row[0])
     np.testing.assert_array_equal(outlet.times, [row[0] for row in by_time])
     np.testing.assert_array_equal(outlet.values, [row[2] for row in by_time])

@@ -57,7 +57,7 @@ def problem(record: Record, **fields: Any) -> Problem:
     [
         (3.0, 7.0),
         pytest.param(4.3, 12.6, marks=pytest.mark.slow),
-        pytest.param(1.5, 30.2, marks=pytest.mark.slow),
+        pytest.param(1.5, 30.2, marks=pytest.mark.night),
     ],
 )
 def test_all_coefficients_and_both_lags_of_the_catalogue_model_are_recovered(
@@ -125,15 +125,14 @@ def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
     assert best == pytest.approx(rest, abs=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["simple", "improved-paper"])
-def test_the_methods_of_the_paper_begin_without_starts(method: Any) -> None:
+def test_the_methods_of_the_paper_begin_without_starts() -> None:
     posed = problem(narx_record(3.0, 7.0))
-    algorithm = GeneticAlgorithm(method=method)
-    assert find_equation_error_starts(posed, algorithm).values == ()
-    islands = (IslandChange(method=method), IslandChange(method="improved"))
-    mixed = GeneticAlgorithm(islands=islands)
-    other = GeneticAlgorithm(islands=(IslandChange(method=method), IslandChange(method=method)))
+    for method in ("simple", "improved-paper"):
+        algorithm = GeneticAlgorithm(method=method)
+        assert find_equation_error_starts(posed, algorithm).values == ()
+    paper = IslandChange(method="improved-paper")
+    mixed = GeneticAlgorithm(islands=(paper, IslandChange(method="improved")))
+    other = GeneticAlgorithm(islands=(paper, paper))
     one, two = begin_run(posed, mixed, 1).islands
     alone = begin_run(posed, other, 1).islands
     assert np.array_equal(one.chromosomes, alone[0].chromosomes)
@@ -147,7 +146,9 @@ def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("evaluations", [100, 200, 1000])
+@pytest.mark.parametrize(
+    "evaluations", [100, *(pytest.param(one, marks=pytest.mark.night) for one in (200, 1000))]
+)
 def test_simulations_of_the_starts_count(evaluations: int) -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
     posed = problem(narx_record(3.0, 7.0, noise=0.05))

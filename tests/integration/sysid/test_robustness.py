@@ -1,7 +1,6 @@
 """The search reaches the optimum where dry friction and a wide lag box hide it."""
 
 import numpy as np
-import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.identification.conclude import conclude_run
@@ -9,12 +8,12 @@ from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from tests.profiles import draw_seeds
+from tests.rates import bound_count
 from tests.searching import COULOMB, noisy, record
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20_000, 20_005))
-def test_a_lag_box_of_five_seconds_with_dry_friction_ends_at_the_optimum(seed: int) -> None:
+def misses_the_optimum(seed: int) -> bool:
     measured = [record(noisy("coulomb-eq16", seed=seed))]
     problem = Problem.build(load_model("coulomb-eq16"), measured, parameters={"L": {"upper": 5.0}})
     truth = np.array([COULOMB[p.name] for p in problem.free_parameters])
@@ -24,5 +23,11 @@ def test_a_lag_box_of_five_seconds_with_dry_friction_ends_at_the_optimum(seed: i
     found = conclude_run(
         problem, algorithm, advance_run(problem, algorithm, begin_run(problem, algorithm, seed))
     )
-    assert found.rms <= optimum.rms * 1.0001
     assert found.evaluations <= 20_000
+    return found.rms > optimum.rms * 1.0001
+
+
+def test_a_lag_box_of_five_seconds_with_dry_friction_ends_at_the_optimum() -> None:
+    seeds = draw_seeds(gate=5, night=500)
+    missed = [seed for seed in seeds if misses_the_optimum(20_000 + seed)]
+    assert len(missed) <= bound_count(len(seeds), 0.001)[1], missed

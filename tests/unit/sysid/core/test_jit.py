@@ -185,23 +185,10 @@ def test_an_edit_makes_the_code_of_importing_modules_invalid_and_no_other(
     assert [count_hits(), count_hits()] == [0, 1]
 
 
-@pytest.mark.slow
-def test_another_fingerprint_compiles_anew(tmp_path: Path) -> None:
-    (tmp_path / "module.py").write_text(MODULE)
-
-    def run(fingerprint: str) -> str:
-        command = [sys.executable, "-c", PROGRAM, str(tmp_path), fingerprint]
-        return subprocess.run(
-            command,
-            check=True,
-            capture_output=True,
-            text=True,
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-        ).stdout.strip()
-
-    assert run("a") == "4.0 0"
-    assert run("a") == "4.0 1"
-    assert run("b") == "4.0 0"
+def test_another_fingerprint_compiles_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for fingerprint, found in (("a", 0), ("a", 1), ("b", 0)):
+        monkeypatch.setattr(jit, "get_sources_digest", lambda told=fingerprint: told)
+        assert hits() == found
 
 
 UPDATED = """
@@ -405,7 +392,7 @@ def test_processes_that_compile_at_once_leave_one_whole_file(tmp_path: Path) -> 
     def started() -> subprocess.Popen[str]:
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
-    racing = [started() for _ in range(3)]
+    racing = [started() for _ in range(2)]
     assert {one.communicate()[0].split()[0] for one in racing} == {"4.0"}
     assert len(os.listdir(tmp_path / "cache")) == 1
     assert started().communicate()[0].split() == ["4.0", "1"]
@@ -429,10 +416,10 @@ print([name for name in loaded if name in sys.modules])
 
 @pytest.mark.slow
 def test_what_was_compiled_before_is_loaded_without_the_compiler() -> None:
-    for _ in range(2):  # the first may have to compile
+    def load() -> str:
         ran = subprocess.run(
             [sys.executable, "-c", WARM], check=True, capture_output=True, text=True
         )
-        if ran.stdout.strip() == "[]":
-            break
-    assert ran.stdout.strip() == "[]"
+        return ran.stdout.strip()
+
+    assert load() == "[]" or load() == "[]"  # the first may have to compile

@@ -16,6 +16,7 @@ from sysid.residuals.restricted_likelihood import (
     _to_pole_and_share,
     fit_noise_colour,
 )
+from tests.profiles import draw_seeds
 
 PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
 
@@ -97,8 +98,8 @@ def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less()
     n, pole = 60, 0.7
     columns, times = regressors(n), np.arange(60.0)
     truth = np.diag(columns.T @ toeplitz(pole ** np.arange(n)) @ columns)
-    found, plain = [], []
-    for seed in range(150):
+    found, plain, seeds = [], [], draw_seeds(gate=50, night=600)
+    for seed in seeds:
         left = residuals(slow(n, pole, seed), columns)
         known = fit_noise_colour(space_residuals(times, left), columns)
         if known is not None:
@@ -106,7 +107,7 @@ def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less()
         sums = np.correlate(left, left, "full")[n - 1 :] / n
         window = np.where(np.arange(n) < 15, 1 - np.arange(n) / 15, 0.0)
         plain.append(np.diag(columns.T @ toeplitz(sums * window) @ columns) / truth)
-    assert len(found) > 130
+    assert len(found) > 0.87 * len(seeds)
     assert np.all(np.abs(np.median(found, axis=0) - 1.0) < 0.3)
     assert np.median(plain) < 0.6
 
@@ -128,7 +129,7 @@ def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
             fit_noise_colour(
                 space_residuals(times, residuals(slow(100, pole, s), columns)), columns
             )
-            for s in range(30)
+            for s in draw_seeds(gate=15, night=200)
         ]
         level = np.array([1.0, 0.0, 0.0])
         degrees.append(
@@ -139,11 +140,11 @@ def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
 
 def test_short_slow_noise_is_recognised_by_its_neighbours_and_white_noise_no_more_often() -> None:
     columns, times = regressors(100), np.arange(100.0)
-    counts = []
+    counts, seeds = [], draw_seeds(gate=200, night=2000)
     for pole in (0.5, 0.0):
-        every = [space_residuals(times, residuals(slow(100, pole, s), columns)) for s in range(200)]
+        every = [space_residuals(times, residuals(slow(100, pole, s), columns)) for s in seeds]
         by_all = sum(chdtrc(one.n_lags, compute_whiteness(one).statistic) < 1e-3 for one in every)
         counts.append((sum(_are_spaced_coloured(one, 1.0) for one in every), by_all))
     (slow_seen, slow_by_all), (white_seen, white_by_all) = counts
-    assert slow_seen > 160 > slow_by_all
-    assert white_seen <= white_by_all + 1
+    assert slow_seen > 0.8 * len(seeds) > slow_by_all
+    assert white_seen <= white_by_all + 0.005 * len(seeds)
