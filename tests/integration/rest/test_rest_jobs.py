@@ -256,10 +256,10 @@ def test_the_start_of_a_later_segment_is_a_parameter_wherever_the_run_is_shown(
 def test_the_wall_time_of_a_job_is_null_while_it_waits_and_stands_still_at_its_end(
     own: TestClient,
 ) -> None:
-    dataset = own.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+    dataset = store_csv(own, recording())
     job = submit(own, dataset)
     assert job["seconds"] is None
-    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    parts = parts_of(own)
     with parts.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("test")
         assert claim is not None
