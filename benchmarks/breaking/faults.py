@@ -23,8 +23,8 @@ from benchmarks.breaking.work import Stream
 from service.storage.tables import DispatcherHeartbeat
 
 LIMIT_SECONDS = 300.0
-PAUSED_SECONDS = 11.0
-"""A dispatcher is stopped so long: past its lease of 10 s; soon after, its supervisor kills it."""
+LATE_SECONDS = 1.0
+"""A dispatcher is stopped for its lease and so much more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,8 @@ def pause_dispatcher(bench: Bench) -> float:
                 LIMIT_SECONDS,
             )
             took = goes_on(bench, begun)
-            time.sleep(max(0.0, PAUSED_SECONDS - (time.monotonic() - begun)))
+            paused = bench.stand.lease_seconds + LATE_SECONDS
+            time.sleep(max(0.0, paused - (time.monotonic() - begun)))
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(first, signal.SIGCONT)
@@ -129,19 +130,15 @@ def pause_dispatcher(bench: Bench) -> float:
 
 def step_clock_back(bench: Bench) -> float:
     """Set the clock back by an hour more."""
-    clock = bench.clock
-    assert clock is not None
-    return recovery(bench, lambda: _write(clock, float(clock.read_text() or 0) - 3600.0))
+    return recovery(bench, lambda: set_clock_back(bench))
 
 
 def step_clock_and_kill(bench: Bench) -> float:
     """Set the clock back by an hour and kill the dispatcher, whose leases then end in an hour."""
-    clock = bench.clock
-    assert clock is not None
 
     def both() -> None:
         kill(bench.stand.family.dispatchers())
-        _write(clock, float(clock.read_text() or 0) - 3600.0)
+        set_clock_back(bench)
 
     return renewal(bench, both)
 
@@ -203,7 +200,10 @@ def kill(pids: list[int]) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def _write(clock: Path, step: float) -> None:
+def set_clock_back(bench: Bench) -> None:
+    """Set the clock of the service back by an hour."""
+    clock = bench.clock
+    assert clock is not None
     fresh = clock.with_suffix(".new")
-    fresh.write_text(str(step))
+    fresh.write_text(str(float(clock.read_text() or 0) - 3600.0))
     fresh.replace(clock)

@@ -37,6 +37,8 @@ class Stand:
     ----------
     database_url : str, optional
         PostgreSQL; by default SQLite in the folder.
+    lease_seconds : float
+        Length of the leases of its dispatchers.
     environment : mapping
         Further variables for all its processes.
     """
@@ -47,11 +49,13 @@ class Stand:
         *,
         database_url: str | None = None,
         cpus: int = 2,
+        lease_seconds: float = 10.0,
         environment: Mapping[str, str] | None = None,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.temporary = Path(tempfile.mkdtemp(prefix="lb-"))  # short: Ray puts sockets there
+        self.temporary = Path(tempfile.mkdtemp(prefix="lb"))  # short: Ray puts sockets there
         self.folder, self.port = folder, find_free_port()
+        self.lease_seconds = lease_seconds
         self.family = Family(mark := secrets.token_hex(8))
         address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
         self.environment = {
@@ -60,6 +64,7 @@ class Stand:
             "LAGID_DATA_DIR": str(folder),
             "LAGID_CPUS": str(cpus),
             "LAGID_PORT": str(self.port),
+            "LAGID_LEASE_SECONDS": str(lease_seconds),
             "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(self.temporary),
             "PYTHONPATH": os.pathsep.join([str(SHIM), str(Path.cwd())]),

@@ -10,7 +10,12 @@ from playwright.sync_api import Page, expect
 
 from service.client.embedded import run_embedded_service
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.ray,
+    pytest.mark.slow,
+    pytest.mark.timeout(600),
+]
 
 K, T, L, STEP = 2.0, 0.35, 0.12, 0.02
 LAST = "plot => Math.max(0, ...(plot.data ?? []).flatMap(trace => trace.x))"

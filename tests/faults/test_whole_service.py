@@ -9,11 +9,13 @@ import pytest
 from sqlalchemy import func, select
 
 from benchmarks.breaking import cancelling, faults
+from benchmarks.breaking.audit import is_over
 from benchmarks.breaking.faults import Bench
-from benchmarks.breaking.stand import Stand, standing_service
+from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import ALWAYS, Stream
 from service.core.states import JobState
-from service.storage.tables import Run
+from service.storage.tables import Checkpoint, Run
+from tests.standing import LIMIT_SECONDS, Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -21,10 +23,8 @@ FAULTS = [
     faults.kill_worker,
     faults.kill_raylet,
     faults.kill_gcs,
-    faults.kill_dispatcher,
     faults.kill_web,
     faults.step_clock_back,
-    faults.step_clock_and_kill,
     faults.pause_dispatcher,
     cancelling.cancel_running,
     cancelling.cancel_finishing,
@@ -32,27 +32,21 @@ FAULTS = [
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, Stream]]:
-    """A service at work on jobs whose undisturbed results are known."""
-    folder = tmp_path_factory.mktemp("broken")
-    clock = folder / "clock"
-    clock.write_text("0")
-    with standing_service(Stand(folder / "data", environment={"BREAK_CLOCK": str(clock)})) as stand:
-        stream = Stream(stand, folder)
-        stream.measure((*ALWAYS, "cancelled"))
-        stream.start()
-        yield Bench(stand, stream, clock=clock), stream
+def bench(standing: Service) -> Iterator[Bench]:
+    """The service at work on jobs whose undisturbed results are known."""
+    stream = Stream(standing.stand, standing.folder)
+    stream.measure((*ALWAYS, "cancelled"))
+    stream.start()
+    yield Bench(standing.stand, stream, clock=standing.clock)
+    stream.finish()
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
-def test_the_work_goes_on_after(
-    fault: Callable[[Bench], float], bench: tuple[Bench, Stream]
-) -> None:
-    stand = bench[0].stand
-    before = count_successes(stand)
-    fault(bench[0])
-    assert count_successes(stand) > before
-    assert stand.answers() == 200
+def test_the_work_goes_on_after(fault: Callable[[Bench], float], bench: Bench) -> None:
+    before = count_successes(bench.stand)
+    fault(bench)
+    assert count_successes(bench.stand) > before
+    assert bench.stand.answers() == 200
 
 
 def count_successes(stand: Stand) -> int:
@@ -62,14 +56,36 @@ def count_successes(stand: Stand) -> int:
         return session.scalar(ended) or 0
 
 
-def test_nothing_is_lost_doubled_stuck_different_or_left(bench: tuple[Bench, Stream]) -> None:
-    (broken, stream), stand = bench, bench[0].stand
+def test_jobs_of_a_killed_dispatcher_go_on_or_are_cancelled_though_the_clock_was_set_back(
+    bench: Bench, service: Service
+) -> None:
+    going, cancelled = service.submit_endless(), service.submit_endless()
+    service.wait_for_checkpoint(going)
+
+    def break_service() -> None:
+        faults.kill(service.stand.family.dispatchers())
+        faults.set_clock_back(bench)
+        assert service.read_job(going).state is JobState.RUNNING
+        service.stand.client.cancel(cancelled)
+
+    faults.renewal(bench, break_service)
+    ended = service.wait_for_end(cancelled)
+    assert (ended.state, ended.attempt) == (JobState.CANCELLED, 1)
+    before = service.read_job(going).evaluations
+    until(lambda: service.read_job(going).evaluations > before, "more", LIMIT_SECONDS)
+    job = service.read_job(going)
+    assert (job.state, job.attempt, job.lost_leases) == (JobState.RUNNING, 2, 1)
+    service.stand.client.cancel(going)
+    assert service.wait_for_end(going).state is JobState.CANCELLED
+
+
+def test_nothing_is_lost_doubled_stuck_or_different(bench: Bench) -> None:
+    stand, stream = bench.stand, bench.stream
     assert stream.finish() == 0
     assert stream.counts["runs"] > 0
     assert (stream.counts["lost"], stream.counts["doubled"], stream.different) == (0, 0, [])
-    assert stream.counts["given up"] == 0
-    states = {job["state"] for job in stand.client.jobs()}
-    assert states == {"succeeded"}
-    assert broken.stream.jobs() == []
-    stand.stop()
-    assert stand.leftovers() == []
+    assert (stream.counts["given up"], stream.counts["unplotted"]) == (0, 0)
+    assert stream.jobs() == []
+    with stand.database.read_session() as session:
+        kept = session.scalars(select(Checkpoint.job_id)).all()
+    assert [job for job in kept if is_over(stand, job)] == []

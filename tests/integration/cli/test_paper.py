@@ -1,23 +1,22 @@
-"""`lagid paper` over a service of its own: the report's numbers are those of the jobs."""
+"""`lagid paper` over a service: the report's numbers are those of the jobs."""
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from service.client.client import Client
-from service.client.embedded import run_embedded_service
 from tests.commands import check_refusal, run_lagid
+from tests.standing import Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 
 
-@pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with run_embedded_service(tmp_path_factory.mktemp("paper"), cpus=2) as address:
-        yield address
+@pytest.fixture
+def url(service: Service) -> str:
+    """The address of the standing service."""
+    return service.stand.url
 
 
 def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from sysid.core.settings import GeneticAlgorithm, Migration, Stop
 from sysid.identification.conclude import conclude_run
 from sysid.identification.run import advance_run, begin_run
 from sysid.islands.evolve import make_stopping_rule
-from sysid.islands.stopping import count_restarts, has_process_ended
+from sysid.islands.stopping import count_restarts, has_search_ended
 from sysid.models.catalogue.load import load_model
 from sysid.search.state import SEARCH_RECORD, SearchArray
 from sysid.simulation.problem import Problem
@@ -37,7 +37,7 @@ def ends(
         champion_discontinuities=int(jumps),
     )
     rule = make_stopping_rule(ALONE, is_warm=is_warm)
-    return bool(has_process_ended(rule, 2, np.array([0.5]), search, False))
+    return bool(has_search_ended(rule, 2, np.array([0.5]), search, False))
 
 
 @pytest.mark.parametrize(
@@ -97,17 +97,17 @@ def test_the_best_champion_decides_whether_the_target_is_reached() -> None:
     rule = make_stopping_rule(GeneticAlgorithm(stop=Stop(rms=0.1)), is_warm=False)
     for best, reached in ((0.1, True), (0.11, False)):
         rms = np.array([0.5, best, 0.7])
-        assert has_process_ended(rule, 2, rms, make_search(3), False) is reached
+        assert has_search_ended(rule, 2, rms, make_search(3), False) is reached
 
 
 def test_a_run_ends_when_all_islands_rest_and_not_before() -> None:
     rule = make_stopping_rule(ALONE, is_warm=False)
     for generations, rest in (([3, 10], False), ([10, 10], False), ([3, 4], True)):
         search = make_search(2, generation=generations)  # type: ignore[arg-type]
-        assert has_process_ended(rule, 10, np.ones(2), search, False) is rest
+        assert has_search_ended(rule, 10, np.ones(2), search, False) is rest
     for border, last in ((rule.most_generations - 1, False), (rule.most_generations, True)):
         search = make_search(2, generation=border)
-        assert has_process_ended(rule, border, np.ones(2), search, False) is last
+        assert has_search_ended(rule, border, np.ones(2), search, False) is last
 
 
 def test_a_false_optimum_that_a_third_of_the_searches_find_does_not_end_a_run() -> None:
