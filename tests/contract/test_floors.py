@@ -11,6 +11,7 @@ from service.dispatch import cramer_rao
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.sweeps.cramer_rao import StoredBounds
+from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.dispatching import LIMIT_SECONDS, Place
 from workers.inline_executor import InlineExecutor
 
@@ -52,7 +53,7 @@ def notes(job):
 
 def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
-    made = cramer_rao.cramer_rao_bound
+    made = cramer_rao_bound
 
     def held(problem, theta):
         begun.set()

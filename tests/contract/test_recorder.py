@@ -11,7 +11,7 @@ from service.dispatch.checkpoints import unpack_state
 from service.dispatch.fitted_signals import SignalsLocation
 from service.dispatch.recorder import (
     CHECKPOINT_SECONDS,
-    MOST_REASONS,
+    MAX_REASONS,
     PROGRESS_SECONDS,
     RESULTS_SECONDS,
     RunRecorder,
@@ -301,7 +301,7 @@ def test_a_job_fails_when_all_its_runs_failed_and_tells_some_reasons(
     end_all(desk, n_failed)
     job = desk.place.job(desk.job)
     assert (job.state, job.error, job.n_failed) == (state, error, n_failed)
-    assert len(desk.messages()) == min(n_failed, MOST_REASONS)
+    assert len(desk.messages()) == min(n_failed, MAX_REASONS)
 
 
 def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Desk) -> None:

@@ -11,7 +11,7 @@ from sqlalchemy import func, select
 
 from benchmarks import paper_example
 from benchmarks.breaking.audit import is_over
-from benchmarks.breaking.disks import filled, small_disk
+from benchmarks.breaking.disks import fill_folders, small_disk
 from benchmarks.breaking.stand import Stand, standing_service, until
 from service.core.states import JobState
 from service.storage.tables import Checkpoint, Job, Run
@@ -60,7 +60,7 @@ def check_service(disk: Path, tmp_path: Path) -> None:
         job = stand.client.submit({**body, "algorithm": LONG})["id"]
         until(lambda: count_checkpoints(stand) > 0, "a checkpoint", LIMIT_SECONDS)
         (dispatcher,) = stand.family.dispatchers()
-        with filled(disk):
+        with fill_folders(disk):
             upload = httpx.post(
                 f"{stand.url}/v1/datasets",
                 content=record.read_bytes() + b" ",

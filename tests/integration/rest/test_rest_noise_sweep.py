@@ -137,10 +137,11 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
 def test_recordings_are_read_while_no_session_is_open(
     server: TestClient, dataset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parts, seen = parts_of(server), []
+    seen = []
+    pool: Any = parts_of(server).database.engine.pool
 
     def noted(*given: Any) -> Any:
-        seen.append(parts.database.engine.pool.checkedout())
+        seen.append(pool.checkedout())
         return load_recording(*given)
 
     monkeypatch.setattr("service.sweeps.output_spread.load_recording", noted)

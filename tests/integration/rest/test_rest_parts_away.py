@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
-from tests.rest import CSV, recording, refused
+from tests.rest import CSV, parts_of, recording, refused
 
 
 def away(*_args: Any, **_options: Any) -> Any:
@@ -19,7 +19,7 @@ def away(*_args: Any, **_options: Any) -> Any:
 def test_a_database_that_is_away_is_a_part_that_is_down(
     server: TestClient, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
-    monkeypatch.setattr(server.app.state.parts.database, "read_session", away)
+    monkeypatch.setattr(parts_of(server).database, "read_session", away)
     answer = server.get(path)
     assert refused(answer, 503, "unavailable") == []
     assert answer.headers["retry-after"] == "1"
@@ -46,5 +46,5 @@ def test_a_mistake_in_a_statement_is_not_told_as_a_database_that_is_away(
         except sqlite3.OperationalError as error:
             raise OperationalError("SELECT", {}, error) from error
 
-    monkeypatch.setattr(server.app.state.parts.database, "read_session", mistaken)
+    monkeypatch.setattr(parts_of(server).database, "read_session", mistaken)
     refused(server.get("/v1/jobs"), 500, "internal")

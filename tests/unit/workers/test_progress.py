@@ -7,7 +7,7 @@ import pytest
 from tests.runs import RECORDS, Notebook, spec
 from tests.unit.workers.test_scheduler import ScriptedExecutor, jobs
 from workers import scheduler
-from workers.packing import PACK_SECONDS
+from workers.packing import PACK_SECONDS, PACKS_PER_CPU
 from workers.protocol import AdvanceRun, ItemResult, RunConclusion, RunProgress, WorkItem
 from workers.scheduler import Scheduler
 from workers.tasks import process_pack
@@ -93,7 +93,7 @@ def test_a_job_whose_results_are_not_told_yet_gets_no_more_packs(concluded: RunC
         most = max(most, len(notebook.begun) - len(told(notebook)) - flying)
     # One core's pack above what it may leave, and those in flight when it came to that.
     room = scheduler.MAX_UNREPORTED_SECONDS * executor.slots / 0.05
-    in_flight = scheduler.PACKS_PER_CPU * executor.slots * PACK_SECONDS / 0.05
+    in_flight = PACKS_PER_CPU * executor.slots * PACK_SECONDS / 0.05
     assert room < most <= room + in_flight + 1
 
 

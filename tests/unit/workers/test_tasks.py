@@ -15,6 +15,7 @@ from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.identification import conclude, generalised_least_squares
 from sysid.identification.identify import identify
+from sysid.identification.run import begin_run
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
@@ -27,7 +28,7 @@ FAULTY_SEED = 13
 
 
 def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = workers.tasks.begin_run
+    sound = begin_run
 
     def begin(problem, algorithm, seed, warm):
         if seed == FAULTY_SEED:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -99,7 +100,7 @@ def test_rays_folder_is_not_one_that_somebody_else_has_made(
 
 def test_the_paths_of_rays_sockets_are_short_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     base = "/" + "b" * (ray_folders._MAX_BASE_LENGTH - 1)
-    monkeypatch.setattr(ray_folders.tempfile, "gettempdir", lambda: base)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: base)
     most = 2**22 - 1  # the highest number of a process
     session = f"session_2026-01-01_00-00-00_000000_{most}/sockets/plasma_store"
     path = ray_folders.get_ray_folder(most) / session

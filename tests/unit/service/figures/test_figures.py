@@ -1,6 +1,7 @@
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def experiment(samples: int, since: float | None = None) -> ExperimentTraces:
     return ExperimentTraces("record 1", outputs, (signal(samples, "u"),), since)
 
 
-def drawn(figure: plotly.Figure, name: str) -> dict[str, object]:
+def drawn(figure: plotly.Figure, name: str) -> dict[str, Any]:
     return next(trace for trace in figure["data"] if trace.get("name") == name)
 
 

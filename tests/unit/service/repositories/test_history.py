@@ -62,7 +62,10 @@ def test_points_of_several_runs_are_parts_of_their_own():
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3), numbers), max_size=20))
 def test_migrants_come_out_as_they_went_in(lines):
-    log = [MigrantPoint("run_a", i, *one, 1, rms) for i, (*one, rms) in enumerate(lines)]
+    log = [
+        MigrantPoint("run_a", i, epoch, source, 1, rms)
+        for i, (epoch, source, rms) in enumerate(lines)
+    ]
     rows = [*pack_migrants(log[3:]), *pack_migrants(log[:7])]
     assert unpack_migrants("run_a", [row["migrants"] for row in rows]) == log
 

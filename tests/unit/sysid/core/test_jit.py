@@ -378,7 +378,7 @@ def test_files_that_another_process_removes_meanwhile_are_no_fault(
             os.unlink(one.path)
         return found
 
-    monkeypatch.setattr(code_cache.os, "scandir", outrun)
+    monkeypatch.setattr(os, "scandir", outrun)
     code_cache.store_code(f"{2:064x}", b"code", "loop")
     assert not caplog.records
 
