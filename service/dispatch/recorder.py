@@ -342,7 +342,6 @@ class RunRecorder:
             [self._generation, *(outcome.generations for outcome in self._taken)]
         )
         self._best = min([self._best, *_list_rms(self._taken)])
-        self._taken = []
         if tell:
             self._told, self._news = now, False
             for live in self._live.values():
