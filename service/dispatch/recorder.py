@@ -352,7 +352,6 @@ class RunRecorder:
             [self._generation, *(outcome.generations for outcome in self._reused_outcomes)]
         )
         self._best = min([self._best, *_list_rms(self._reused_outcomes)])
-        self._reused_outcomes = []
         if with_progress:
             self._progress_written_at, self._has_new_progress = now, False
             for live in self._live.values():
