@@ -227,11 +227,11 @@ def statements_behind(place, n_failed):
 
 
 def test_chains_of_an_earlier_attempt_go_on_each_from_its_own_runs(place):
-    place.submit(**chained(LABELLED, SEEDS))
+    place.submit(**chained(LABELLED, {"path": "/seed", "values": [1, 2, 3, 4]}))
     with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
         rows = RunWriter(session, claim.lease).list_pending()
-        assert [row.cell["/seed"] for row in rows[:5]] == [*SEEDS["values"], SEEDS["values"][0]]
+        assert [row.cell["/seed"] for row in rows[:5]] == [1, 2, 3, 4, 1]
         for row in rows[:6]:  # of four chains the first two have two runs behind them
             row.state = JobState.SUCCEEDED
             row.estimates = {"T": {"value": 10.0 + row.number, "stderr": None}}
