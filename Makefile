@@ -4,9 +4,10 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 FAST   := not slow and not ray and not postgres and not browser and not data
+TEST_PROCESSES ?= 3
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test check check-code check-unit check-laws format bench bench-full mutants night real-data clean
+.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format bench bench-full mutants night real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -40,14 +41,22 @@ serve: $(READY)
 
 # Bytecode is kept for the next run, also where the shell says otherwise: modules of tests are
 # compiled twice, and every process that a test starts compiles its modules again.
-test check: export PYTHONDONTWRITEBYTECODE =
+test suite check: export PYTHONDONTWRITEBYTECODE =
 
-test: $(READY) check-code
-	$(BIN)/python -m pytest
+# Compiled code first: processes side by side would each compile it. Then linters beside tests, as
+# tests of services wait more than they compute; these are one group and begin.
+test: $(READY) warm
+	@$(MAKE) --no-print-directory -j2 check-code suite
+
+suite: $(READY)
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --no-loadscope-reorder
+
+warm: $(READY)
+	@$(BIN)/python -c 'from sysid.identification.warmup import compile_search; compile_search()'
 
 # Side by side, or as -j says; each with its output in one piece where this make can do that. The
 # part that failed may have ended before the others, which go on.
-check: $(READY)
+check: $(READY) warm
 	@$(MAKE) --no-print-directory --keep-going $(if $(filter -j% --jobserver%,$(MAKEFLAGS)),,-j3) \
 	  $(if $(filter output-sync,$(.FEATURES)),--output-sync) check-code check-unit check-laws || \
 	  { echo "make check failed: see '***' above; each part: make check-code, check-unit, check-laws"; exit 1; }
