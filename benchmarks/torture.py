@@ -109,7 +109,7 @@ class Torture:
         with standing_service(self.stand):
             self._separate_checkpoints()
             stream = Stream(self.stand, self.folder)
-            took = stream.measure([*stream.kinds])
+            took = stream.measure(*stream.kinds)
             print(f"{self.name}: undisturbed", {kind: round(s, 1) for kind, s in took.items()})
             meter = Meter(self.stand.family)
             meter.start()

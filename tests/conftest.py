@@ -26,6 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Start the guard: at the end nothing is left, also if pytest is killed."""
     guard = config.stash[GUARD] = Guard()
     guard.mark_environment()
+    config.addinivalue_line("markers", "xdist_group(name): tests that one process runs in turn")
     config.add_cleanup(guard.end_session)
 
 
@@ -35,14 +36,13 @@ def _guarded_folder(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPa
 
 
 @pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Let the tests of services begin; for xdist they are one group, all others one by module."""
     items.sort(key=lambda item: not needs_service(item))
-    if config.pluginmanager.hasplugin("xdist"):
-        for item in items:
-            module = item.nodeid.partition("::")[0]
-            group = "services" if needs_service(item) else module
-            item.add_marker(pytest.mark.xdist_group(group))
+    for item in items:
+        module = item.nodeid.partition("::")[0]
+        group = "services" if needs_service(item) else module
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 def needs_service(item: pytest.Item) -> bool:

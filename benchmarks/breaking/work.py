@@ -22,11 +22,11 @@ STUCK_SECONDS = 180.0
 DEADLY, GREEDY = (9013, 9014), (9077,)
 """Seeds of runs that kill their workers, and of one that takes all memory (`shim`)."""
 ALWAYS = ("sweep", "diverging", "long")
-"""Kinds of jobs of which one is open at any time; the others are what a fault submits."""
+"""Kinds of jobs of which usually one is open; the others are what a fault submits."""
 
 
-def bodies(dataset: str) -> dict[str, dict[str, Any]]:
-    """The jobs, by kind.
+def bodies(dataset: str, size: float = 1.0) -> dict[str, dict[str, Any]]:
+    """The jobs, by kind; `size` scales their work.
 
     A sweep; one of which half the cells diverge; a long run on islands; a sweep with runs that
     kill their workers or take all memory; one to be cancelled, which ends with making floors.
@@ -36,15 +36,17 @@ def bodies(dataset: str) -> dict[str, dict[str, Any]]:
         "path": "/parameters/b",
         "values": [{"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8}],
     }
-    endless = {"generations": 40_000, "islands": 4, "stop": {"settled": None}}
+    generations = round(40_000 * size)
+    long = {"generations": generations, "islands": 4, "stop": {"settled": None}}
+    seeds, few = _seeds(range(1, 1 + round(200 * size))), _seeds(range(1, 1 + round(30 * size)))
     bad = [*range(1, 6), *DEADLY, *range(6, 11), *GREEDY, *range(11, 16)]
     sigmas = {"path": "/noise/sigma", "values": [0.01, 0.02]}
     return {
-        "sweep": {**common, "sweep": {"axes": [_seeds(range(1, 201))]}},
-        "diverging": {**common, "sweep": {"axes": [unstable, _seeds(range(1, 31))]}},
-        "long": {**common, "seed": 7, "algorithm": endless},
+        "sweep": {**common, "sweep": {"axes": [seeds]}},
+        "diverging": {**common, "sweep": {"axes": [unstable, few]}},
+        "long": {**common, "seed": 7, "algorithm": long},
         "bad": {**common, "sweep": {"axes": [_seeds(bad)]}},
-        "cancelled": {**common, "sweep": {"axes": [sigmas, _seeds(range(1, 31))]}},
+        "cancelled": {**common, "sweep": {"axes": [sigmas, few]}},
     }
 
 
@@ -61,12 +63,27 @@ class _Open:
 
 
 class Stream:
-    """Keeps one job of each usual kind open, from a thread of its own, and watches others."""
+    """Keeps one job of some kinds open, from a thread of its own, and watches others.
 
-    def __init__(self, stand: Stand, folder: Path) -> None:
+    Parameters
+    ----------
+    kinds : collection of str
+        What is always open.
+    size : float
+        Scale of the work of the jobs.
+    """
+
+    def __init__(
+        self,
+        stand: Stand,
+        folder: Path,
+        *,
+        kinds: Collection[str] = ALWAYS,
+        size: float = 1.0,
+    ) -> None:
         path = paper_example.write_csv(folder / "record.csv", seed=1)
         dataset = stand.client.add_dataset(path, name="example 1")["id"]
-        self._stand, self._bodies = stand, bodies(dataset)
+        self._stand, self._bodies, self._always = stand, bodies(dataset, size), tuple(kinds)
         self.undisturbed: dict[str, Finding] = {}
         self._open: dict[str, _Open] = {}
         self.counts: Counter[str] = Counter()
@@ -82,10 +99,10 @@ class Stream:
         """All that can be submitted."""
         return tuple(self._bodies)
 
-    def measure(self, kinds: Collection[str] = ALWAYS) -> dict[str, float]:
-        """Carry out these kinds once, undisturbed; gives their seconds."""
+    def measure(self, *others: str) -> dict[str, float]:
+        """Carry out what is always open and these kinds once, undisturbed; gives their seconds."""
         took = {}
-        for kind in kinds:
+        for kind in dict.fromkeys((*self._always, *others)):
             job = self._stand.client.submit(self._bodies[kind])["id"]
             took[kind] = until(lambda job=job: is_over(self._stand, job), f"{kind} ended", 300.0)
             self.undisturbed[kind] = audit(self._stand, job)
@@ -159,7 +176,7 @@ class Stream:
             with self._lock:
                 self._try(lambda job=job: self._compare(job))
         there = {open_job.kind for open_job in self._open.values()}
-        for kind in ALWAYS if submits else ():
+        for kind in self._always if submits else ():
             if kind not in there:
                 self._try(lambda kind=kind: self.watch(self.submit(kind), kind))
 
