@@ -49,7 +49,7 @@ test: $(READY) warm
 	@$(MAKE) --no-print-directory -j2 check-code suite
 
 suite: $(READY)
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadscope --no-loadscope-reorder
 
 warm: $(READY)
 	@$(BIN)/python -c 'from sysid.identification.warmup import compile_search; compile_search()'

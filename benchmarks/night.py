@@ -47,7 +47,7 @@ def list_parts(seed: int) -> dict[str, Part]:
         target = FOLDER / f"{name.rpartition('.')[2]}.json"
         return Part(["-m", name, "--json", str(target), *options])
 
-    pytest = ["-m", "pytest", "-q", "-n", "2", "--dist", "loadgroup"]
+    pytest = ["-m", "pytest", "-q", "-n", "2", "--dist", "loadscope"]
     settings = {"LAGID_TEST_PROFILE": "night", "LAGID_NIGHT_SEED": str(seed)}
     return {
         "tests": Part([*pytest], {**settings, "LAGID_REQUIRE_DATA": "1"}),

@@ -7,9 +7,14 @@ import os
 # thread as well.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from functools import cache
+
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 from tests.guard import Guard
+from tests.repository import ROOT
 
 pytest_plugins = [
     "tests.profiles",
@@ -19,6 +24,7 @@ pytest_plugins = [
     "tests.standing",
 ]
 
+SERVICES = "services"
 GUARD = pytest.StashKey[Guard]()
 
 
@@ -26,7 +32,6 @@ def pytest_configure(config: pytest.Config) -> None:
     """Start the guard: at the end nothing is left, also if pytest is killed."""
     guard = config.stash[GUARD] = Guard()
     guard.mark_environment()
-    config.addinivalue_line("markers", "xdist_group(name): tests that one process runs in turn")
     config.add_cleanup(guard.end_session)
 
 
@@ -35,16 +40,29 @@ def _guarded_folder(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPa
     pytestconfig.stash[GUARD].remove_when_killed(tmp_path_factory.getbasetemp())
 
 
-@pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let the tests of services begin; for xdist they are one group, all others one by module."""
-    items.sort(key=lambda item: not needs_service(item))
-    for item in items:
-        module = item.nodeid.partition("::")[0]
-        group = "services" if needs_service(item) else module
-        item.add_marker(pytest.mark.xdist_group(group))
+    """Let the tests of services begin: they wait more than they compute."""
+    items.sort(key=lambda item: find_group(item.nodeid) != SERVICES)
 
 
-def needs_service(item: pytest.Item) -> bool:
-    """Whether a test uses Ray: all of these share one Ray, one service, and wait for each other."""
-    return item.get_closest_marker("ray") is not None
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling:
+    """Give a process all tests of services, which share one Ray, and any other module whole."""
+    return GroupScheduling(config, log)
+
+
+class GroupScheduling(LoadScopeScheduling):
+    """Scheduling by group. Marks do not reach it, so a module shows its group by its text."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return find_group(nodeid)
+
+
+@cache
+def _needs_services(module: str) -> bool:
+    return "pytest.mark.ray" in (ROOT / module).read_text(encoding="utf-8")
+
+
+def find_group(nodeid: str) -> str:
+    """Find the group of a test: its module, or that of all modules that use Ray."""
+    module = nodeid.partition("::")[0]
+    return SERVICES if _needs_services(module) else module
