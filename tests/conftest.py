@@ -42,7 +42,7 @@ def _guarded_folder(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPa
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Let the tests of services begin: they wait more than they compute."""
-    items.sort(key=lambda item: find_group(item.nodeid) != SERVICES)
+    items.sort(key=lambda item: item.get_closest_marker("ray") is None)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling:
@@ -59,7 +59,8 @@ class GroupScheduling(LoadScopeScheduling):
 
 @cache
 def _needs_services(module: str) -> bool:
-    return "pytest.mark.ray" in (ROOT / module).read_text(encoding="utf-8")
+    path = ROOT / module
+    return path.is_file() and "pytest.mark.ray" in path.read_text(encoding="utf-8")
 
 
 def find_group(nodeid: str) -> str:

@@ -426,7 +426,7 @@ def test_a_fault_of_a_batch_is_told_at_its_entry_also_where_entries_are_not_in_o
 ) -> None:
     names = [["gone"], [dataset], ["lost"]]
     batch = [{"x": x, "datasets": name} for x, name in zip((8, 2, 4), names, strict=True)]
-    body = {"model": "fopdt", "label": "n", "look_at": ["L"], "batch": batch}
+    body = {"model": "fopdt", "label": "n", "trend_parameters": ["L"], "batch": batch}
     faults = refused(server.post("/v1/recipes/reidentify", json=body), 422, "invalid")
     assert {(one["pointer"], one["detail"].split("'")[1]) for one in faults} == {
         ("/batch/0/datasets/0", "gone"),

@@ -187,7 +187,7 @@ def test_an_edit_makes_the_code_of_importing_modules_invalid_and_no_other(
 
 def test_another_fingerprint_compiles_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for fingerprint, found in (("a", 0), ("a", 1), ("b", 0)):
-        monkeypatch.setattr(jit, "get_sources_digest", lambda told=fingerprint: told)
+        monkeypatch.setattr(jit, "get_sources_digest", lambda module, told=fingerprint: told)
         assert hits() == found
 
 

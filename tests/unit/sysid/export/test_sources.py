@@ -72,4 +72,4 @@ def test_a_delay_has_one_variable_however_often_it_is_read() -> None:
     source = sysid.export_model(
         parse_model(document), {"c": 0.2, "L": 0.5, "b": 5, "a": 1}, "python"
     )
-    assert len(re.findall(r"^ +lag_\d+ = ", source, re.M)) == 1
+    assert len(re.findall(r"^ +delay_\d+ = ", source, re.M)) == 1
