@@ -1,6 +1,7 @@
 """Laws of the code and of the operators on it, and of the derived random numbers."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,6 +96,26 @@ def test_a_scale_free_step_stays_in_the_box_and_moves(
 ) -> None:
     assert 0 <= mutate_by_step(place, size, sign, bits) <= 1
     assert 0 <= reflect_at_bounds(2 * place - 0.5) <= 1
+
+
+def test_a_scale_free_step_has_every_size_of_the_code_in_both_directions() -> None:
+    bits, words = 10, range(0, 2**32, 2**20)
+    for sign in (0, 1):
+        sizes = np.array([mutate_by_step(0.5, word, sign, bits) - 0.5 for word in words])
+        assert np.all(sizes * (1 if sign else -1) > 0)
+        # 0.5 is half the range away from its bounds, where a longer step turns round
+        steps = np.abs([mutate_by_step(0.0 if sign else 1.0, word, sign, bits) for word in words])
+        logs = np.log2(steps if sign else 1.0 - steps)
+        assert np.histogram(logs, bins=bits, range=(-bits, 0))[0].tolist() == pytest.approx(
+            [4096 / bits] * bits, abs=2
+        )
+
+
+@pytest.mark.parametrize(
+    ("place", "reflected"), [(-0.25, 0.25), (0.0, 0.0), (0.3, 0.3), (1.0, 1.0), (1.25, 0.75)]
+)
+def test_what_passes_a_bound_comes_back_as_far(place: float, reflected: float) -> None:
+    assert reflect_at_bounds(place) == reflected
 
 
 @given(WORD, WORD, st.integers(2, 1000))

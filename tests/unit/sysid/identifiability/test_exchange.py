@@ -461,3 +461,17 @@ def test_a_profile_stays_with_one_copy(name: str) -> None:
     assert high is not None
     assert low < TRUTH[name] < high
     assert high - low < 0.8
+
+
+@pytest.mark.parametrize("name", ["T1", "T2"])
+def test_a_profile_that_reaches_a_double_pole_does_not_go_on_in_the_other_copy(name: str) -> None:
+    near = TRUTH | {"T1": 1.1, "T2": 0.9}
+    clean = simulate(model("in series"), [U], near, times=TIMES).channels[0]
+    noise = np.random.default_rng(4).normal(0, 0.2, TIMES.size)
+    data = Record((U,), (Channel("z", TIMES, clean.values + noise, "m"),))
+    posed = Problem.build(model("in series"), [data])
+    found = compute_profile(posed, np.array(list(near.values())), name, points=7)
+    own = found.others[:, 2]
+    larger, smaller = (found.values, own) if name == "T1" else (own, found.values)
+    assert np.all(larger >= smaller - 1e-5)
+    assert np.min(larger - smaller) < 1e-3

@@ -100,6 +100,21 @@ def test_the_correlation_time_is_found_with_and_without_missing_samples() -> Non
         assert np.mean(found) == pytest.approx(true, rel=0.15)
 
 
+def test_a_long_record_says_more_of_the_correlation_time_than_a_short_one() -> None:
+    short = (np.arange(N) < 60).astype(np.float64)
+    records = record(1), record(2, 0.5, short)
+    together = posed(*records)
+    found = fit_generalised_least_squares(together, squares(together), np.zeros((2, 2)), 1)
+    alone = []
+    for one in records:
+        problem = posed(one)
+        end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
+        alone.append(end.correlation_times["y"])
+    assert alone[0] > 5 * alone[1] > 0
+    expected = (N * alone[0] + 60 * alone[1]) / (N + 60)
+    assert found.correlation_times["y"] == pytest.approx(expected, rel=0.2)
+
+
 @pytest.mark.parametrize("unit", [2.0**40, 2.0**-40])
 def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float) -> None:
     data = record(4)

@@ -126,6 +126,8 @@ def test_after_an_exchange_fitness_is_that_of_the_chromosome(
         known = np.isfinite(island.fitness)
         waiting += np.count_nonzero(~known)
         assert np.array_equal(island.fitness[known], problem.evaluate_fitness(theta)[known])
+        assert island.champion_rms == island.fitness[0]  # what waits is no champion yet
+        assert island.history[-1].parameters == tuple(theta[0])
         arrived = evolve(problem.evaluator, plan, island, 0)
         theta = from_unit(problem.evaluator, decode(arrived.chromosomes, plan.bits))
         assert np.array_equal(arrived.fitness, problem.evaluate_fitness(theta))

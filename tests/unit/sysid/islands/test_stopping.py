@@ -1,17 +1,21 @@
 """When searches agree enough for a run to end."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Migration, Stop
 from sysid.identification.conclude import conclude_run
 from sysid.identification.run import advance_run, begin_run
+from sysid.islands.archipelago import create_islands
 from sysid.islands.evolve import make_stopping_rule
+from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts, has_search_ended
 from sysid.models.catalogue.load import load_model
-from sysid.search.state import SEARCH_RECORD, SearchArray
+from sysid.search.state import SEARCH_RECORD, Improvement, SearchArray
 from sysid.simulation.problem import Problem
-from tests.searching import DUFFING, noisy, record
+from tests.searching import DUFFING, example, noisy, record
 
 ALONE = GeneticAlgorithm(islands=1, migration=Migration(every=1))
 
@@ -108,6 +112,30 @@ def test_a_run_ends_when_all_islands_rest_and_not_before() -> None:
     for border, last in ((rule.most_generations - 1, False), (rule.most_generations, True)):
         search = make_search(2, generation=border)
         assert has_search_ended(rule, border, np.ones(2), search, False) is last
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_old"),
+    [
+        ([(3, 1.0), (9, 0.5)], [(4, 0.8)], False),  # the others' early ones are worse
+        ([(3, 0.5)], [(9, 0.4)], False),
+        ([(3, 0.5)], [(9, 0.5 * (1 - 5e-5))], True),  # the same optimum again
+        ([(3, 0.5)], [(4, 0.8), (9, 0.6)], True),
+    ],
+)
+def test_a_run_is_unimproved_since_its_best_optimum_was_first_found(
+    first: list[tuple[int, float]], second: list[tuple[int, float]], is_old: bool
+) -> None:
+    islands = create_islands(example(n=80), GeneticAlgorithm(islands=2), 1)
+    found = [
+        tuple(Improvement(generation, 0, rms, "genetic", ()) for generation, rms in history)
+        for history in (first, second)
+    ]
+    state = RunState(
+        1,
+        tuple(replace(one, history=history) for one, history in zip(islands, found, strict=True)),
+    )
+    assert state.is_unimproved_since(5) is is_old
 
 
 def test_a_false_optimum_that_a_third_of_the_searches_find_does_not_end_a_run() -> None:

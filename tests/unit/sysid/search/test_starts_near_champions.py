@@ -3,10 +3,13 @@
 from functools import cache
 from itertools import pairwise
 
+import pytest
+
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.search.basin_hopping import COUNTED_HOP, SINGLE_PARAMETER_HOP, UNCOUNTED_HOP
 from sysid.search.island import Island, evolve
+from sysid.search.state import SAME_OPTIMUM
 from tests.searching import bits, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
@@ -86,3 +89,28 @@ def test_it_can_be_cut_anywhere_there_too() -> None:
     at_once = evolve(problem.evaluator, plan, create_islands(problem, ALONE, 3)[0], GENERATIONS)
     assert at_once.search["fitness_discontinuities"] > 0
     assert bits(at_once) == bits(generations("coulomb-eq16")[-1])
+
+
+@pytest.mark.parametrize("model", ["duffing-eq16", "coulomb-eq16"])
+def test_a_local_search_that_leads_to_the_champion_confirms_it_and_another_does_not(
+    model: str,
+) -> None:
+    ended = []
+    for before, after in pairwise(generations(model)):
+        old, new = before.search, after.search
+        ends = new["in_sequence_search"] == 0 and (
+            old["in_sequence_search"] == 1 or new["local_searches"] > old["local_searches"]
+        )
+        if not ends or after.champion_rms < before.champion_rms:
+            continue
+        is_random, is_hop = bool(new["from_random_start"]), bool(new["hop_kind"] & COUNTED_HOP)
+        relative = new["reached_fitness"] / after.champion_rms - 1.0
+        led_back = bool(abs(relative) <= SAME_OPTIMUM)
+        ended.append((is_random, is_hop, led_back))
+        counted = ("random_starts", "confirmed_starts", "hop_count", "returned_hops")
+        grown = [int(new[name] - old[name]) for name in counted]
+        assert grown == [is_random, is_random and led_back, is_hop, is_hop and led_back]
+        is_of_champion = new["replaced_fitness"] == after.champion_rms
+        assert new["champion_converged"] == (old["champion_converged"] or is_of_champion)
+    other = (False, True, False) if model == "coulomb-eq16" else (True, False, True)
+    assert {(True, False, False), (False, True, True), other} <= set(ended)

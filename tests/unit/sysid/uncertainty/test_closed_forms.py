@@ -46,7 +46,8 @@ def pose(y: FloatArray | None = None, **options: Any) -> Problem:
 
 
 def fit(problem: Problem) -> FloatArray:
-    candidate = refine_candidates(problem, [np.ones(len(problem.free_parameters))])[0]
+    start = np.clip(1.0, problem.evaluator.lower, problem.evaluator.upper)
+    candidate = refine_candidates(problem, [start])[0]
     assert candidate is not None
     return candidate.theta
 
@@ -216,3 +217,33 @@ def test_a_budget_that_just_suffices_gives_standard_errors() -> None:
     assert list_stderr(just) == list_stderr(whole)
     assert None not in list_stderr(just)
     assert list_stderr(analyse_estimate(example(), theta, whole.evaluations - 1)) == [None] * 4
+
+
+def test_a_parameter_that_the_data_pull_beyond_its_bound_is_not_unidentifiable() -> None:
+    """Its standard error is as large as its range, because the bound leaves large residuals."""
+    times = 0.1 * np.arange(80)
+    u = np.sin(1.3 * np.arange(80))
+    noise = np.random.default_rng(1).normal(0.0, 3.0, 80)
+    record = Record((Channel("u", times, u),), (Channel("y", times, 2.0 * u + 4.0 + noise),))
+    bounds = {"b": {"lower": 0.0, "upper": 0.1}}
+    problem = Problem.build(parse_model(LINE), [record], parameters=bounds)
+    b = analyse_estimate(problem, fit(problem)).estimates[1]
+    assert b.value == pytest.approx(0.1)
+    assert b.stderr is not None
+    assert b.stderr > 0.1
+    assert b.status == "at bound"
+
+
+def test_the_possible_gain_is_what_a_step_inside_the_bounds_removes() -> None:
+    free = pose()
+    least = float(free.evaluate_fitness(fit(free)[None])[0])
+    for theta in (np.array([2.3, 1.0]), np.array([1.5, 2.0])):
+        share = 1.0 - (least / float(free.evaluate_fitness(theta[None])[0])) ** 2
+        assert analyse_estimate(free, theta).possible_gain == pytest.approx(share, rel=1e-4)
+    for bounds in ({"upper": 0.2}, {"lower": 2.5}):
+        held = pose(parameters={"b": bounds})
+        assert analyse_estimate(held, fit(held)).possible_gain < 1e-9
+        inside = np.array([fit(held)[0], 0.1 if "upper" in bounds else 2.6])
+        assert analyse_estimate(held, inside).possible_gain > 0.01
+    at_lower = pose(parameters={"b": {"lower": 0.5}})
+    assert analyse_estimate(at_lower, np.array([2.0, 0.5])).possible_gain > 0.1
