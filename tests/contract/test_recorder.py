@@ -23,12 +23,11 @@ from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import LeaseLost, ObjectStoreFailed
 from service.storage.tables import Checkpoint
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
-from sysid.uncertainty.estimates import Criteria
 from tests.dispatching import Place
+from tests.results import conclude
 from workers.protocol import RunConclusion, RunFailure
 
 N_RUNS, GENERATIONS = 4, 100
@@ -130,35 +129,12 @@ def searched(
 
 def concluded(state: RunState) -> RunConclusion:
     """The result of a run that ended in this state."""
-    return RunConclusion(
-        Identification(
-            estimates=(),
-            rms=state.rms,
-            fit_percent=90.0,
-            rms_validation=None,
-            fit_percent_validation=None,
-            valid=True,
-            evaluations=state.evaluations,
-            generations=state.generation,
-            islands=(),
-            history=state.history,
-            migrations=state.migrations,
-            uncertainty=None,
-            simulated=(),
-            simulated_validation=(),
-            agreement=(),
-            agreement_validation=(),
-            warnings=(),
-            selection=(),
-            criteria=Criteria(0.0, None, 0.0, 100, 1),
-            residual_tests=None,
-            onset_delays=(),
-            correlation_times={},
-            holds={},
-            sample_time=0.1,
-            known_before=(),
-            known_before_validation=(),
-        )
+    return conclude(
+        state.rms,
+        evaluations=state.evaluations,
+        generations=state.generation,
+        history=state.history,
+        migrations=state.migrations,
     )
 
 
@@ -323,6 +299,22 @@ def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Des
     assert desk.place.job(desk.job).evaluations == 300
 
 
+def test_a_checkpoint_counts_until_its_run_goes_on_or_ends(desk: Desk) -> None:
+    fails, ends, waits, _ = desk.runs
+    for run in (fails, ends, waits):
+        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_all()
+    desk.recorder = desk.claim_again()
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).evaluations == 300
+    desk.recorder.record_failure(fails, RunFailure("as told"))
+    desk.recorder.record_result(ends, concluded(searched(30, 310, 0.5)), 3.0)
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).evaluations == 100 + 310 + 100
+    assert [run.evaluations for run in desk.place.runs(desk.job)[:2]] == [100, 310]
+    assert desk.checkpoints() == {waits: 100}
+
+
 def computed_before(desk: Desk, evaluations: int) -> str:
     """A run of another job that has succeeded with so many evaluations."""
     job = desk.place.submit()
@@ -404,6 +396,9 @@ def test_signals_that_the_store_refuses_cost_no_result_and_are_told(desk: Desk) 
 def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: Desk) -> None:
     with desk.place.database.write_session() as session:
         LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({"d1"})))
+    desk.recorder.record_start(desk.runs[0])
+    with pytest.raises(LeaseLost):
+        desk.recorder.write_due()
     desk.recorder.record_result(desk.runs[0], concluded(searched(5, 50, 0.5)), 0.2)
     desk.recorder.record_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
     for write in (desk.recorder.write_due, desk.recorder.cancel_job, desk.recorder.finish_job):

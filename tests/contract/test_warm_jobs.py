@@ -226,6 +226,25 @@ def statements_behind(place, n_failed):
     return len(seen)
 
 
+def test_chains_of_an_earlier_attempt_go_on_each_from_its_own_runs(place):
+    place.submit(**chained(LABELLED, SEEDS))
+    with place.database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("d1")
+        rows = RunWriter(session, claim.lease).list_pending()
+        assert [row.cell["/seed"] for row in rows[:5]] == [*SEEDS["values"], SEEDS["values"][0]]
+        for row in rows[:6]:  # of four chains the first two have two runs behind them
+            row.state = JobState.SUCCEEDED
+            row.estimates = {"T": {"value": 10.0 + row.number, "stderr": None}}
+        rows[4].state = JobState.FAILED
+    source = JobRuns(place.database, claim, place.store)
+    starts = [one.spec.warm_starts for one in takewhile(is_run, source.iterate_runs())]
+    assert starts == [({"T": 10.0 + number},) for number in (2, 3, 0, 5)]
+
+
+def is_run(entry):
+    return not isinstance(entry, RunNotReady)
+
+
 def test_what_a_chain_goes_on_from_is_found_as_quickly_behind_many_failures(place):
     assert statements_behind(place, 60) == statements_behind(place, 3)
 

@@ -207,6 +207,36 @@ def test_an_own_model_cannot_take_the_name_of_a_built_in_one(server: TestClient)
     assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
 
 
+@pytest.mark.parametrize("name", ["a/b", "a@1", ".", "a?b", "a b"])
+def test_a_name_under_which_a_model_could_not_be_read_is_refused(
+    server: TestClient, name: str
+) -> None:
+    answer = server.post("/v1/models", json={**MODEL, "name": name})
+    assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
+
+
+@pytest.mark.parametrize("name", ["a", "A.b_c-1", "9" * 64])
+def test_a_model_can_be_read_under_every_name_that_it_may_have(
+    server: TestClient, name: str
+) -> None:
+    assert server.post("/v1/models", json={**MODEL, "name": name}).status_code == 201
+    assert server.get(f"/v1/models/{name}").json()["name"] == name
+
+
+def test_pages_of_models_have_each_once_and_the_built_in_ones_first(own: TestClient) -> None:
+    for name in ("first", "second", "third"):
+        assert own.post("/v1/models", json={**MODEL, "name": name}).status_code == 201
+    whole = [one["name"] for one in own.get("/v1/models").json()["items"]]
+    names, cursor = [], ""
+    while cursor is not None:
+        page = own.get(f"/v1/models?limit=2{cursor and f'&cursor={cursor}'}").json()
+        names += [one["name"] for one in page["items"]]
+        cursor = page["next"]
+    assert names == whole
+    assert names[-3:] == ["third", "second", "first"]
+    assert len(names) == len(set(names))
+
+
 UPLOADS: list[tuple[bytes, str]] = [
     (b"t,u,y\n0,1,2\n0.1,volt,3\n", "row 3, column 'u'"),
     (b"", "empty"),
@@ -380,7 +410,7 @@ def test_a_population_that_no_memory_holds_is_refused(server: TestClient, datase
         ("limit=0", "?limit"),
         ("limit=x", "?limit"),
         ("state=done", "?state"),
-        ("limit=5000", "?limit"),
+        ("limit=1001", "?limit"),
         ("state=queued&state=foo", "?state"),
     ],
 )
@@ -389,6 +419,19 @@ def test_a_query_value_that_cannot_be_used_is_named(
 ) -> None:
     faults = refused(server.get(f"/v1/jobs?{query}"), 422, "invalid")
     assert faults[0]["pointer"] == pointer
+
+
+def test_a_fault_of_a_batch_is_told_at_its_entry_also_where_entries_are_not_in_order(
+    server: TestClient, dataset: str
+) -> None:
+    names = [["gone"], [dataset], ["lost"]]
+    batch = [{"x": x, "datasets": name} for x, name in zip((8, 2, 4), names, strict=True)]
+    body = {"model": "fopdt", "label": "n", "look_at": ["L"], "batch": batch}
+    faults = refused(server.post("/v1/recipes/reidentify", json=body), 422, "invalid")
+    assert {(one["pointer"], one["detail"].split("'")[1]) for one in faults} == {
+        ("/batch/0/datasets/0", "gone"),
+        ("/batch/2/datasets/0", "lost"),
+    }
 
 
 def test_a_text_that_no_database_can_keep_is_refused(server: TestClient, dataset: str) -> None:

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import pytest
 from starlette.testclient import TestClient
 
+from service.api import events as event_routes
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
@@ -149,10 +151,27 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     assert events(own, job) == ["state", "state", "log", "state", "end"]
     assert events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
     assert events(own, job, **{"Last-Event-ID": "5"}) == []
-    refused(own.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "x"}), 422, "invalid")
+    for text in ("x", "-1", "9" * 19, "9" * 30):
+        answer = own.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": text})
+        refused(answer, 422, "invalid")
     read = own.get(f"/v1/jobs/{job}").json()
     assert (read["state"], read["error"]) == ("failed", "no candidate was finite")
     refused(own.post(f"/v1/jobs/{job}:cancel"), 409, "conflict")
+
+
+def test_a_stream_is_whole_whatever_is_read_at_once(
+    server: TestClient, dataset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = submit(server, dataset)["id"]
+    for _ in range(3):
+        assert server.post(f"/v1/jobs/{job}:cancel").status_code == 200
+        assert server.post(f"/v1/jobs/{job}:resume").status_code == 202
+    server.post(f"/v1/jobs/{job}:cancel")
+    whole = events(server, job)
+    assert whole == ["state", *["state", "end", "state"] * 3, "state", "end"]
+    for most in (1, 2, len(whole)):
+        monkeypatch.setattr(event_routes, "MAX_BATCH_EVENTS", most)
+        assert events(server, job) == whole
 
 
 def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None:

@@ -78,6 +78,18 @@ def test_the_draws_of_a_replicate_do_not_depend_on_the_grid(server: TestClient) 
     assert not small & draws(seed=2)
 
 
+def test_a_run_without_noise_is_added_only_where_the_truth_is_unknown(
+    server: TestClient, dataset: str
+) -> None:
+    def sigmas(**changes: Any) -> list[float]:
+        job = submitted(server, sigma=[0.1], replicates=1, methods=["simple"], **changes)["id"]
+        runs = server.get(f"/v1/jobs/{job}/runs").json()["items"]
+        return [run["cell"]["/noise/sigma"] for run in runs]
+
+    assert sigmas() == [0.1]
+    assert sigmas(truth=None, datasets=[dataset]) == [0.0, 0.1]
+
+
 def test_the_same_key_gives_the_same_job(server: TestClient) -> None:
     key = {"Idempotency-Key": "noise once"}
     first, again = (server.post(URL, json=BODY, headers=key).json() for _ in range(2))

@@ -8,6 +8,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
+from service.api import content
 from tests.rest import CSV, parts_of, recording, refused
 
 
@@ -35,6 +36,18 @@ def test_a_full_disk_is_a_part_that_is_down(
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
     assert "a disk of the server is full" in answer.json()["detail"]
+
+
+def test_another_fault_of_a_disk_is_not_told_as_a_full_one_and_its_words_stay_inside(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_args: Any, **_options: Any) -> None:
+        raise OSError(errno.EIO, "Input/output error", "/somewhere/inside")
+
+    monkeypatch.setattr(content, "_save_body", broken)
+    answer = server.post("/v1/datasets", content=recording(), headers=CSV)
+    refused(answer, 500, "internal")
+    assert "inside" not in answer.text
 
 
 def test_a_mistake_in_a_statement_is_not_told_as_a_database_that_is_away(

@@ -186,6 +186,19 @@ def test_a_higher_priority_goes_first_and_the_lower_one_still_gets_its_sixteenth
     assert part == pytest.approx(1 / WAIT_TURN_INTERVAL, rel=0.25)
 
 
+def test_the_sixteenth_pack_goes_to_each_of_those_that_wait_in_turn() -> None:
+    theatre = Theatre(2)
+    for name in ("low", "lower"):
+        theatre.add(name, SWEEP, 0.1, priority=0)
+    theatre.play(3 * HEADSTART_SECONDS)
+    theatre.add("high", SWEEP, 0.1, priority=5)
+    before = {name: theatre.had(name) for name in ("low", "lower")}
+    theatre.play(160.0)
+    for name, seconds in before.items():
+        part = (theatre.had(name) - seconds) / 320.0
+        assert part == pytest.approx(0.5 / LONGEST_WAIT_INTERVAL, rel=0.25)
+
+
 def test_a_priority_beats_even_a_new_identification_of_a_lower_one() -> None:
     theatre = Theatre(1)
     theatre.add("high", 100, 0.1, priority=1)

@@ -2,7 +2,9 @@
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 
@@ -79,20 +81,23 @@ def test_an_error_is_raised_where_the_document_is_taken_and_ends_nothing_else(
 
 
 def test_what_is_dropped_or_stopped_is_made_no_further(jobs: BackgroundJobs[str]) -> None:
-    steps_taken: list[int] = []
+    steps_taken: Counter[str] = Counter()
 
-    def endless() -> Iterator[Document | None]:
+    def endless(key: str) -> Iterator[Document | None]:
         while True:
-            steps_taken.append(1)
+            steps_taken[key] += 1
             yield None
 
-    jobs.start_job("a", endless)
-    until(lambda: len(steps_taken) > 3)
+    jobs.start_job("a", partial(endless, "a"))
+    until(lambda: steps_taken["a"] > 3)
     jobs.cancel_job("a")
+    before = steps_taken["a"]
     jobs.cancel_job("a")
     assert jobs.pending_keys == ()
-    jobs.start_job("b", endless)
+    jobs.start_job("b", partial(endless, "b"))
+    until(lambda: steps_taken["b"] > 3)
+    assert steps_taken["a"] <= before + 1  # the step that was begun
     jobs.stop()
-    count = len(steps_taken)
+    count = steps_taken.total()
     time.sleep(0.02)
-    assert len(steps_taken) == count
+    assert steps_taken.total() == count

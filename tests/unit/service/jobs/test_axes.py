@@ -50,6 +50,28 @@ def test_the_number_of_cells_is_the_product_of_the_axes(lengths: list[int]) -> N
     assert len({tuple(cell.values.items()) for cell in found}) == len(found)
 
 
+def test_crossed_axes_give_the_last_one_fastest_and_zipped_ones_step_together() -> None:
+    body = job(
+        {"path": "/noise/sigma", "values": [0.1, 0.2], "labels": [{"s": 1}, {"s": 2}]},
+        {"path": "/seed", "range": [3, 9, 3], "zip": "z"},
+        {"path": "/skip", "values": [1, 2]},
+        {"path": "/noise/seed", "values": [7, 8], "zip": "z"},
+    )
+    found = cells(body)
+    assert count_runs(body, group_axes(body.sweep.axes)) == len(found) == 8
+    paths = ("/noise/sigma", "/seed", "/noise/seed", "/skip")
+    assert [tuple(cell.values[path] for path in paths) for cell in found[:5]] == [
+        (0.1, 3, 7, 1),
+        (0.1, 3, 7, 2),
+        (0.1, 6, 8, 1),
+        (0.1, 6, 8, 2),
+        (0.2, 3, 7, 1),
+    ]
+    assert [cell.labels["s"] for cell in found] == [1] * 4 + [2] * 4
+    groups = build_axis_groups(body.sweep.axes, group_axes(body.sweep.axes))
+    assert list(iterate_cells(groups, 5)) == found[5:]
+
+
 def test_a_cell_changes_its_fields_and_nothing_else() -> None:
     whole = job().to_normal_form()
     changed = build_run_body(

@@ -1,0 +1,92 @@
+"""Trends of stored results: each label is compared with its own reference, at a common limit."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.trends.schemas import TrendOut
+from service.trends.trend import compute_trend
+from sysid.trends.trend import compute_drift_limit
+from tests.dispatching import Place
+from tests.results import claim_job, conclude, write_results
+
+LENGTHS = (1.0, 2.0, 4.0)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Iterator[Place]:
+    made = Place(tmp_path / "data")
+    yield made
+    made.database.dispose()
+
+
+def batch(
+    place: Place, change: dict[float, float] | None = None, reference: str | None = None
+) -> tuple[str, dict[float, str]]:
+    """A batch over three lengths, and its run at each; `change` is added to L and T at a length."""
+    labels = [{"x": x} for x in LENGTHS]
+    job = place.submit(
+        sweep={"axes": [{"path": "/seed", "values": [1, 2, 3], "labels": labels}]},
+        trend={"x": "x", "parameters": ["L", "T"], "reference": reference},
+    )
+    lease = claim_job(place.database, job)
+    runs = {float(run.labels["x"]): run.id for run in place.runs(job)}
+    results = {}
+    for x, run in runs.items():
+        more = (change or {}).get(x, 0.0)
+        results[run] = conclude(
+            L=(0.1 * x + more, 0.01), T=(1.0 + more, 0.02), K=(1.0, None), y0=(0.0, None)
+        )
+    write_results(place.database, lease, results)
+    return job, runs
+
+
+def trend(place: Place, job: str) -> TrendOut:
+    with place.database.read_session() as session:
+        return compute_trend(session, job)
+
+
+def drifts(found: TrendOut, kind: str) -> dict[tuple[str, float], Any]:
+    return {
+        (quantity.name, point.x): drift
+        for quantity in found.quantities
+        for point in quantity.points
+        for drift in point.drifts
+        if drift.kind == kind
+    }
+
+
+def test_the_reference_run_is_compared_at_its_own_label_only(place: Place) -> None:
+    _, runs = batch(place)
+    job, _ = batch(place, {2.0: 0.03}, runs[2.0])
+    told = drifts(trend(place, job), "run")
+    assert set(told) == {("L", 2.0), ("T", 2.0)}
+    assert told["L", 2.0].expected == pytest.approx(0.2)
+    assert told["L", 2.0].z == pytest.approx(0.03 / (0.01 * 2**0.5))
+
+
+def test_the_limit_of_drift_counts_all_labels_and_quantities(place: Place) -> None:
+    _, runs = batch(place)
+    job, _ = batch(place, {4.0: 1.0}, runs[2.0])
+    found = trend(place, job)
+    limit = compute_drift_limit(None, 2 * len(LENGTHS))
+    assert {drift.limit for drift in drifts(found, "run").values()} == {limit}
+    along = drifts(found, "trend")
+    assert len(along) == 2 * len(LENGTHS)
+    assert {key for key, drift in along.items() if drift.drifted} == {("L", 4.0), ("T", 4.0)}
+    assert along["L", 4.0].expected == pytest.approx(0.4)
+
+
+def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
+    labels = [{"x": x} for x in LENGTHS]
+    job = place.submit(
+        sweep={"axes": [{"path": "/seed", "values": [1, 2, 3], "labels": labels}]},
+        trend={"x": "x", "parameters": ["L"]},
+    )
+    lease = claim_job(place.database, job)
+    first = place.runs(job)[0].id
+    write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
+    found = trend(place, job)
+    assert (found.missing, [label.x for label in found.places]) == (2, [1.0])

@@ -1,0 +1,77 @@
+"""Results of runs that no search has found: for tests of what becomes of results."""
+
+from service.dispatch.results import to_run_outcome
+from service.queue.leases import Lease, LeaseQueue
+from service.queue.run_writes import RunWriter
+from service.storage.sessions import Database
+from sysid.identification.result import Identification
+from sysid.search.state import Improvement, Migrant
+from sysid.uncertainty.estimates import Criteria, Estimate
+from workers.protocol import RunConclusion
+
+
+def conclude(
+    rms: float = 0.5,
+    *,
+    evaluations: int = 50,
+    generations: int = 5,
+    history: tuple[tuple[Improvement, ...], ...] = (),
+    migrations: tuple[Migrant, ...] = (),
+    samples: int = 100,
+    **estimates: tuple[float, float | None],
+) -> RunConclusion:
+    """The conclusion of a run of `fopdt` with these estimates: value and standard error."""
+    return RunConclusion(
+        Identification(
+            estimates=tuple(_build_estimate(name, *pair) for name, pair in estimates.items()),
+            rms=rms,
+            fit_percent=90.0,
+            rms_validation=None,
+            fit_percent_validation=None,
+            valid=True,
+            evaluations=evaluations,
+            generations=generations,
+            islands=(),
+            history=history,
+            migrations=migrations,
+            uncertainty=None,
+            simulated=(),
+            simulated_validation=(),
+            agreement=(),
+            agreement_validation=(),
+            warnings=(),
+            selection=(),
+            criteria=Criteria(0.0, None, 0.0, samples, max(1, len(estimates))),
+            residual_tests=None,
+            onset_delays=(),
+            correlation_times={},
+            holds={},
+            sample_time=0.1,
+            known_before=(),
+            known_before_validation=(),
+        ),
+        rms_noise_free=rms / 2,
+    )
+
+
+def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
+    ends = None if stderr is None else (value - 2.0 * stderr, value + 2.0 * stderr)
+    unit = "s" if name in ("T", "L") else "1"
+    return Estimate(name, unit, value, 0.0, 100.0, stderr, ends, "identified")
+
+
+def write_results(database: Database, lease: Lease, results: dict[str, RunConclusion]) -> None:
+    """End runs of a leased job with these results."""
+    with database.write_session() as session:
+        RunWriter(session, lease).record_outcomes(
+            [to_run_outcome(run, concluded, 1.0) for run, concluded in results.items()]
+        )
+
+
+def claim_job(database: Database, job: str) -> Lease:
+    """Claim the only job that waits."""
+    with database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("d1")
+    assert claim is not None
+    assert claim.job.id == job
+    return claim.lease
