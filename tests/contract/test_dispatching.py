@@ -40,15 +40,15 @@ def test_of_two_jobs_the_one_that_is_cancelled_stops(stand: Stand) -> None:
     stays, goes = stand.place.submit(), stand.place.submit()
     turn(stand, 4)
     (kept,), (stopped,) = (
-        [handle for handle, runs in enumerate(stand.crew.sent) if run.id in runs]
+        [handle for handle, runs in enumerate(stand.executor.sent) if run.id in runs]
         for job in (stays, goes)
         for run in stand.place.runs(job)
     )
     stand.place.cancel(goes)
     turn(stand, 2)
     assert (kept, stopped) == (0, 1)
-    assert stand.crew.cancelled == [(stopped, False)]
-    stand.crew.is_slow = False
+    assert stand.executor.cancelled == [(stopped, False)]
+    stand.executor.is_slow = False
     turn(stand, 2)
     assert states(stand, stays, goes) == [JobState.FAILED, JobState.CANCELLED]
     assert stand.place.job(stays).error == "as told"
@@ -66,8 +66,8 @@ def test_of_two_jobs_the_one_that_is_lost_stops(stand: Stand) -> None:
     assert rival.claim_job().job.id == lost
     stand.leases.renew_leases()
     turn(stand, 2)
-    assert stand.crew.cancelled == [(0, False)]
-    stand.crew.is_slow = False
+    assert stand.executor.cancelled == [(0, False)]
+    stand.executor.is_slow = False
     turn(stand, 2)
     assert states(stand, lost, kept) == [JobState.RUNNING, JobState.FAILED]
     assert {run.state for run in stand.place.runs(lost)} <= set(OPEN_STATES)
@@ -76,7 +76,7 @@ def test_of_two_jobs_the_one_that_is_lost_stops(stand: Stand) -> None:
 def test_a_full_dispatcher_takes_what_is_short_or_more_urgent_than_one_of_its_jobs(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dispatcher, "MOST_JOBS", 2)
+    monkeypatch.setattr(dispatcher, "MAX_JOBS", 2)
     held = [stand.place.submit(priority=priority) for priority in (0, 5)]
     turn(stand, 4)
     sweep, urgent = (stand.place.submit(priority=one, sweep=SWEEP) for one in (0, 3))
@@ -84,7 +84,7 @@ def test_a_full_dispatcher_takes_what_is_short_or_more_urgent_than_one_of_its_jo
     short, late = stand.place.submit(), stand.place.submit()
     turn(stand, 6)
     assert states(stand, *held, urgent, short) == [JobState.RUNNING] * 4
-    assert states(stand, sweep, late) == [JobState.QUEUED] * 2  # twice as many as `MOST_JOBS`
+    assert states(stand, sweep, late) == [JobState.QUEUED] * 2  # twice as many as `MAX_JOBS`
 
 
 def test_deaths_counted_by_an_earlier_dispatcher_go_with_their_run(stand: Stand) -> None:

@@ -89,4 +89,4 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
     first = place.runs(job)[0].id
     write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
     found = trend(place, job)
-    assert (found.missing, [label.x for label in found.places]) == (2, [1.0])
+    assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])

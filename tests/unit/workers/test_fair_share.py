@@ -196,7 +196,7 @@ def test_the_sixteenth_pack_goes_to_each_of_those_that_wait_in_turn() -> None:
     theatre.play(160.0)
     for name, seconds in before.items():
         part = (theatre.had(name) - seconds) / 320.0
-        assert part == pytest.approx(0.5 / LONGEST_WAIT_INTERVAL, rel=0.25)
+        assert part == pytest.approx(0.5 / WAIT_TURN_INTERVAL, rel=0.25)
 
 
 def test_a_priority_beats_even_a_new_identification_of_a_lower_one() -> None:
