@@ -108,7 +108,7 @@ class RunRecorder:
         self._n_begun, self._begun = claim.job.n_done, self._stopwatch()
         self._n_reused = 0
         self._reused_outcomes: list[RunOutcome] = []  # from other runs, in the present transaction
-        self._progress_written_at = 0.0  # these three on the monotonic clock
+        self._progress_written_at = 0.0  # these three by the stopwatch
         self._results_written_at = 0.0
         self._checkpoints_written_at = 0.0
         self._has_new_progress = False

@@ -6,6 +6,7 @@ of mutants goes to a folder that is removed at the end.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import queue
@@ -23,10 +24,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+from sysid.core.code_cache import find_cache_folder
 from tests.mutants.lists import Mutant, MutantList, check_lists, read_lists
 from tests.repository import ROOT
 
 LIMIT_SECONDS = 400.0
+COMPILED = ".compiled"
+"""Folder of compiled code in a copy."""
 KILL_RATE = 0.9
 """Of all mutants that are not equivalent; strict packages need all."""
 
@@ -59,13 +63,19 @@ def copy_checkout(target: Path) -> None:
             shutil.copy2(ROOT / name, target / name)
 
 
+def copy_compiled_code(target: Path) -> None:
+    """Copy what this user has compiled. It is found by its sources, so mutants never find it."""
+    with contextlib.suppress(OSError):
+        shutil.copytree(find_cache_folder(), target)
+
+
 def run_tests(root: Path, tests: tuple[str, ...], limit: float) -> tuple[int | None, str]:
     """Run tests of a copy until the first failure; the exit code is None after the limit."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(root),
         "PYTHONDONTWRITEBYTECODE": "1",  # a file that changes twice in a second keeps its time
-        "LAGID_CACHE_DIR": str(root / ".compiled"),
+        "LAGID_CACHE_DIR": str(root / COMPILED),
         "LAGID_DATA": os.environ.get("LAGID_DATA", str(ROOT.parent / "shared" / "data")),
     }
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-p", "no:cacheprovider"]
@@ -110,6 +120,7 @@ def make_copies(count: int) -> Iterator[queue.SimpleQueue[Path]]:
     with TemporaryDirectory(prefix="lagid-mutants-") as folder:
         for number in range(count):
             copy_checkout(Path(folder) / str(number))
+            copy_compiled_code(Path(folder) / str(number) / COMPILED)
             copies.put(Path(folder) / str(number))
         yield copies
 

@@ -132,13 +132,13 @@ def test_runs_of_different_records_do_not_share_a_pack() -> None:
             assert [item.spec.problem.record_keys for item in pack] == [keys] * len(pack)
             return super().submit_pack(pack, keys, shared)
 
-    crew, notebook = Keeping(fails), Notebook()
-    feeder: Scheduler[str] = Scheduler(crew)
+    executor, notebook = Keeping(fails), Notebook()
+    feeder: Scheduler[str] = Scheduler(executor)
     queued = (QueuedRun(f"a{n}", spec(records="long" if n % 7 else "short")) for n in range(100))
     feeder.add_job("a", ListedRuns(queued), notebook)
     finish(feeder)
     assert len(notebook.failures) == 100
-    assert max(map(len, crew.sent)) > 1
+    assert max(map(len, executor.sent)) > 1
 
 
 def test_a_run_whose_worker_dies_once_is_sent_again() -> None:

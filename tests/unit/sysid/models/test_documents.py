@@ -101,6 +101,8 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"name": "a/b"}, "/name", "cannot be a model's name"),
         ({"name": ".hidden"}, "/name", "starting with a letter or a digit"),
         ({"name": "a" * 65}, "/name", "up to 64"),
+        ({"name": "a@2"}, "/name", "cannot be a model's name"),
+        ({"name": "a:check"}, "/name", "cannot be a model's name"),
         ({"equation": {}}, "/equation", "did you mean 'equations'?"),
         ({"title": 3}, "/title", "3 is not a text"),
         ({"constants": {"m": 0, 2: None}}, "/constants", "write 0.2 where 0,2 was meant"),
