@@ -24,7 +24,6 @@ pytest_plugins = [
     "tests.standing",
 ]
 
-SERVICES = "services"
 GUARD = pytest.StashKey[Guard]()
 
 
@@ -41,12 +40,12 @@ def _guarded_folder(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPa
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let the tests of services begin: they wait more than they compute."""
-    items.sort(key=lambda item: item.get_closest_marker("ray") is None)
+    """Let the tests of services and pages begin: they wait more than they compute."""
+    items.sort(key=lambda item: not any(map(item.get_closest_marker, ("ray", "browser"))))
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling:
-    """Give a process all tests of services, which share one Ray, and any other module whole."""
+    """Give a process all tests that share a service, Ray or browser, and other modules whole."""
     return GroupScheduling(config, log)
 
 
@@ -58,12 +57,14 @@ class GroupScheduling(LoadScopeScheduling):
 
 
 @cache
-def _needs_services(module: str) -> bool:
+def find_module_group(module: str) -> str:
+    """Find the group of a module: what it shares with others and costs seconds, or itself."""
     path = ROOT / module
-    return path.is_file() and "pytest.mark.ray" in path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    shared = {"tests.standing": "service", "mark.ray": "ray", "mark.browser": "browser"}
+    return next((group for mark, group in shared.items() if mark in text), module)
 
 
 def find_group(nodeid: str) -> str:
-    """Find the group of a test: its module, or that of all modules that use Ray."""
-    module = nodeid.partition("::")[0]
-    return SERVICES if _needs_services(module) else module
+    """Find the group of a test: that of its module."""
+    return find_module_group(nodeid.partition("::")[0])

@@ -2,8 +2,8 @@
 
 Run as ``python guard.py PYTEST FOLDER``: a process beside pytest. It waits until pytest has ended,
 or has asked for the end on standard input. It finds the processes of the session by a variable of
-their environment. It finds their descendants too: workers of Ray and PostgreSQL overwrite the
-memory that shows their environment.
+their environment, or by their open files. It finds their descendants too: workers of Ray and
+PostgreSQL overwrite the memory that shows their environment.
 """
 
 import contextlib
@@ -167,9 +167,16 @@ def _is_alive(process: psutil.Process) -> bool:
 
 
 def belongs_to(process: psutil.Process, session: str) -> bool:
-    """Whether the environment of a process names the session."""
+    """Whether the environment of a process names the session, or it has a file of it open.
+
+    Agents of Ray overwrite their environment, and outlive their parent by a minute.
+    """
     with contextlib.suppress(psutil.Error):
-        return bool(process.environ().get(SESSION_VARIABLE) == session)
+        if process.environ().get(SESSION_VARIABLE) == session:
+            return True
+    with contextlib.suppress(psutil.Error, OSError):
+        opened = Path(f"/proc/{process.pid}/fd").iterdir()
+        return any(os.readlink(file).startswith(f"{session}/") for file in opened)
     return False
 
 

@@ -90,7 +90,12 @@ def _serve(folder: Path, temporary: Path) -> None:
     from ray.cluster_utils import Cluster
 
     node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
-    head = {**node, "include_dashboard": False, "temp_dir": str(temporary)}
+    head = {
+        **node,
+        "include_dashboard": False,
+        "temp_dir": str(temporary),
+        "_system_config": {"health_check_period_ms": 500},  # a dead node is noticed soon
+    }
     cluster = Cluster(initialize_head=True, connect=False, head_node_args=head)
     loops = os.environ.get("NUMBA_CACHE_DIR") or str(
         find_cache_folder()

@@ -212,7 +212,7 @@ def _serialize_function(compiled_: Any) -> bytes:
     module = compiled_.library._get_module_for_linking()
     defined = (*module.functions, *module.global_variables)
     names = {symbol.name for symbol in defined if not symbol.is_declaration}
-    return bytes(dumps((names, *parts)))  # type: ignore[no-untyped-call]
+    return bytes(dumps((names, *parts)))
 
 
 def _rebuild_function(content: bytes, target_context: Any) -> Any:

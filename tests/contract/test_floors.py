@@ -15,6 +15,8 @@ from sysid.uncertainty.cramer_rao import cramer_rao_bound
 from tests.dispatching import LIMIT_SECONDS, Place
 from workers.inline_executor import InlineExecutor
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 NOISY = {"algorithm": SMALL, "noise": {"sigma": 0.1}}
 

@@ -22,6 +22,8 @@ from service.sweeps.summary import summarise_job
 from tests.dispatching import Place, carry_out
 from workers.inline_executor import InlineExecutor
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 AXES = [
     {"path": "/noise/sigma", "values": [0.0, 0.01, 0.3], "labels": [{"x": 1}, {"x": 2}, {"x": 1}]},

@@ -13,6 +13,8 @@ from tests.dispatching import Place, carry_out
 from workers.inline_executor import InlineExecutor
 from workers.tasks import process_pack
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 
 

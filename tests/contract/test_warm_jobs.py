@@ -18,6 +18,8 @@ from tests.dispatching import Place, carry_out
 from workers.inline_executor import InlineExecutor
 from workers.protocol import RunNotReady
 
+pytestmark = pytest.mark.slow
+
 QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 2}}
 
 

@@ -1,5 +1,6 @@
 """A server over a filled data folder, and Chromium to look at its pages."""
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -9,7 +10,14 @@ from pathlib import Path
 
 import pytest
 import uvicorn
-from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    ConsoleMessage,
+    Page,
+    expect,
+    sync_playwright,
+)
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
@@ -26,6 +34,7 @@ ARGUMENTS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--process-per-site",  # one process for all tabs: it keeps compiled scripts
 ]
 
 LIMIT_SECONDS = 180.0
@@ -56,27 +65,37 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         yield served
 
 
+@pytest.fixture(scope="session")
+def listener() -> Iterator[socket.socket]:
+    """The port of all own sites, one after the other.
+
+    Compiled scripts are kept by address. Compiling Plotly takes two seconds.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as bound:
+        yield bound
+
+
 @pytest.fixture
-def own_site(tmp_path: Path) -> Iterator[Site]:
+def own_site(tmp_path: Path, listener: socket.socket) -> Iterator[Site]:
     """The same, for a test that changes something."""
-    with _serve_filled(tmp_path) as served:
+    with _serve_filled(tmp_path, listener.dup()) as served:
         yield served
 
 
 @contextmanager
-def _serve_filled(folder: Path) -> Iterator[Site]:
+def _serve_filled(folder: Path, bound: socket.socket | None = None) -> Iterator[Site]:
     filled = copy_filled(folder)
-    with serve_folder(folder) as server:
+    with serve_folder(folder, bound) as server:
         yield Site(server.url, server.parts, filled)
 
 
 @contextmanager
-def serve_folder(folder: Path) -> Iterator[Server]:
-    """The service over a data folder, on a port of its own."""
+def serve_folder(folder: Path, bound: socket.socket | None = None) -> Iterator[Server]:
+    """The service over a data folder, at a bound socket, which it closes, or a port of its own."""
     app = create_app(settings_of(folder, poll_seconds=0.05))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
     server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run)
+    thread = threading.Thread(target=server.run, args=([bound] if bound else None,))
     thread.start()
     try:
         while not server.started:
@@ -103,12 +122,21 @@ def browser() -> Iterator[Browser]:
         opened.close()
 
 
+@pytest.fixture(scope="session")
+def browser_context(browser: Browser, site: Site) -> Iterator[BrowserContext]:
+    """What all tabs share: the cache. The pages store nothing in the browser."""
+    with browser.new_context() as context:
+        context.set_default_timeout(LIMIT_MILLISECONDS)
+        context.new_page().goto(f"{site.url}/static/lagid.svg")  # it keeps the process of all tabs
+        yield context
+        assert context.storage_state() == {"cookies": [], "origins": []}
+
+
 @pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
+def page(browser_context: BrowserContext) -> Iterator[Page]:
     """A tab in which nothing may go wrong: an error on its console fails the test."""
-    context = browser.new_context(viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(LIMIT_MILLISECONDS)
-    tab = context.new_page()
+    tab = browser_context.new_page()
+    tab.set_viewport_size({"width": 1280, "height": 900})
     wrong: list[str] = []
 
     def note(message: ConsoleMessage) -> None:
@@ -119,5 +147,5 @@ def page(browser: Browser) -> Iterator[Page]:
     tab.on("console", note)
     tab.on("pageerror", lambda error: wrong.append(str(error)))
     yield tab
-    context.close()
+    tab.close()
     assert wrong == []

@@ -4,7 +4,7 @@ import re
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Request, Route, expect
+from playwright.sync_api import BrowserContext, Page, Request, Route, expect
 
 from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import LIMIT_SECONDS, Site
@@ -200,10 +200,10 @@ def test_a_page_that_comes_late_does_not_bring_back_what_was(own_site: Site, pag
 
 @pytest.mark.parametrize("refused", ["jobs/{job}", "v1/jobs/{job}/events"])
 def test_a_page_is_fresh_again_after_the_server_was_away(
-    own_site: Site, browser: Browser, refused: str
+    own_site: Site, browser_context: BrowserContext, refused: str
 ) -> None:
     job, database = own_site.filled.running, own_site.parts.database
-    page = browser.new_page()  # of its own: what fails is told on the console
+    page = browser_context.new_page()  # of its own: what fails is told on the console
     page.goto(f"{own_site.url}/jobs/{job}")
     expect(page.locator("#job .chip")).to_have_text("running")
     times = iter(range(2))

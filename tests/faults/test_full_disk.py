@@ -52,7 +52,7 @@ def run_in_namespace(test: str) -> None:
 
 def check_service(disk: Path, tmp_path: Path) -> None:
     """Fill the disk of a service at work; it refuses what is new, and ends what it has."""
-    stand = Stand(disk / "data")
+    stand = Stand(disk / "data", cpus=1)
     record = paper_example.write_csv(tmp_path / "record.csv", seed=1)
     with standing_service(stand):
         dataset = stand.client.add_dataset(record, name="example 1")["id"]

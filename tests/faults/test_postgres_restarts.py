@@ -32,14 +32,13 @@ def server() -> Iterator[Any]:
 
 
 def test_a_killed_database_costs_nothing_but_time(tmp_path: Path, server: Any) -> None:
-    stand = Stand(tmp_path / "data", database_url=server.get_uri())
+    stand = Stand(tmp_path / "data", database_url=server.get_uri(), lease_seconds=2.0, cpus=1)
     with standing_service(stand):
-        stream = Stream(stand, tmp_path)
+        stream = Stream(stand, tmp_path, size=0.3)
         stream.measure()
         stream.start()
         (before,) = stand.family.dispatchers()
         bench = Bench(stand, stream, server)
-        faults.kill_postgres(bench)
         faults.kill_postgres(bench)
         assert stand.family.dispatchers() == [before]  # it waited
         assert stream.finish() == 0

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from tests.two_nodes import two_nodes
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(300)]
 
-SWEEP = {"axes": [{"path": "/seed", "range": [0, 24]}]}
-ALGORITHM = {"generations": 1500, "islands": 2, "stop": {"settled": None}}
+WRONG_TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
+SWEEP = {"axes": [{"path": "/seed", "range": [0, 32]}]}
+ALGORITHM = {"generations": 1000, "islands": 2, "stop": {"settled": None}}
 
 JOIN = """
 import sys
@@ -49,7 +51,7 @@ def results(runs: tuple[Run, ...]) -> list[dict[str, Any]]:
     return [{**(run.result or {}), "seconds": 0} for run in runs]
 
 
-def told_on_joining(address: str, **environment: str) -> str:
+def told_on_joining(address: str, environment: dict[str, str]) -> str:
     """What a process prints that tries to join; it must end by itself."""
     inherited = {name: text for name, text in os.environ.items() if not name.startswith("RAY_")}
     done = subprocess.run(
@@ -67,7 +69,9 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = Place(tmp_path / "data")
-    with two_nodes(tmp_path) as cluster:
+    with two_nodes(tmp_path) as cluster, ThreadPoolExecutor(1) as pool:
+        # It takes 20 s: Ray tries again and again.
+        joining = pool.submit(told_on_joining, cluster.address, WRONG_TOKEN)
         for name, value in cluster.environment.items():
             monkeypatch.setenv(name, value)
         place.settings = place.settings.model_copy(
@@ -85,13 +89,13 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
             until(lambda: "has 1 cores now" in log_of(place), "one core")
             cluster.order("add")
             until(lambda: "has 2 cores now" in log_of(place), "two cores again")
-        wrong = told_on_joining(cluster.address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64)
+        wrong = joining.result()
         assert wrong.count("\n") == 1
         assert "refuses the connection. Most likely its token is a different one" in wrong
     assert (ended.state, ended.attempt, ended.n_done, ended.n_failed) == (
         JobState.SUCCEEDED,
         1,
-        24,
+        32,
         0,
     )
     assert results(place.runs(shaken)) == results(place.runs(quiet))

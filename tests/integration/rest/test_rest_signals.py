@@ -9,6 +9,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
+from service.dispatch import fitted_signals
 from service.formats.mcap import read_fitted_outputs
 from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
@@ -97,6 +98,7 @@ def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(
 
     with monkeypatch.context() as patched:
         patched.setattr(served.parts.store, "put_stream", full)
+        patched.setattr(fitted_signals, "RETRY_SECONDS", 0.1)
         job, runs = identified(served.parts, served.body)
     found = rows(served, runs)
     assert [(row.state.value, row.signals_sha256) for row in found] == [("succeeded", None)] * 3

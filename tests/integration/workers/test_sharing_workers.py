@@ -76,7 +76,7 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
     tmp_path: Path, database: Database
 ) -> None:
     place = Place(tmp_path / "data", database)
-    jobs = [place.submit(sweep=sweep(4), algorithm=QUICK, seed=n) for n in range(12)]
+    jobs = [place.submit(sweep=sweep(4), algorithm=QUICK, seed=n) for n in range(6)]
     url = database.engine.url.render_as_string(hide_password=False)
     own = [Database(url), Database(url)]
     both = threading.Barrier(2)  # a quick one could have them all before the other begins

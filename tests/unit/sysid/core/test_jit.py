@@ -22,6 +22,8 @@ from packaging.requirements import Requirement
 from sysid.core import code_cache, jit
 from sysid.search import levenberg_marquardt
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(jit.__file__).parents[2]
 PROGRAM = """
 import sys
@@ -383,7 +385,6 @@ def test_files_that_another_process_removes_meanwhile_are_no_fault(
     assert not caplog.records
 
 
-@pytest.mark.slow
 def test_processes_that_compile_at_once_leave_one_whole_file(tmp_path: Path) -> None:
     (tmp_path / "module.py").write_text(MODULE)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -414,7 +415,6 @@ print([name for name in loaded if name in sys.modules])
 """
 
 
-@pytest.mark.slow
 def test_what_was_compiled_before_is_loaded_without_the_compiler() -> None:
     def load() -> str:
         ran = subprocess.run(
