@@ -4,7 +4,7 @@ from service.dispatch.results import to_run_outcome
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
-from sysid.identification.result import Identification
+from sysid.identification.result import Identification, SearchEvidence
 from sysid.search.state import Improvement, Migrant
 from sysid.uncertainty.estimates import Criteria, Estimate
 from workers.protocol import RunConclusion
@@ -47,6 +47,7 @@ def conclude(
             correlation_times={},
             holds={},
             sample_time=0.1,
+            search=SearchEvidence(True, "starts", 10, 5),
             known_before=(),
             known_before_validation=(),
         ),

@@ -60,6 +60,7 @@ class Diagnostics:
     onsets: Sequence[OnsetView]
     groups: Sequence[str]
     criteria: Mapping[str, float | None]
+    search: str
     selection: Sequence[SelectedTermView] = ()
 
 
@@ -81,6 +82,7 @@ def to_diagnostics(result: Document) -> Diagnostics:
         onsets=[_to_onset_view(onset, several) for onset in onsets],
         groups=[_format_group(group) for group in groups],
         criteria=result.get("criteria", {}),
+        search=_describe_search(result.get("search", {})),
         selection=[
             SelectedTermView(
                 term["term"],
@@ -146,6 +148,19 @@ def _to_onset_view(onset: Document, several: bool) -> OnsetView:
     steps = "one step" if onset["events"] == 1 else f"{onset['events']} steps"
     scatter = f", spread {spread}\u202fs" if spread else ""
     return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")
+
+
+def _describe_search(search: Document) -> str:
+    """Describe how far the search is to be trusted; empty for a result that does not say."""
+    if not search:
+        return ""
+    starts = f"{search['agreeing_starts']} of {search['independent_starts']}"
+    verdict = {
+        "starts": "settled",
+        "residuals": "settled, as nothing but noise is left",
+        None: "not settled",
+    }[search["because"]]
+    return f"{verdict}; {starts} independent starts ended here"
 
 
 def _format_group(group: Document) -> str:

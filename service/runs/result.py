@@ -89,6 +89,7 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
             "estimation": list(identification.known_before),
             "validation": list(identification.known_before_validation),
         },
+        "search": _to_search_document(identification),
         "warnings": list(identification.warnings),
         "selection": [step._asdict() for step in identification.selection],
     }
@@ -111,6 +112,23 @@ def _to_estimate_document(estimate: Estimate) -> dict[str, Any]:
 
 def _to_agreement_document(metrics: ChannelMetrics) -> dict[str, Any]:
     return _read(metrics, "experiment", "output", "unit", "samples", "rms", "fit_percent", "span")
+
+
+def _to_search_document(identification: Identification) -> dict[str, Any]:
+    """Convert the evidence of the whole search, with the minima that were found."""
+    evidence = identification.search
+    return {
+        **_read(evidence, "settled", "because", "independent_starts", "agreeing_starts"),
+        "minima": [
+            {
+                "parameters": dict(zip(evidence.names, minimum.values.tolist(), strict=True)),
+                "rms": to_finite(minimum.rms),
+                "likelihood_ratio": to_finite(minimum.likelihood_ratio),
+                **_read(minimum, "count", "is_compatible", "recorded_from"),
+            }
+            for minimum in evidence.minima
+        ],
+    }
 
 
 def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, Any]:

@@ -26,6 +26,13 @@ from sysid.identification.local_minima import (
     find_local_minima,
     widen_intervals,
 )
+from sysid.identification.minima import (
+    FoundMinima,
+    ScanResult,
+    collect_minima,
+    mark_ambiguous,
+    scan_parameters,
+)
 from sysid.identification.noise_model_choice import (
     confirm_noise_model,
     explain_noise_model_choice,
@@ -33,18 +40,27 @@ from sysid.identification.noise_model_choice import (
     resolve_noise_model,
 )
 from sysid.identification.result import Identification
-from sysid.identification.warnings import collect_warnings, warn_noise_model, warn_time_limit
+from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
+from sysid.identification.unrecorded_input import compare_where_recorded
+from sysid.identification.warnings import (
+    collect_warnings,
+    find_delay_parameters,
+    warn_noise_model,
+    warn_time_limit,
+)
 from sysid.islands.state import RunState
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import ResidualTests, list_residual_series, run_residual_tests
 from sysid.search.island import compute_analysis_budget, get_island_settings
 from sysid.search.refine import RefinedCandidate, refine_candidates
-from sysid.search.state import Improvement, IslandSummary
+from sysid.search.state import SAME_OPTIMUM, Improvement, IslandSummary
 from sysid.simulation.metrics import Metrics
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
+
+_SCAN_DIVISOR = 4  # of the simulations that are left, a scan takes this part at most
 
 
 def conclude_run(
@@ -82,7 +98,7 @@ def _build_identification(
     validation: Problem | None,
     deadline: Deadline,
 ) -> Identification:
-    refined, ends, noise, analysis = _refine_and_analyse(problem, algorithm, state, deadline)
+    refined, ends, found, noise, analysis = _refine_and_analyse(problem, algorithm, state, deadline)
     problem, theta = resolve_noise_model(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(problem.free_names)
@@ -100,6 +116,11 @@ def _build_identification(
         else run_residual_tests(problem, simulated, "estimation", times)
     )
     limit = algorithm.safe_limit
+    evidence = assess_search(problem, state, metrics.rms, tests, found)
+    analysis = replace(
+        analysis,
+        estimates=mark_unsettled(mark_ambiguous(problem, analysis.estimates, found), evidence),
+    )
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -119,6 +140,8 @@ def _build_identification(
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *found.warnings,
+            *warn_unsettled(evidence),
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
@@ -139,6 +162,7 @@ def _build_identification(
         correlation_times=times,
         holds={channel.name: channel.hold for channel in problem.records[0].inputs},
         sample_time=find_common_sample_time(problem.records),
+        search=evidence,
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),
     )
@@ -167,10 +191,11 @@ def _refine_and_analyse(
 ) -> tuple[
     tuple[RefinedCandidate | None, ...],
     list[tuple[FloatArray, float]],
+    FoundMinima,
     GeneralisedEstimate,
     Analysis,
 ]:
-    """Refine the islands' champions and analyse the best of them."""
+    """Refine the islands' champions, scan for better minima and analyse the best."""
     champions = [_get_champion(problem, island.history) for island in state.islands]
     refined = _refine_champions(problem, algorithm, state, champions, deadline)
     ends = [
@@ -178,6 +203,13 @@ def _refine_and_analyse(
         for champion, island, end in zip(champions, state.islands, refined, strict=True)
     ]
     best = min(range(len(ends)), key=lambda i: ends[i][1])
+    all_ends, has_gained = list(ends), False
+    if _should_refine(algorithm, len(ends)):
+        scanned = _scan_from_best(problem, algorithm, state, refined, ends[best], deadline)
+        all_ends += [(end.theta, end.rms) for end in scanned.ends[1:]]
+        has_gained = scanned.best.rms < ends[best][1] * (1.0 - SAME_OPTIMUM)
+        ends[best] = scanned.best.theta, scanned.best.rms
+        refined = (*refined[:best], scanned.best, *refined[best + 1 :])
     left = _count_budget_left(algorithm, state, refined)
     spare = None if left is None else max(0, left - compute_analysis_budget(ends[best][0].size))
     groups, spent = find_exchanges(problem, ends[best][0], spare)
@@ -199,7 +231,74 @@ def _refine_and_analyse(
     noise, analysis = _apply_noise_model(
         problem, algorithm, state, refined, theta, analysis, deadline
     )
-    return refined, ends, noise, analysis
+    groups = analysis.exchanges
+    ordered = [(order_exchangeable(problem, theta, groups), rms) for theta, rms in all_ends]
+    minima = collect_minima(problem, ordered, _get_variance_ratio(analysis))
+    found = FoundMinima(minima, has_gained)
+    if _should_refine(algorithm, len(ends)):
+        most = _count_scan_simulations(problem, algorithm, state, refined, deadline)
+        recorded = compare_where_recorded(
+            problem,
+            noise.theta,
+            analysis,
+            _list_delays(problem),
+            most,
+            deadline.is_past_grace,
+        )
+        analysis = replace(analysis, evaluations=analysis.evaluations + recorded.evaluations)
+        found = FoundMinima((*minima, *recorded.minima), has_gained, recorded.warnings)
+    return refined, ends, found, noise, analysis
+
+
+def _get_variance_ratio(analysis: Analysis) -> float:
+    """Get the least variance ratio of all parameters; 1 for white residuals."""
+    if analysis.linear_model is None:
+        return 1.0
+    ratios = analysis.linear_model.variance_ratio
+    return float(np.min(ratios[np.isfinite(ratios)], initial=1.0))
+
+
+def _scan_from_best(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    end: tuple[FloatArray, float],
+    deadline: Deadline,
+) -> ScanResult:
+    """Scan from the best end; the result's evaluations include those of its refinement."""
+    theta, rms = end
+    start = _find_refined(refined, theta) or RefinedCandidate(theta, rms, 0)
+    most = _count_scan_simulations(problem, algorithm, state, refined, deadline)
+    scanned = scan_parameters(problem, start, _list_delays(problem), most, deadline.is_past_grace)
+    spent = start.evaluations + scanned.evaluations
+    best = replace(scanned.best, evaluations=spent, is_cut_short=start.is_cut_short)
+    return scanned._replace(best=best)
+
+
+def _count_scan_simulations(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    deadline: Deadline,
+) -> int:
+    """Count the simulations that a scan may take."""
+    left = _count_budget_left(algorithm, state, refined)
+    most = count_affordable_simulations(problem, deadline.is_over())
+    return most if left is None else min(most, left // _SCAN_DIVISOR)
+
+
+def _list_delays(problem: Problem) -> list[int]:
+    """List the numbers of the free parameters that time lags depend on."""
+    names = find_delay_parameters(problem)
+    return [d for d, name in enumerate(problem.free_names) if name in names]
+
+
+def _find_refined(
+    refined: tuple[RefinedCandidate | None, ...], theta: FloatArray
+) -> RefinedCandidate | None:
+    return next((one for one in refined if one is not None and one.theta is theta), None)
 
 
 def _get_champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
@@ -243,10 +342,7 @@ def _search_local_minima(
     Its evaluations are those of the candidate that it replaces, and of this search.
     """
     theta, rms = end
-    previous = next(
-        (candidate for candidate in refined if candidate is not None and candidate.theta is theta),
-        None,
-    )
+    previous = _find_refined(refined, theta)
     before, is_cut = (
         (0, False) if previous is None else (previous.evaluations, previous.is_cut_short)
     )

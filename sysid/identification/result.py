@@ -13,6 +13,64 @@ from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 
+CHI_SQUARE_95 = 3.841
+"""Quantile of χ² with one degree of freedom."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """A minimum of the loss.
+
+    Attributes
+    ----------
+    values : FloatArray, shape (D,)
+        Of the free parameters.
+    rms : float
+    count : int
+        How many least-squares fits ended in it.
+    likelihood_ratio : float
+        n ln(Σe²/Σe²₀) to the best minimum, twice the logarithm of the ratio of likelihoods, made
+        smaller for coloured residuals.
+    recorded_from : float or None
+        Compared only where the input is recorded: samples of each record after so many seconds.
+    """
+
+    values: FloatArray
+    rms: float
+    count: int
+    likelihood_ratio: float
+    recorded_from: float | None = None
+
+    @property
+    def is_compatible(self) -> bool:
+        """Whether the data do not rule it out."""
+        return self.likelihood_ratio <= CHI_SQUARE_95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchEvidence:
+    """What a result knows of the whole search.
+
+    Attributes
+    ----------
+    settled : bool
+    because : "starts", "residuals" or None
+        What shows it; None if nothing does.
+    independent_starts, agreeing_starts : int
+        Local searches from random points, and those of them that ended in the best minimum.
+    names : tuple of str
+        Free parameters, in the order of the values of a minimum.
+    minima : tuple of Minimum
+        Minima in which least squares ended after the search, the lowest first.
+    """
+
+    settled: bool
+    because: Literal["starts", "residuals"] | None
+    independent_starts: int
+    agreeing_starts: int
+    names: tuple[str, ...] = ()
+    minima: tuple[Minimum, ...] = ()
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
@@ -39,6 +97,8 @@ class Identification:
         Behaviour of the inputs of the first experiment between their samples.
     sample_time : float or None
         Sampling period (s) of all outputs; None if irregular or not the same for all.
+    search : SearchEvidence
+        Whether the search settled, and the minima that were found.
     known_before, known_before_validation : tuple of float
         Time (s) before the start of each experiment for which the inputs are recorded. Before
         that, the first value is assumed.
@@ -68,6 +128,7 @@ class Identification:
     correlation_times: Mapping[str, float]
     holds: Mapping[str, Hold]
     sample_time: float | None
+    search: SearchEvidence
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
 

@@ -8,18 +8,28 @@ S' and e' are the sensitivities and residuals of the other samples (one Gauss-Ne
 1977). If one estimate uses a part of the data of another, the variance of their difference is the
 difference of their variances (Hausman 1978). A far larger move shows that these samples do not fit
 the others. Only then is the model fitted again without them, and the move is reported.
+
+The assumption also decides between minima: a longer time lag reads the assumed input for longer.
+If the data contradict it (predictive test of Chow, Econometrica 28 (1960) 591), the minima are
+compared again on the samples that read recorded input with every time lag in question.
 """
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
+from scipy.special import fdtrc
 
 from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import truncated_svd
-from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
+from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray, Interval
 from sysid.data.records import Channel, Record
+from sysid.identification.minima import collect_minima, scan_parameters
+from sysid.identification.result import Minimum
 from sysid.kernels.reads import list_delayed_values
 from sysid.models.delays import compute_longest_delay, list_past_values
 from sysid.models.model import EstimatedInitial
-from sysid.search.refine import refine_candidates
+from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
@@ -27,6 +37,13 @@ from sysid.uncertainty.estimates import Estimate
 _NOTABLE_MOVE = 1.0  # of a standard error
 _UNLIKELY_MOVE = 4.0  # deviations of the difference of both estimates
 _MIN_SAMPLES_PER_PARAMETER = 2  # samples for each parameter, that are left
+_ADVICE = (
+    "Give the input before the record (trim a longer recording, or put rows with an empty output "
+    "before it), or"
+)
+_CONTRADICTION = 3.0  # mean square of samples that read assumed input, over that of the others
+_RELEASE = 1e6  # times their range
+_UNLIKELY = 1e-3  # probability of these residuals if the assumption holds
 _MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 
 
@@ -58,18 +75,20 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
     )
     return [
         f"{subject} an input from before the record, which was not recorded. Its first value is "
-        f"assumed there. Without {pronoun} {', '.join(moves)}. Give the input before the record "
-        "(trim a longer recording, or put rows with an empty output before it), or skip: "
+        f"assumed there. Without {pronoun} {', '.join(moves)}. {_ADVICE} skip: "
         f"{max(int(np.count_nonzero(part)) for part in parts)}"
     ]
 
 
 def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
     """Mark the samples of every output that read an input from before its recorded part."""
+    reach = _compute_longest_input_delay(
+        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
+    )
     return [
         channel.times < until
         for record, until in zip(
-            problem.records, _find_recorded_starts(problem, analysis), strict=True
+            problem.records, _find_recorded_starts(problem, reach), strict=True
         )
         for channel in _order_outputs(problem, record)
     ]
@@ -80,20 +99,18 @@ def _order_outputs(problem: Problem, record: Record) -> list[Channel]:
     return [channels[output.name] for output in problem.model.outputs]
 
 
-def _find_recorded_starts(problem: Problem, analysis: Analysis) -> list[float]:
-    """Find the time (s) in each experiment from which only recorded inputs are read."""
-    reach = _compute_longest_input_delay(problem, analysis)
+def _find_recorded_starts(problem: Problem, reach: float) -> list[float]:
+    """Find the time (s) in each experiment from which a lag of `reach` reads recorded inputs."""
     return [
         experiment.grid.start + reach - record.history_duration
         for record, experiment in zip(problem.records, problem.experiments, strict=True)
     ]
 
 
-def _compute_longest_input_delay(problem: Problem, analysis: Analysis) -> float:
-    """Compute how far (s) the estimated time lags of inputs reach back."""
+def _compute_longest_input_delay(problem: Problem, spans: Mapping[str, Interval]) -> float:
+    """Compute how far (s) the time lags of inputs reach back at most, inside these bounds."""
     if not list_delayed_values(problem.model, "input"):
         return 0.0
-    spans = {estimate.name: (estimate.value, estimate.value) for estimate in analysis.estimates}
     step = problem.experiments[0].grid.integration_step
     return max(
         compute_longest_delay(problem.model, past, spans, step)
@@ -139,16 +156,127 @@ def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
 def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
     """Fit the other samples, from the estimate (D,) on; return the estimate if that fails."""
     theta = _to_theta(problem, analysis)
-    scored_from = problem.settings.scored_from or [-np.inf] * len(problem.records)
-    from_then = zip(_find_recorded_starts(problem, analysis), scored_from, strict=True)
-    try:
-        others = problem.rebuild(
-            weights=problem.output_weights, scored_from=tuple(max(pair) for pair in from_then)
-        )
-    except InvalidRecord:  # of one record nothing would be left
+    reach = _compute_longest_input_delay(
+        problem, {one.name: (one.value, one.value) for one in analysis.estimates}
+    )
+    others = _select_recorded(problem, reach)
+    if others is None:
         return theta
     (end,) = refine_candidates(others, [theta], _MAX_STEPS * (theta.size + 1))
     return theta if end is None else end.theta
+
+
+def _select_recorded(
+    problem: Problem, reach: float, parameters: Mapping[str, Mapping[str, Any]] | None = None
+) -> Problem | None:
+    """Score only samples that read recorded inputs; None if one record would be left empty."""
+    scored_from = problem.settings.scored_from or [-np.inf] * len(problem.records)
+    from_then = zip(_find_recorded_starts(problem, reach), scored_from, strict=True)
+    try:
+        return problem.rebuild(
+            weights=problem.output_weights,
+            scored_from=tuple(max(pair) for pair in from_then),
+            parameters={**problem.settings.parameters, **(parameters or {})},
+        )
+    except InvalidRecord:
+        return None
+
+
+def _release_initial_states(problem: Problem) -> dict[str, dict[str, Any]]:
+    """Widen the bounds of initial states: these make up for an input that is assumed wrongly."""
+    declared = {parameter.name for parameter in problem.model.parameters}
+    return {
+        one.name: {
+            **problem.settings.parameters.get(one.name, {}),
+            "lower": one.lower - _RELEASE * (one.upper - one.lower),
+            "upper": one.upper + _RELEASE * (one.upper - one.lower),
+        }
+        for one in problem.free_parameters
+        if one.name not in declared
+    }
+
+
+class RecordedComparison(NamedTuple):
+    """Minima compared where the input is recorded, the simulations spent, and a warning."""
+
+    minima: tuple[Minimum, ...] = ()
+    evaluations: int = 0
+    warnings: tuple[str, ...] = ()
+
+
+def compare_where_recorded(
+    problem: Problem,
+    theta: FloatArray,
+    analysis: Analysis,
+    delays: Sequence[int],
+    budget: int,
+    is_late: Callable[[], bool],
+) -> RecordedComparison:
+    """Compare minima where the input is recorded, if the data contradict the input assumed before.
+
+    It takes about `budget` simulations at most. There are no minima if the assumption holds, or if
+    too little is recorded. Time lags are compared up to half of the shortest record.
+    """
+    if not delays or not _may_contradict(problem, analysis):
+        return RecordedComparison()
+    evaluator = problem.evaluator
+    spans = {one.name: (one.value, one.value) for one in analysis.estimates}
+    ends = zip(evaluator.lower.tolist(), evaluator.upper.tolist(), strict=True)
+    spans |= dict(zip(problem.free_names, ends, strict=True))
+    shortest = min(record.duration for record in problem.records)
+    reach = min(_compute_longest_input_delay(problem, spans), 0.5 * shortest)
+    others = _select_recorded(problem, reach, _release_initial_states(problem))
+    if others is None or others.n_scored <= _MIN_SAMPLES_PER_PARAMETER * theta.size:
+        return RecordedComparison()
+    (end,) = refine_candidates(others, [theta], min(budget, _MAX_STEPS * (theta.size + 1)))
+    if end is None or not _is_contradicted(problem, end, others, analysis):
+        return RecordedComparison(evaluations=0 if end is None else end.evaluations)
+    scanned = scan_parameters(others, end, delays, budget - end.evaluations, is_late)
+
+    def reaches_back(values: FloatArray) -> float:
+        found = zip(problem.free_names, values.tolist(), strict=True)
+        return _compute_longest_input_delay(
+            problem, spans | {name: (value, value) for name, value in found}
+        )
+
+    kept = [(one.theta, one.rms) for one in scanned.ends if reaches_back(one.theta) <= reach]
+    since = _find_recorded_starts(problem, reach)[0] - problem.records[0].start
+    count = max(map(np.count_nonzero, find_assumed_samples(problem, analysis)))
+    return RecordedComparison(
+        collect_minima(others, kept, recorded_from=since),
+        end.evaluations + scanned.evaluations,
+        (
+            "the data contradict the input that is assumed before the record, its first value. "
+            f"{_ADVICE} skip: {count}",
+        ),
+    )
+
+
+def _may_contradict(problem: Problem, analysis: Analysis) -> bool:
+    """Whether samples that read an assumed input fit far worse than the others."""
+    if analysis.residuals_and_sensitivities is None or problem.prediction != "simulation":
+        return False
+    assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
+    error = analysis.residuals_and_sensitivities[0]
+    if not assumed.any() or assumed.all():
+        return False
+    return bool(np.mean(error[assumed] ** 2) > _CONTRADICTION * np.mean(error[~assumed] ** 2))
+
+
+def _is_contradicted(
+    problem: Problem, end: RefinedCandidate, others: Problem, analysis: Analysis
+) -> bool:
+    """Whether samples that read an assumed input do not follow from a fit of the others."""
+    assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
+    evaluator, rows = problem.evaluator, problem.scored_rows
+    error = evaluator.weight * (problem.predict(end.theta[None])[0] - evaluator.measured)
+    degrees = others.n_scored - end.theta.size
+    count = int(np.count_nonzero(assumed))
+    variance = end.rms**2 * others.n_scored / degrees
+    if variance <= 0:
+        return bool(np.any(error[rows][assumed] != 0))
+    ratio = float(np.mean(error[rows][assumed] ** 2)) / variance
+    return bool(fdtrc(count, degrees, ratio) < _UNLIKELY)
 
 
 def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:

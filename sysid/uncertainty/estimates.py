@@ -7,7 +7,16 @@ from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 
 NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
-EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
+EstimateStatus = Literal[
+    "identified",
+    "not settled",
+    "ambiguous",
+    "group",
+    "at bound",
+    "unidentifiable",
+    "fixed",
+    "tied",
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,6 +77,20 @@ def test_groups_ties_and_criteria_are_in_the_result(served: Served) -> None:
     }
     assert set(document["criteria"]) == {"aic", "aicc", "bic", "samples", "parameters"}
     assert document["criteria"]["parameters"] == 4
+
+
+def test_the_minima_and_whether_the_search_settled_are_in_the_result(served: Served) -> None:
+    document = served.server.get(f"/v1/runs/{served.run}").json()
+    search = document["search"]
+    assert search["settled"] is (search["because"] is not None)
+    assert 0 <= search["agreeing_starts"] <= search["independent_starts"]
+    lowest = search["minima"][0]
+    values = {one["name"]: one["value"] for one in document["parameters"]}
+    assert set(lowest["parameters"]) <= set(values)
+    assert (lowest["likelihood_ratio"], lowest["is_compatible"]) == (0.0, True)
+    assert lowest["rms"] == pytest.approx(document["rms"], rel=1e-3)
+    page = served.server.get(f"/runs/{served.run}", headers={"accept": "text/html"}).text
+    assert "independent starts ended here" in page
     history = served.server.get(f"/v1/runs/{served.run}/history").json()
     assert history["names"] == ["k", "A", "J", "L"]
 

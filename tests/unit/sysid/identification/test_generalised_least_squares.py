@@ -187,7 +187,7 @@ def test_white_residuals_leave_everything_as_it_is() -> None:
 def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_out() -> None:
     data = searching.record(searching.clean("coulomb-eq16") + 0.02 * coloured(300, 0.9, 2))
     problem = Problem.build(load_model("coulomb-eq16"), [data], loss=AR1)
-    settings = GeneticAlgorithm(stop=Stop(evaluations=20_000))
+    settings = GeneticAlgorithm(stop=Stop(evaluations=30_000))
     found = conclude_run(
         problem, settings, advance_run(problem, settings, begin_run(problem, settings, 1))
     )

@@ -1,0 +1,225 @@
+"""The minima of the loss that a run has found: those its islands ended in, and those of a scan.
+
+A search ends in one of several minima where the loss is a comb in a time lag, where the input is
+periodic, or where the model has mirror images. From the best estimate each parameter alone is
+moved over its whole range, time lags first, with all places in one batch. Least squares continues
+from the lowest dips. If it ends lower, the scan is repeated from there.
+
+All ends are kept. The data do not rule out a minimum whose likelihood ratio n ln(Σe²/Σe²₀) is
+below the quantile of χ² with one degree of freedom: its value lies in the profile likelihood region
+(Venzon and Moolgavkar, Appl. Statist. 37 (1988) 87). A parameter that differs between such minima
+is ambiguous. Coloured residuals hold less information than white ones. The ratio is multiplied by
+the least `variance_ratio` of all parameters (`sysid.uncertainty.linear_model`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
+from sysid.identification.result import Minimum
+from sysid.search.refine import RefinedCandidate, refine_candidate
+from sysid.search.state import SAME_OPTIMUM
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import from_unit, to_unit
+from sysid.uncertainty.estimates import Estimate
+
+_DELAY_PLACES, _PLACES = 128, 16  # of a scan: over the range of a time lag, of another parameter
+_STARTS = 6  # dips from which least squares continues, in a round
+_TRIAL_STEPS, _MAX_STEPS = 4, 20  # of least squares from each, and from a promising one
+_PROMISING = 1.5  # times the RMS of the best: least squares continues below it
+_MAX_ROUNDS = 4
+_SAME_PLACE = 1e-3  # of the range: nearer ends are one minimum
+_MOST_MINIMA = 10  # that a result lists
+
+
+class FoundMinima(NamedTuple):
+    """All minima, the lowest first; `has_gained`: the scan ended lower than the search."""
+
+    minima: tuple[Minimum, ...]
+    has_gained: bool
+    warnings: tuple[str, ...] = ()
+
+
+class ScanResult(NamedTuple):
+    """Best candidate after a scan, with all ends of least squares and the simulations spent."""
+
+    best: RefinedCandidate
+    ends: tuple[RefinedCandidate, ...]
+    evaluations: int
+
+
+def scan_parameters(
+    problem: Problem,
+    start: RefinedCandidate,
+    delays: Sequence[int],
+    budget: int,
+    is_late: Callable[[], bool] | None = None,
+) -> ScanResult:
+    """Scan each parameter alone from a minimum, with at most `budget` simulations.
+
+    Parameters
+    ----------
+    start : RefinedCandidate
+        A minimum. It counts as one of the ends.
+    delays : sequence of int
+        Numbers of the free parameters that time lags depend on.
+    """
+    best, ends, spent = start, [start], 0
+    for _ in range(_MAX_ROUNDS):
+        scanned = _scan_around(problem, best, delays, budget - spent)
+        spent += sum(series.values.size - 1 for series in scanned)
+        reached = best
+        for place, rms in _find_dips(scanned):
+            if is_late is not None and is_late():
+                break
+            trial = refine_candidate(problem, place, rms, budget - spent, _TRIAL_STEPS)
+            if trial is None:
+                break
+            spent += trial.evaluations
+            if not trial.rms < _PROMISING * best.rms:
+                continue
+            end = refine_candidate(problem, trial.theta, trial.rms, budget - spent, _MAX_STEPS)
+            if end is None:
+                break
+            spent += end.evaluations
+            ends.append(end)
+            reached = min(reached, end, key=lambda candidate: candidate.rms)
+        gains = reached.rms < best.rms * (1.0 - SAME_OPTIMUM)
+        best = reached
+        if not gains:
+            break
+    return ScanResult(best, tuple(ends), spent)
+
+
+class _Series(NamedTuple):
+    """Places with one parameter moved, in ascending order, and their fitness; the centre too."""
+
+    places: FloatArray
+    values: FloatArray
+    centre: int
+
+
+def _scan_around(
+    problem: Problem, centre: RefinedCandidate, delays: Sequence[int], budget: int
+) -> list[_Series]:
+    """Simulate the range of each parameter, time lags first, as far as the budget goes."""
+    middle = to_unit(problem.evaluator, centre.theta[None])[0]
+    scanned, moved = [], []
+    for d in (*delays, *(d for d in range(middle.size) if d not in delays)):
+        count = _DELAY_PLACES if d in delays else _PLACES
+        budget -= count
+        if budget < 0:
+            break
+        series = np.repeat(middle[None], count, axis=0)
+        series[:, d] = (np.arange(count) + 0.5) / count
+        scanned.append(d)
+        moved.append(series)
+    if not moved:
+        return []
+    places = from_unit(problem.evaluator, np.concatenate(moved))
+    ends = np.cumsum([len(series) for series in moved])[:-1]
+    fitness = problem.evaluate_fitness(places)
+    return [
+        _insert_centre(theta, values, series[:, d], middle[d], centre)
+        for theta, values, series, d in zip(
+            np.split(places, ends), np.split(fitness, ends), moved, scanned, strict=True
+        )
+    ]
+
+
+def _insert_centre(
+    places: FloatArray,
+    values: FloatArray,
+    unit: FloatArray,
+    middle: float,
+    centre: RefinedCandidate,
+) -> _Series:
+    at = int(np.searchsorted(unit, middle))
+    return _Series(
+        np.insert(places, at, centre.theta, axis=0), np.insert(values, at, centre.rms), at
+    )
+
+
+def _find_dips(scanned: Sequence[_Series]) -> list[tuple[FloatArray, float]]:
+    """Find the lowest local minima of the series, without their centre: places and fitness."""
+    dips = []
+    for places, values, centre in scanned:
+        framed = np.pad(np.where(np.isfinite(values), values, np.inf), 1, constant_values=np.inf)
+        is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:])
+        is_dip[centre] = False
+        dips += [(places[i], float(values[i])) for i in np.flatnonzero(is_dip)]
+    return sorted(dips, key=lambda dip: dip[1])[:_STARTS]
+
+
+def collect_minima(
+    problem: Problem,
+    ends: Sequence[tuple[FloatArray, float]],
+    variance_ratio: float = 1.0,
+    recorded_from: float | None = None,
+) -> tuple[Minimum, ...]:
+    """Group the ends of least squares, (D,) and RMS each, by minimum; the lowest first."""
+    kept: list[Minimum] = []
+    n = problem.n_scored * variance_ratio
+    for theta, rms in sorted(ends, key=lambda end: end[1]):
+        for i, minimum in enumerate(kept):
+            if _is_same_place(problem, minimum.values, theta):
+                kept[i] = replace(minimum, count=minimum.count + 1)
+                break
+        else:
+            least = kept[0].rms if kept else rms
+            ratio = 0.0 if rms <= least else np.inf if least == 0 else 2.0 * n * np.log(rms / least)
+            kept.append(Minimum(theta, rms, 1, float(ratio), recorded_from))
+    return tuple(kept[:_MOST_MINIMA])
+
+
+def _is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
+    places = to_unit(problem.evaluator, np.array([first, second]))
+    return bool(np.max(np.abs(places[0] - places[1]), initial=0.0) < _SAME_PLACE)
+
+
+def mark_ambiguous(
+    problem: Problem, estimates: tuple[Estimate, ...], found: FoundMinima
+) -> tuple[Estimate, ...]:
+    """Mark estimates that differ between the minima that the data do not rule out.
+
+    A value differs if its interval and that of the estimate, equally wide, do not overlap. An
+    initial state is not compared where the start of the record is left out.
+    """
+    by_name = {estimate.name: estimate.value for estimate in estimates}
+    theta = np.array([by_name[name] for name in problem.free_names])
+    compatible = [
+        minimum
+        for minimum in found.minima
+        if minimum.is_compatible and not _is_same_place(problem, minimum.values, theta)
+    ]
+    columns = {name: d for d, name in enumerate(problem.free_names)}
+    parameters = {parameter.name for parameter in problem.model.parameters}
+    return tuple(
+        _mark_one(
+            estimate,
+            columns[estimate.name],
+            [m for m in compatible if m.recorded_from is None or estimate.name in parameters],
+        )
+        if estimate.name in columns
+        else estimate
+        for estimate in estimates
+    )
+
+
+def _mark_one(estimate: Estimate, column: int, compatible: Sequence[Minimum]) -> Estimate:
+    if estimate.interval95 is None:
+        return estimate
+    lower, upper = estimate.interval95
+    others = [m for m in compatible if abs(m.values[column] - estimate.value) > upper - lower]
+    if not others:
+        return estimate
+    listed = ", ".join(f"{value:.4g}" for value in sorted(m.values[column] for m in others))
+    verb = "fits" if len(others) == 1 else "fit"
+    since = next((m.recorded_from for m in others if m.recorded_from is not None), None)
+    where = "" if since is None else f" from t = {since:.3g} s on, where the input is recorded"
+    reason = f"{listed}{format_unit(estimate.unit)} {verb} as well{where}"
+    return replace(estimate, status="ambiguous", reason=reason)

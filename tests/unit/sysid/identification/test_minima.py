@@ -1,0 +1,193 @@
+"""Minima that one search misses, and minima that the data do not tell apart."""
+
+import numpy as np
+import pytest
+
+from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
+from sysid.core.types import FloatArray
+from sysid.identification.minima import collect_minima, scan_parameters
+from sysid.models.model import Model
+from sysid.models.parse import parse_model
+from sysid.search.refine import RefinedCandidate, refine_candidates
+from sysid.simulation.problem import Problem
+from tests import searching
+
+STEP, GAIN, TIME, LAG, PERIOD = 0.2, 2.0, 1.5, 1.33, 5.0
+FINE = 40
+NOISE = 0.02
+
+REGENERATIVE = {
+    "name": "regenerative",
+    "form": "differential",
+    "inputs": {"f": "N"},
+    "states": {"x": "m", "v": "m/s"},
+    "parameters": {
+        "w": {"lower": 1, "upper": 60, "unit": "rad/s"},
+        "k": {"lower": 0, "upper": 60, "unit": "1/s^2"},
+        "tau": {"lower": 0, "upper": 9, "unit": "s"},
+    },
+    "equations": {"x": "v", "v": "f - 0.1*w*v - w**2*x - k*(x - x(t - tau))"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0, "v": 0},
+}
+
+
+def lag_model() -> Model:
+    return parse_model(
+        {
+            "name": "lag",
+            "form": "differential",
+            "inputs": {"u": "V"},
+            "states": {"x": "V"},
+            "parameters": {
+                "K": {"lower": 0, "upper": 10, "unit": "1"},
+                "T": {"lower": 0.05, "upper": 10, "unit": "s"},
+                "L": {"lower": 0, "upper": 12, "unit": "s"},
+            },
+            "equations": {"x": "(K*u(t - L) - x)/T"},
+            "outputs": {"y": "x"},
+            "initial": {"x": {"lower": -5, "upper": 5}},
+        }
+    )
+
+
+def respond(u: FloatArray) -> FloatArray:
+    """The response to a held input, from rest at its first value, exact between jumps."""
+    grid = np.arange((u.size - 1) * FINE + 1) * STEP / FINE
+    driven = GAIN * u[np.clip(np.floor((grid - LAG) / STEP + 1e-9).astype(int), 0, u.size - 1)]
+    pole, x, out = np.exp(-STEP / FINE / TIME), driven[0], np.empty(grid.size)
+    for k in range(grid.size):
+        out[k] = x
+        x = pole * x + (1 - pole) * driven[k]
+    return out[::FINE]
+
+
+def periodic(count: int = 300) -> FloatArray:
+    return np.where(np.round(np.arange(count) * STEP, 6) % PERIOD < 2.0, 1.0, -0.5)
+
+
+def steps(count: int = 300) -> FloatArray:
+    random = np.random.default_rng(4)
+    return np.repeat(random.uniform(-1, 1, count // 6 + 1), 6)[:count]
+
+
+def record(u: FloatArray, first: int, seed: int = 1) -> Record:
+    """The part of a longer recording that begins at sample `first`."""
+    y = respond(u) + NOISE * np.random.default_rng(seed).standard_normal(u.size)
+    times = np.arange(u.size - first) * STEP
+    return Record(
+        (Channel("u", times, u[first:], "V", hold="zero"),), (Channel("y", times, y[first:], "V"),)
+    )
+
+
+def status(found: Identification, name: str) -> str:
+    return next(one.status for one in found.estimates if one.name == name)
+
+
+def reason(found: Identification, name: str) -> str:
+    return next(one.reason for one in found.estimates if one.name == name)
+
+
+def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:
+    model = parse_model(REGENERATIVE)
+    times = np.arange(400) * 0.05
+    force = np.where((times % 7 < 0.5), 20.0, 0.0)
+    clean = Record((Channel("f", times, force, "N"),), (Channel("y", times, 0 * times, "m"),))
+    truth = np.array([6.0, 8.0, 1.9])
+    blank = Problem.build(model, [clean])
+    y = blank.predict(truth[None])[0]
+    y = y + 0.02 * np.std(y) * np.random.default_rng(2).standard_normal(y.size)
+    problem = Problem.build(model, [Record(clean.inputs, (Channel("y", times, y, "m"),))])
+    (false,) = refine_candidates(problem, [np.array([6.0, 8.0, 2.95])])
+    assert false is not None
+    (best,) = refine_candidates(problem, [truth])
+    assert best is not None
+    assert false.rms > 1.5 * best.rms
+    found = scan_parameters(problem, false, [2], 2000)
+    assert found.best.rms == pytest.approx(best.rms, rel=1e-6)
+    assert found.best.theta == pytest.approx(best.theta, rel=1e-3)
+    assert found.evaluations <= 1000
+
+
+def test_a_scan_keeps_its_budget_and_its_start() -> None:
+    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    start = RefinedCandidate(np.array([2.0, 1.5, 4.0, 0.0]), 1.0, 0)
+    for budget in (0, 10, 150, 200):
+        found = scan_parameters(problem, start, [2], budget)
+        assert found.evaluations <= budget
+        assert found.ends[0] is start
+
+
+def test_lags_a_period_apart_are_listed_where_the_start_is_skipped() -> None:
+    found = identify(lag_model(), record(periodic(500), 200), skip=120, seed=3)
+    assert status(found, "L") == "ambiguous"
+    lags = sorted(one.values[2] for one in found.search.minima if one.is_compatible)
+    assert lags == pytest.approx([LAG, LAG + PERIOD, LAG + 2 * PERIOD], abs=0.02)
+    told = {float(text) for text in reason(found, "L").split(" s ")[0].split(", ")}
+    (own,) = (one.value for one in found.estimates if one.name == "L")
+    others = [lag for lag in lags if abs(lag - own) > 1]
+    assert sorted(told) == pytest.approx(others, abs=0.01)
+    assert {status(found, name) for name in "KT"} == {"identified"}
+
+
+def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart() -> None:
+    found = identify(lag_model(), record(periodic(500), 200), seed=3)
+    assert status(found, "L") == "ambiguous"
+    assert "where the input is recorded" in reason(found, "L")
+    assert any("the data contradict the input that is assumed" in text for text in found.warnings)
+    compared = [one for one in found.search.minima if one.recorded_from is not None]
+    assert len([one for one in compared if one.is_compatible]) == 3
+
+
+def test_a_record_that_begins_at_rest_tells_lags_a_period_apart() -> None:
+    found = identify(lag_model(), record(np.concatenate([np.full(40, -0.5), periodic()]), 0))
+    assert status(found, "L") == "identified"
+    assert not any("contradict" in text for text in found.warnings)
+
+
+def test_an_input_without_a_period_tells_the_lag() -> None:
+    found = identify(lag_model(), record(steps(500), 200))
+    assert status(found, "L") == "identified"
+    (own,) = (one for one in found.estimates if one.name == "L")
+    assert own.stderr is not None
+    assert abs(own.value - LAG) <= 4 * own.stderr + 0.1
+
+
+def test_a_search_that_ends_too_early_says_that_it_did_not_settle() -> None:
+    hurried = GeneticAlgorithm(generations=1, islands=1, refine=False)
+    found = identify(load_model("duffing-eq16"), _duffing_record(), hurried)
+    assert not found.search.settled
+    assert found.search.because is None
+    assert "identified" not in {one.status for one in found.estimates}
+    assert any(text.startswith("the search did not settle") for text in found.warnings)
+
+
+def test_a_search_is_settled_by_starts_that_agree_or_by_residuals_that_are_noise() -> None:
+    agreed = identify(load_model("duffing-eq16"), _duffing_record())
+    assert agreed.search.settled
+    assert agreed.search.because == "starts"
+    assert 2 <= agreed.search.agreeing_starts <= agreed.search.independent_starts
+    hurried = GeneticAlgorithm(generations=20, islands=1)
+    quick = identify(load_model("duffing-eq16"), _duffing_record(), hurried)
+    assert quick.search.agreeing_starts < 2
+    assert quick.search.because == "residuals"
+    assert {one.status for one in quick.estimates} == {"identified"}
+
+
+def _duffing_record() -> Record:
+    return searching.record(searching.noisy(seed=5))
+
+
+def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
+    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    ends = [
+        (np.array([2.0, 1.5, 1.33, 0.0]), 0.02),
+        (np.array([2.001, 1.501, 1.331, 0.001]), 0.02),
+        (np.array([2.0, 1.5, 6.33, 0.0]), 0.021),
+    ]
+    first, second = collect_minima(problem, ends)
+    assert (first.count, second.count) == (2, 1)
+    assert first.likelihood_ratio == 0.0
+    assert second.likelihood_ratio == pytest.approx(2 * 300 * np.log(1.05))
+    assert not second.is_compatible
+    assert collect_minima(problem, ends, variance_ratio=0.1)[1].is_compatible
