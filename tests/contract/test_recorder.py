@@ -291,6 +291,7 @@ def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Des
     desk.recorder.record_progress(run, searched(30, 300, 0.5), 2.0)
     desk.recorder.cancel_job()
     assert desk.place.job(desk.job).state is JobState.CANCELLED
+    assert desk.place.job(desk.job).evaluations == 300  # those of its checkpoint are among them
     with desk.place.database.write_session() as session:
         JobRepository(session).resume(desk.job)
     desk.recorder = desk.claim()

@@ -30,6 +30,11 @@ def test_coding_is_the_inverse_of_decoding(bits: int, values: list[int]) -> None
     assert np.array_equal(encode(decode(words, bits), bits), words)
 
 
+def test_a_place_is_coded_by_the_nearest_word() -> None:
+    places = np.array([[0.0, 0.16, 0.17, 0.6, 0.9, 1.0]])
+    assert encode(places, 2).tolist() == [[0, 0, 1, 2, 3, 3]]
+
+
 @given(st.booleans(), st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_placing_is_the_inverse_of_locating(log: bool, values: list[float]) -> None:
     evaluator = example(n=80).evaluator

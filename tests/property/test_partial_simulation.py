@@ -55,6 +55,15 @@ def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
     assert np.array_equal(part[:, reached], whole, equal_nan=True)
 
 
+def test_a_part_reaches_a_sample_between_two_steps_at_its_end() -> None:
+    problem = POSED["between"]
+    theta, progress = candidates(problem, 1), compute_record_progress(problem)
+    whole = problem.predict(theta)
+    for m in range(0, progress.size, 4):
+        part = predict_partially(problem.evaluator, theta, float(progress[m]))[:, :5].T
+        assert np.array_equal(part[:, m], whole[:, m], equal_nan=True)
+
+
 @pytest.mark.parametrize("name", sorted(POSED))
 def test_fitness_by_the_whole_part_is_fitness(name: str) -> None:
     problem = POSED[name]

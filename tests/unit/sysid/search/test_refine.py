@@ -11,6 +11,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.search import least_squares, refine
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import to_unit
 from tests.searching import example, force, noisy, record
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])
@@ -53,6 +54,18 @@ def test_an_optimum_on_the_bound_is_reached_exactly() -> None:
     end = refine_candidates(problem, [np.array([0.2, 0.5, 5.0, 2.0])])[0]
     assert end is not None
     assert end.theta[3] == 1.5
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1.5, 5.0), (0.0, 0.8)])
+def test_a_solution_beside_a_bound_is_moved_onto_it(lower: float, upper: float) -> None:
+    changes = {"a": {"lower": lower, "upper": upper}}  # the true value, 1, lies beyond
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=changes)
+    bound = min(max(1.0, lower), upper)
+    place = to_unit(problem.evaluator, np.array([[0.2, 0.5, 5.0, bound]]))[0]
+    place[3] += 5e-7 if lower > 1.0 else -5e-7
+    theta, rms = refine._snap_to_bounds(problem.evaluator, place)
+    assert theta[3] == bound
+    assert rms == problem.evaluate_fitness(theta[None])[0]
 
 
 def test_robust_refinement_withstands_outliers() -> None:

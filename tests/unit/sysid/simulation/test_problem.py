@@ -71,6 +71,14 @@ def test_settings_do_not_change_with_what_they_were_made_of() -> None:
     assert settings == FitSettings({"c": {"fixed": 0.2}}, weights={"y": 2.0})
 
 
+def test_a_recursion_is_scored_from_the_first_value_that_it_computes() -> None:
+    model = difference({"x": "b*x(k - 1) + c*x(k - 2) + u(k - 1)"}, "x", initial={"x": "measured"})
+    weight = Problem.build(model, [record(samples=30)]).evaluator.weight
+    assert model.memory == 2
+    assert not weight[:2].any()
+    assert weight[2:].all()
+
+
 def test_j_is_the_rms_error_over_the_scored_samples() -> None:
     model, blank = duffing(), record()
     y = blank.outputs[0].values.copy()
