@@ -186,23 +186,28 @@ def mark_ambiguous(
 ) -> tuple[Estimate, ...]:
     """Mark estimates that differ between the minima that the data do not rule out.
 
-    A value differs if its interval and that of the estimate, equally wide, do not overlap. An
-    initial state is not compared where the start of the record is left out.
+    The minimum nearest to the estimate is its own; under a noise model it is not quite the same.
+    A value differs if the intervals of both, equally wide, do not overlap. An initial state is not
+    compared where the start of the record is left out.
     """
     by_name = {estimate.name: estimate.value for estimate in estimates}
     theta = np.array([by_name[name] for name in problem.free_names])
-    compatible = [
-        minimum
-        for minimum in found.minima
-        if minimum.is_compatible and not _is_same_place(problem, minimum.values, theta)
+    declared = {parameter.name for parameter in problem.model.parameters}
+    pairs = [
+        pair
+        for is_recorded in (False, True)
+        for pair in _pair_with_own(
+            problem,
+            theta,
+            [m for m in found.minima if (m.recorded_from is not None) == is_recorded],
+        )
     ]
     columns = {name: d for d, name in enumerate(problem.free_names)}
-    parameters = {parameter.name for parameter in problem.model.parameters}
     return tuple(
         _mark_one(
             estimate,
             columns[estimate.name],
-            [m for m in compatible if m.recorded_from is None or estimate.name in parameters],
+            [p for p in pairs if p[1].recorded_from is None or estimate.name in declared],
         )
         if estimate.name in columns
         else estimate
@@ -210,11 +215,28 @@ def mark_ambiguous(
     )
 
 
-def _mark_one(estimate: Estimate, column: int, compatible: Sequence[Minimum]) -> Estimate:
+def _pair_with_own(
+    problem: Problem, theta: FloatArray, minima: Sequence[Minimum]
+) -> list[tuple[Minimum, Minimum]]:
+    """Pair the minimum nearest to the estimate (D,) with each other that is compatible."""
+    if not minima:
+        return []
+    places = to_unit(problem.evaluator, np.array([theta, *(m.values for m in minima)]))
+    own = int(np.argmin(np.max(np.abs(places[1:] - places[0]), axis=1, initial=0.0)))
+    return [(minima[own], m) for i, m in enumerate(minima) if i != own and m.is_compatible]
+
+
+def _mark_one(
+    estimate: Estimate, column: int, pairs: Sequence[tuple[Minimum, Minimum]]
+) -> Estimate:
     if estimate.interval95 is None:
         return estimate
     lower, upper = estimate.interval95
-    others = [m for m in compatible if abs(m.values[column] - estimate.value) > upper - lower]
+    others = [
+        other
+        for own, other in pairs
+        if abs(other.values[column] - own.values[column]) > upper - lower
+    ]
     if not others:
         return estimate
     listed = ", ".join(f"{value:.4g}" for value in sorted(m.values[column] for m in others))

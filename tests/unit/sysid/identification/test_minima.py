@@ -5,11 +5,12 @@ import pytest
 
 from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
 from sysid.core.types import FloatArray
-from sysid.identification.minima import collect_minima, scan_parameters
+from sysid.identification.minima import FoundMinima, collect_minima, mark_ambiguous, scan_parameters
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
 from tests import searching
 
 STEP, GAIN, TIME, LAG, PERIOD = 0.2, 2.0, 1.5, 1.33, 5.0
@@ -191,3 +192,25 @@ def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
     assert second.likelihood_ratio == pytest.approx(2 * 300 * np.log(1.05))
     assert not second.is_compatible
     assert collect_minima(problem, ends, variance_ratio=0.1)[1].is_compatible
+
+
+def test_an_estimate_that_a_noise_model_moved_is_not_ambiguous_for_it() -> None:
+    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    names = problem.free_names
+    white, moved, far = (
+        np.array([2.0, 1.5, 1.33, 0.0]),
+        np.array([2.2, 1.5, 1.33, 0.0]),
+        np.array([2.0, 1.5, 6.33, 0.0]),
+    )
+    estimates = tuple(
+        Estimate(name, "1", value, -10.0, 20.0, 0.01, (value - 0.02, value + 0.02), "identified")
+        for name, value in zip(names, moved.tolist(), strict=True)
+    )
+    minima = collect_minima(problem, [(white, 0.02), (far, 0.0200001)])
+    marked = mark_ambiguous(problem, estimates, FoundMinima(minima, False))
+    assert [one.status for one in marked] == [
+        "identified",
+        "identified",
+        "ambiguous",
+        "identified",
+    ]
