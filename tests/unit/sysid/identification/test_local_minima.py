@@ -116,6 +116,17 @@ def lasting(steps: int) -> Problem:
     return SimpleNamespace(experiments=(SimpleNamespace(grid=grid),))  # type: ignore[return-value]
 
 
+def test_points_near_an_estimate_stay_inside_the_bounds() -> None:
+    problem = example()
+    linear = analyse_estimate(problem, TRUTH).linear_model
+    assert linear is not None
+    for corner in (problem.evaluator.lower, problem.evaluator.upper):
+        search = local_minima._LocalSearch(problem, linear, 1, 1000)
+        starts, _ = search._simulate_moves(corner, np.full(32, 3.0))
+        assert np.all((starts >= problem.evaluator.lower) & (starts <= problem.evaluator.upper))
+        assert np.any(starts != corner)
+
+
 def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local_minima, "_MAX_LATE_WORK", 0)
     problem = example()

@@ -356,6 +356,11 @@ def test_coefficients_on_past_outputs_are_those_that_multiply_a_state(
     assert found == {"y": count}
 
 
+def test_a_parameter_inside_a_function_of_a_state_is_a_coefficient() -> None:
+    model = difference({"x": "sin(x(k - 1) + b) + c"}, "x")
+    assert count_past_output_coefficients(model, model.parameters) == {"y": 1}
+
+
 def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -> None:
     draw = draws(14)
     record = Record(
