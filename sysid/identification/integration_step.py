@@ -37,6 +37,7 @@ _NOTABLE_MOVE = 0.3  # of a standard error
 _NOTABLE_GROWTH = 1.3  # of a standard error with half the step
 _NOTABLE_ERROR = 1e-3  # of the output's size: smaller integration errors act linearly
 _NOTABLE_SHARE = 0.01  # of a value: smaller moves are accepted if the original step fits far better
+_RANGE_SHARE = 0.1  # of that share, of the range: so are these, such as those of values near 0
 _TINY = float(np.finfo(float).tiny)
 _LIKELIHOOD_GAIN = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_STEPS = 2_000_000  # of one simulation
@@ -263,7 +264,8 @@ def _describe_moves(
         if error is None:
             is_notable = not is_near and distance > _NOTABLE_SHARE
         else:
-            is_notable = shift > max(_NOTABLE_MOVE * error, share * abs(estimate.value))
+            is_small = shift <= share * abs(estimate.value) or distance <= share * _RANGE_SHARE
+            is_notable = shift > _NOTABLE_MOVE * error and not is_small
         if is_notable:
             often = f", {shift / error:.2g} of its standard errors away" if error else ""
             unit = format_unit(estimate.unit)

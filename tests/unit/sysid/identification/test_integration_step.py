@@ -11,7 +11,12 @@ from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.data.records import Channel, Record
 from sysid.identification.conclude import conclude_run
 from sysid.identification.identify import identify
-from sysid.identification.integration_step import HalfStep, compare_half_step, find_limit
+from sysid.identification.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    find_limit,
+)
 from sysid.identification.result import Identification
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
@@ -236,3 +241,30 @@ def test_the_limits_of_a_finer_fit_have_names() -> None:
     assert find_limit(coarse, 10 * coarse.problem.n_steps) == "the limit on the work of finer fits"
     assert find_limit(coarse, work, 10) == "the budget of evaluations"
     assert find_limit(coarse, work, None, lambda: True) == "the time limit"
+
+
+def test_a_finer_fit_starts_from_what_is_best_with_the_finer_step() -> None:
+    """The last champion may owe its fit to the longer step."""
+    truth = np.array([STIFF[name] for name in ("K", "T1", "r", "L")])
+    far = truth * np.array([1.0, 1.0, 4.0, 1.3])
+    half = HalfStep(Problem.build(two_lags(8), [sampled(STIFF)]), far, {}, 0)
+    starts, rms, count = choose_starts(half, [[truth, far], [far]])
+    np.testing.assert_array_equal(starts, [truth, far])
+    np.testing.assert_array_equal(rms, half.problem.evaluate_fitness(np.array([truth, far])))
+    assert count == 3
+    many = [far] * 100 + [truth]
+    assert choose_starts(half, [many])[0][0] is truth
+    assert choose_starts(half, [many])[2] <= 32
+
+
+@pytest.mark.parametrize(("half_range", "status"), [(0.5, "unidentifiable"), (1.0, "identified")])
+def test_an_interval_wider_than_the_range_identifies_nothing(
+    half_range: float, status: str
+) -> None:
+    bounds = {"lower": STIFF["L"] - half_range, "upper": STIFF["L"] + half_range}
+    fields = {"r": {"fixed": SLOW["r"]}, "L": bounds}
+    lag = by_name(identify(two_lags(4), sampled(SLOW, sd=0.5), QUICK, parameters=fields))["L"]
+    assert lag.stderr is not None
+    assert 0.3 < lag.stderr < 0.5
+    assert lag.status == status
+    assert lag.reason.endswith("is wider than its range") == (status == "unidentifiable")
