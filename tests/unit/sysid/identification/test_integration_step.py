@@ -148,26 +148,40 @@ def test_a_stiff_plant_is_identified_at_any_substeps(substeps: int) -> None:
     assert not any("substeps" in text for text in found.warnings if text not in notes)
 
 
-def test_the_edge_of_stability_is_no_standard_error() -> None:
-    """The fast lag lies below all that the data tell; a long step bounds it from below."""
+@pytest.mark.parametrize("substeps", [2, 4])
+def test_a_standard_error_from_the_edge_of_stability_counts(substeps: int) -> None:
+    """The fast lag lies at its bound, where the method is just stable: no value moves by much."""
+    edge = 1.0 / (2.7 * substeps * STIFF["T1"])
+    record = sampled({**STIFF, "r": 2e-4}, substeps=1000)
+    problem = Problem.build(
+        two_lags(substeps), [record], parameters={"r": {"lower": edge, "upper": 1}}
+    )
+    start = np.array([STIFF["K"], STIFF["T1"], edge, STIFF["L"]])
+    (end,) = refine_candidates(problem, [start])
+    assert end is not None
+    half = compare_half_step(problem, end.theta, analyse_estimate(problem, end.theta))
+    assert half is not None
+    assert half.changes["L"].startswith("the standard error of L is 2")
+
+
+def test_a_lag_that_the_data_do_not_tell_has_the_error_of_a_short_step() -> None:
     wide = {"r": {"lower": 2e-4, "upper": 1}}
     record = sampled({**STIFF, "r": 2e-4}, substeps=1000)
-    for substeps in (1, 2, 4):
-        problem = Problem.build(two_lags(substeps), [record], parameters=wide)
-        edge = 1.0 / (2.75 * substeps * STIFF["T1"])
-        start = np.array([STIFF["K"], STIFF["T1"], edge, STIFF["L"]])
-        (end,) = refine_candidates(problem, [start])
-        assert end is not None
-        half = compare_half_step(problem, end.theta, analyse_estimate(problem, end.theta))
-        assert half is not None
-        assert half.changes
-    errors = [
+    long, short = (
         by_name(identify(two_lags(substeps), record, QUICK, parameters=wide))["L"].stderr
         for substeps in (1, 32)
-    ]
-    assert errors[0] is not None
-    assert errors[1] is not None
-    assert 0.5 < errors[0] / errors[1] < 2
+    )
+    assert long is not None
+    assert short is not None
+    assert 0.5 < long / short < 2
+
+
+def test_half_a_standard_error_is_a_change_and_a_tenth_is_none() -> None:
+    model, record = load_model("fopdt"), noisy("fopdt", FINE, 0.01)
+    _, half = compared(model, "fopdt", record)
+    assert 0.3 < float(half.changes["L"].split()[-6]) < 1.0
+    quiet = replace_substeps(model, 4 * model.solver.substeps)
+    assert compared(quiet, "fopdt", record)[1].changes == {}
 
 
 def test_a_plant_that_is_not_stiff_keeps_its_step() -> None:
