@@ -199,14 +199,14 @@ def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis)
 class _Analysed(NamedTuple):
     """The analysed estimate, and the problem with the integration step that it needs.
 
-    `first`: by name, the estimates with the model's own step that a finer one has changed.
+    `first`: the estimates with the model's own step, if that is not the one.
     """
 
     problem: Problem
     refined: tuple[RefinedCandidate | None, ...]
     ends: list[tuple[FloatArray, float]]
     found: FoundMinima
-    first: Mapping[str, Estimate]
+    first: tuple[Estimate, ...]
     noise: GeneralisedEstimate
     analysis: Analysis
 
@@ -226,7 +226,7 @@ def _refine_and_analyse(
         for champion, island, end in zip(champions, state.islands, refined, strict=True)
     ]
     work = compute_work_limit(problem, state.evaluations)
-    first: dict[str, Estimate] = {}
+    first: tuple[Estimate, ...] = ()
     has_gained = False
     while True:
         best = _analyse_best(problem, algorithm, state, refined, ends, deadline)
@@ -250,8 +250,7 @@ def _refine_and_analyse(
             marked = mark_changing(analysis.estimates, half.changes, limit)
             analysis = replace(analysis, estimates=marked)
             break
-        if not first:
-            first = {e.name: e for e in analysis.estimates if e.name in half.changes}
+        first = first or analysis.estimates
         problem = half.problem
         work -= problem.n_steps * sum(end.evaluations for end in fitted)
         refined = _add_evaluations(fitted, refined, ends, theta, analysis)

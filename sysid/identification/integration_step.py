@@ -186,22 +186,32 @@ def mark_changing(
 
 
 def explain_finer_step(
-    asked: Problem, used: Problem, first: Mapping[str, Estimate], estimates: tuple[Estimate, ...]
+    asked: Problem, used: Problem, first: tuple[Estimate, ...], estimates: tuple[Estimate, ...]
 ) -> tuple[str, ...]:
     """Explain why a result is that of a finer step than the model's; `first`: estimates with it."""
     wanted, taken = asked.model.solver.substeps, used.model.solver.substeps
     if taken == wanted:
         return ()
-    changes = "; ".join(
-        f"{_format_estimate(estimate, first[estimate.name])} instead of "
-        f"{_format_estimate(first[estimate.name], estimate)}"
+    before = {estimate.name: estimate for estimate in first}
+    changes = [
+        f"{_format_estimate(estimate, before[estimate.name])} instead of "
+        f"{_format_estimate(before[estimate.name], estimate)}"
         for estimate in estimates
-        if estimate.name in first
-    )
+        if estimate.name in before and _differs(estimate, before[estimate.name])
+    ]
     return (
         f"the integration step of the model, substeps: {wanted}, is too long for these data. The "
-        f"result is that of substeps: {taken}: {changes}",
+        f"result is that of substeps: {taken}{': ' if changes else ''}{'; '.join(changes)}",
     )
+
+
+def _differs(estimate: Estimate, before: Estimate) -> bool:
+    """Whether value or error of an estimate differ notably."""
+    if not estimate.stderr or not before.stderr:
+        return estimate.value != before.value
+    move, growth = abs(estimate.value - before.value), estimate.stderr / before.stderr
+    is_same = 1.0 / _NOTABLE_GROWTH <= growth <= _NOTABLE_GROWTH
+    return move > _NOTABLE_MOVE * before.stderr or not is_same
 
 
 def _spread(champions: Sequence[FloatArray]) -> Sequence[FloatArray]:
@@ -311,11 +321,12 @@ def _compare_errors(
 
 def _format_estimate(estimate: Estimate, other: Estimate) -> str:
     error = f" ± {estimate.stderr:.2g}" if estimate.stderr else ""
-    value = _format(estimate.value, estimate.value - other.value)
+    errors = [error for error in (estimate.stderr, other.stderr) if error]
+    value = _format(estimate.value, min(errors, default=0.0))
     return f"{estimate.name} = {value}{error}{format_unit(estimate.unit)}"
 
 
-def _format(value: float, shift: float) -> str:
-    """Format a value with the digits that show a shift."""
-    digits = max(4, 2 + ceil(log10(abs(value / shift)))) if value and shift else 4
+def _format(value: float, resolution: float) -> str:
+    """Format a value with the digits that show a difference of this size."""
+    digits = max(4, 2 + ceil(log10(abs(value / resolution)))) if value and resolution else 4
     return f"{value:.{digits}g}"
