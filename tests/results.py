@@ -48,6 +48,7 @@ def conclude(
             holds={},
             sample_time=0.1,
             search=SearchEvidence(True, "starts", 10, 5),
+            substeps=1,
             known_before=(),
             known_before_validation=(),
         ),

@@ -17,7 +17,7 @@ from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import list_job_parameters
 from service.jobs.results import read_noise_model
 from service.jobs.to_core import fit_settings_of
-from service.models.models import apply_selection, load_stored_model
+from service.models.models import apply_result, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
@@ -42,8 +42,8 @@ class StoredRun:
     body : mapping
         The job's request with the values of the run's cell in it.
     model : Model
-        With the terms that were selected on the run's data. A run that selects terms has all
-        candidates and a `rule` until it has a result.
+        With the terms that were selected on the run's data, and the substeps of its result. A run
+        that selects terms has all candidates and a `rule` until it has a result.
     """
 
     job: Job
@@ -55,7 +55,7 @@ class StoredRun:
     def from_rows(cls, job: Job, run: Run) -> "StoredRun":
         """Build the value from the rows of a run and its job."""
         body = build_run_body(job.spec, run.cell)
-        return cls(job, run, body, apply_selection(load_stored_model(body["model"]), run.result))
+        return cls(job, run, body, apply_result(load_stored_model(body["model"]), run.result))
 
     @property
     def requested_model(self) -> Model:

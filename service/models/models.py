@@ -18,7 +18,7 @@ from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
 from sysid.core.errors import SysidError, UnknownModel, suggest_name
 from sysid.models.catalogue import load
-from sysid.models.model import Model
+from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
 
 
@@ -117,11 +117,13 @@ def _parse_stored(document: str) -> Model:
     return parse_model(json.loads(document))
 
 
-def apply_selection(model: Model, result: Mapping[str, Any] | None) -> Model:
-    """Return the model with the terms that the result document of a run selected, if any."""
-    if model.rule is None or not (result or {}).get("selection"):
-        return model
-    return keep_terms(model, [entry["term"] for entry in (result or {})["selection"]])
+def apply_result(model: Model, result: Mapping[str, Any] | None) -> Model:
+    """Return the model of a run's result document: with its selected terms and its substeps."""
+    found = result or {}
+    if model.rule is not None and found.get("selection"):
+        model = keep_terms(model, [entry["term"] for entry in found["selection"]])
+    substeps = found.get("substeps", model.solver.substeps)
+    return model if substeps == model.solver.substeps else replace_substeps(model, substeps)
 
 
 def _get_own_model(session: Session, reference: str) -> StoredModel:

@@ -91,6 +91,7 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
         },
         "search": _to_search_document(identification),
         "warnings": list(identification.warnings),
+        "substeps": identification.substeps,
         "selection": [step._asdict() for step in identification.selection],
     }
 

@@ -19,7 +19,15 @@ from sysid.identification.generalised_least_squares import (
     fit_generalised_least_squares,
     make_whitening,
 )
-from sysid.identification.integration_step import warn_integration_step
+from sysid.identification.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    compute_work_limit,
+    explain_finer_step,
+    find_limit,
+    mark_changing,
+)
 from sysid.identification.local_minima import (
     LocalMinima,
     count_affordable_simulations,
@@ -98,7 +106,10 @@ def _build_identification(
     validation: Problem | None,
     deadline: Deadline,
 ) -> Identification:
-    refined, ends, found, noise, analysis = _refine_and_analyse(problem, algorithm, state, deadline)
+    asked = problem
+    problem, refined, ends, found, first, noise, analysis = _refine_and_analyse(
+        problem, algorithm, state, deadline
+    )
     problem, theta = resolve_noise_model(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(problem.free_names)
@@ -149,9 +160,7 @@ def _build_identification(
             ),
             *warn_time_limit(any(end.is_cut_short for end in refined if end is not None)),
             *_check_feedback(problem, simulated, analysis),
-            *warn_integration_step(
-                problem, theta, analysis.estimates, simulated, deadline.is_past_grace
-            ),
+            *explain_finer_step(asked, problem, first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
             *explain_noise_model_choice(problem, noise),
         ),
@@ -163,6 +172,7 @@ def _build_identification(
         holds={channel.name: channel.hold for channel in problem.records[0].inputs},
         sample_time=find_common_sample_time(problem.records),
         search=evidence,
+        substeps=problem.model.solver.substeps,
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),
     )
@@ -186,22 +196,109 @@ def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis)
     return describe_feedback(list_residual_series(problem, simulated), advises_noise_model=advises)
 
 
+class _Analysed(NamedTuple):
+    """The analysed estimate, and the problem with the integration step that it needs.
+
+    `first`: the estimates with the model's own step, if that is not the one.
+    """
+
+    problem: Problem
+    refined: tuple[RefinedCandidate | None, ...]
+    ends: list[tuple[FloatArray, float]]
+    found: FoundMinima
+    first: tuple[Estimate, ...]
+    noise: GeneralisedEstimate
+    analysis: Analysis
+
+
 def _refine_and_analyse(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState, deadline: Deadline
-) -> tuple[
-    tuple[RefinedCandidate | None, ...],
-    list[tuple[FloatArray, float]],
-    FoundMinima,
-    GeneralisedEstimate,
-    Analysis,
-]:
-    """Refine the islands' champions, scan for better minima and analyse the best."""
+) -> _Analysed:
+    """Refine the islands' champions, scan for better minima and analyse the best.
+
+    The integration step is halved until the estimates and their errors stand still, or until a
+    limit is reached. Then those that still change are not identified.
+    """
     champions = [_get_champion(problem, island.history) for island in state.islands]
     refined = _refine_champions(problem, algorithm, state, champions, deadline)
     ends = [
         (champion, island.champion_rms) if end is None else (end.theta, end.rms)
         for champion, island, end in zip(champions, state.islands, refined, strict=True)
     ]
+    work = compute_work_limit(problem, state.evaluations)
+    first: tuple[Estimate, ...] = ()
+    has_gained = False
+    while True:
+        best = _analyse_best(problem, algorithm, state, refined, ends, deadline)
+        refined, ends, theta, analysis = best.refined, best.ends, best.theta, best.analysis
+        has_gained |= best.has_gained
+        half, limit = _compare_half_step(
+            problem, algorithm, state, refined, theta, analysis, work, deadline
+        )
+        if half is None:
+            break
+        analysis = replace(analysis, evaluations=analysis.evaluations + half.evaluations)
+        fitted = None
+        if half.changes and not limit:
+            left = _count_simulations_left(algorithm, state, refined, analysis)
+            most = work // half.problem.n_steps
+            most = most if left is None else min(most, left)
+            fitted = _fit_half_step(half, state, ends, theta, most, deadline)
+            if fitted is None:
+                limit = "no simulation with half the step is finite"
+        if fitted is None:
+            marked = mark_changing(analysis.estimates, half.changes, limit)
+            analysis = replace(analysis, estimates=marked)
+            break
+        first = first or analysis.estimates
+        problem = half.problem
+        work -= problem.n_steps * sum(end.evaluations for end in fitted)
+        refined = _add_evaluations(fitted, refined, ends, theta, analysis)
+        ends = [(end.theta, end.rms) for end in fitted]
+    is_settled = half is None or not half.changes
+    noise, analysis = _apply_noise_model(
+        problem, algorithm, state, refined, theta, analysis, deadline, is_settled=is_settled
+    )
+    groups = analysis.exchanges
+    ordered = [(order_exchangeable(problem, end, groups), rms) for end, rms in best.all_ends]
+    minima = collect_minima(problem, ordered, _get_variance_ratio(analysis))
+    found = FoundMinima(minima, has_gained)
+    if _should_refine(algorithm, len(ends)):
+        simulations = _count_scan_simulations(problem, algorithm, state, refined, deadline)
+        recorded = compare_where_recorded(
+            problem,
+            noise.theta,
+            analysis,
+            _list_delays(problem),
+            simulations,
+            deadline.is_past_grace,
+        )
+        analysis = replace(analysis, evaluations=analysis.evaluations + recorded.evaluations)
+        found = FoundMinima((*minima, *recorded.minima), has_gained, recorded.warnings)
+    return _Analysed(problem, refined, ends, found, first, noise, analysis)
+
+
+class _AnalysedBest(NamedTuple):
+    """The best end and its analysis, with all ends; `has_gained`: a scan found it."""
+
+    refined: tuple[RefinedCandidate | None, ...]
+    ends: list[tuple[FloatArray, float]]
+    all_ends: list[tuple[FloatArray, float]]
+    has_gained: bool
+    theta: FloatArray
+    analysis: Analysis
+
+
+def _analyse_best(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    ends: list[tuple[FloatArray, float]],
+    deadline: Deadline,
+) -> _AnalysedBest:
+    """Scan from the best of the ends, analyse the result, and search for minima near it."""
+    ends = list(ends)
     best = min(range(len(ends)), key=lambda i: ends[i][1])
     all_ends, has_gained = list(ends), False
     if _should_refine(algorithm, len(ends)):
@@ -228,26 +325,95 @@ def _refine_and_analyse(
         theta = end.theta
         ends[best] = theta, end.rms
         refined = (*refined[:best], end, *refined[best + 1 :])
-    noise, analysis = _apply_noise_model(
-        problem, algorithm, state, refined, theta, analysis, deadline
+    return _AnalysedBest(refined, ends, all_ends, has_gained, theta, analysis)
+
+
+def _compare_half_step(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    theta: FloatArray,
+    analysis: Analysis,
+    work: int,
+    deadline: Deadline,
+) -> tuple[HalfStep | None, str]:
+    """Compare an estimate with that of half the step; name the limit that forbids to use it."""
+    is_refined = _should_refine(algorithm, len(state.islands))
+    is_late = deadline.is_past_grace if is_refined else lambda: True
+    left = _count_simulations_left(algorithm, state, refined, analysis)
+    half = compare_half_step(problem, theta, analysis, left, is_late)
+    if half is None or not half.changes:
+        return half, ""
+    if not is_refined:
+        return half, "estimates of this search are not refined"
+    left = None if left is None else max(0, left - half.evaluations)
+    return half, find_limit(half, work, left, deadline.is_past_grace)
+
+
+def _count_simulations_left(
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    analysis: Analysis,
+) -> int | None:
+    """Count the simulations left for a finer step, less those of its analysis."""
+    left = _count_budget_left(algorithm, state, refined)
+    if left is None:
+        return None
+    size = len(state.islands[0].point)
+    return max(0, left - analysis.evaluations - compute_analysis_budget(size))
+
+
+def _fit_half_step(
+    half: HalfStep,
+    state: RunState,
+    ends: list[tuple[FloatArray, float]],
+    theta: FloatArray,
+    max_simulations: int,
+    deadline: Deadline,
+) -> tuple[RefinedCandidate, ...] | None:
+    """Fit the champions of all islands with half the step; None if none is finite.
+
+    An island starts from the best of its champions with that step.
+    """
+    champions = [
+        [*(np.array(one.parameters) for one in island.history), end]
+        + ([half.theta] if end is theta else [])
+        for island, (end, _) in zip(state.islands, ends, strict=True)
+    ]
+    starts, values, spent = choose_starts(half, champions)
+    if not np.isfinite(values).any():
+        return None
+    found = refine_candidates(
+        half.problem, starts, max(0, max_simulations - spent), deadline.is_past_grace
     )
-    groups = analysis.exchanges
-    ordered = [(order_exchangeable(problem, theta, groups), rms) for theta, rms in all_ends]
-    minima = collect_minima(problem, ordered, _get_variance_ratio(analysis))
-    found = FoundMinima(minima, has_gained)
-    if _should_refine(algorithm, len(ends)):
-        most = _count_scan_simulations(problem, algorithm, state, refined, deadline)
-        recorded = compare_where_recorded(
-            problem,
-            noise.theta,
-            analysis,
-            _list_delays(problem),
-            most,
-            deadline.is_past_grace,
-        )
-        analysis = replace(analysis, evaluations=analysis.evaluations + recorded.evaluations)
-        found = FoundMinima((*minima, *recorded.minima), has_gained, recorded.warnings)
-    return refined, ends, found, noise, analysis
+    each = spent // len(starts)
+    return tuple(
+        RefinedCandidate(start, rms, each)
+        if end is None
+        else replace(end, evaluations=end.evaluations + each)
+        for start, rms, end in zip(starts, values.tolist(), found, strict=True)
+    )
+
+
+def _add_evaluations(
+    fitted: tuple[RefinedCandidate, ...],
+    refined: tuple[RefinedCandidate | None, ...],
+    ends: list[tuple[FloatArray, float]],
+    theta: FloatArray,
+    analysis: Analysis,
+) -> tuple[RefinedCandidate | None, ...]:
+    """Add the evaluations of the longer step to those of the finer one."""
+    counts = [0 if end is None else end.evaluations for end in refined]
+    counts = [
+        count + (analysis.evaluations if end is theta else 0)
+        for count, (end, _) in zip(counts, ends, strict=True)
+    ]
+    return tuple(
+        replace(end, evaluations=end.evaluations + count)
+        for end, count in zip(fitted, counts, strict=True)
+    )
 
 
 def _get_variance_ratio(analysis: Analysis) -> float:
@@ -391,18 +557,20 @@ def _apply_noise_model(
     theta: FloatArray,
     analysis: Analysis,
     deadline: Deadline,
+    *,
+    is_settled: bool,
 ) -> tuple[GeneralisedEstimate, Analysis]:
     """Estimate and analyse under the noise model that was requested or selected.
 
     Estimates of the paper's methods stay unchanged. So do all if the residuals are consistent with
-    white noise.
+    white noise, or if the integration step is too long for them.
     """
     requested = problem.loss.noise_model
     if requested == "white" or not _should_refine(algorithm, len(state.islands)):
         return GeneralisedEstimate(theta, {}, 0, requested != "ar1"), analysis
     in_time = deadline.count_simulations_left(state.seconds, state.evaluations, problem.n_steps)
-    is_late = deadline.is_past_grace
-    if requested == "auto" and not is_ar1_indicated(problem, theta, analysis, is_late, in_time):
+    is_indicated = is_settled and is_ar1_indicated(problem, theta, analysis, in_time)
+    if requested == "auto" and not is_indicated:
         return GeneralisedEstimate(theta, {}, 0, True), analysis
     left = _count_budget_left(algorithm, state, refined)
     reserved = analysis.evaluations + compute_analysis_budget(theta.size)
@@ -516,7 +684,9 @@ def _validate_estimates(
     fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in shared}
     other_changes = {name: fields for name, fields in changes.items() if name not in shared}
     fixed_problem = validation.rebuild(
-        parameters={**other_changes, **fixed}, weights=estimation.output_weights
+        model=estimation.untied_model,
+        parameters={**other_changes, **fixed},
+        weights=estimation.output_weights,
     )
     theta = np.zeros(0)
     if fixed_problem.free_parameters:

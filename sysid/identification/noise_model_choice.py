@@ -21,7 +21,6 @@ The correlation time must be resolved as well. Where a record is not five times 
 generalised least squares was no better than least squares.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +32,6 @@ from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     find_coloured_outputs,
 )
-from sysid.identification.integration_step import warn_integration_step
 from sysid.kernels.layout import ExperimentLayout
 from sysid.residuals.autocorrelation import ROUNDING_SHARE
 from sysid.residuals.coloured import iterate_parts
@@ -134,14 +132,12 @@ def is_ar1_indicated(
     problem: Problem,
     theta: FloatArray,
     analysis: Analysis,
-    is_late: Callable[[], bool] | None = None,
     max_simulations: int | None = None,
 ) -> bool:
     """Whether least-squares residuals at theta (D,) are coloured and the model integrates.
 
-    The analysis of the estimates gives the colour; white residuals end the test. Errors of too
-    long an integration step are not noise. If the test may need more than `max_simulations`, the
-    answer is no.
+    The analysis of the estimates gives the colour; white residuals end the test. If the test may
+    need more than `max_simulations`, the answer is no.
     """
     uncertainty = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
@@ -150,10 +146,7 @@ def is_ar1_indicated(
     if max_simulations is not None and max_simulations < 2 + MAX_TRIES * len(problem.model.states):
         return False
     coloured = find_coloured_outputs(problem, theta)
-    if not coloured or not coloured <= find_integrating_outputs(problem, theta):
-        return False
-    simulated = problem.predict(theta[None])[0]
-    return not warn_integration_step(problem, theta, analysis.estimates, simulated, is_late)
+    return bool(coloured) and coloured <= find_integrating_outputs(problem, theta)
 
 
 def confirm_noise_model(

@@ -99,6 +99,8 @@ class Identification:
         Sampling period (s) of all outputs; None if irregular or not the same for all.
     search : SearchEvidence
         Whether the search settled, and the minima that were found.
+    substeps : int
+        Integration steps in one grid step, with which the result was computed: the model's or more.
     known_before, known_before_validation : tuple of float
         Time (s) before the start of each experiment for which the inputs are recorded. Before
         that, the first value is assumed.
@@ -129,6 +131,7 @@ class Identification:
     holds: Mapping[str, Hold]
     sample_time: float | None
     search: SearchEvidence
+    substeps: int
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
 

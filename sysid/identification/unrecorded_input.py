@@ -126,7 +126,7 @@ def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> boo
     error, columns = analysis.residuals_and_sensitivities
     recorded = columns[~assumed]
     move = -np.linalg.lstsq(recorded, error[~assumed], rcond=RANK_TOLERANCE)[0]
-    by_all, by_recorded = _compute_variances(columns), _compute_variances(recorded)
+    by_all, by_recorded = compute_variances(columns), compute_variances(recorded)
     scale = compute_physical_scale(problem, _to_theta(problem, analysis))
     for d, estimate in enumerate(_select_identified(problem, analysis)):
         if estimate is None or not estimate.stderr or not 0.0 < by_all[d] < np.inf:
@@ -294,7 +294,7 @@ def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> li
     return moves
 
 
-def _compute_variances(columns: FloatArray) -> FloatArray:
+def compute_variances(columns: FloatArray) -> FloatArray:
     """Compute the diagonal of (SᵀS)⁻¹, (D,); inf for parameters that these rows leave open."""
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
     _, singular, rows, retained = truncated_svd(triangle)

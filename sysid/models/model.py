@@ -1,7 +1,7 @@
 """A checked model: equations as trees, parameters, initial states, solver, polynomial terms."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 from sysid.language.printer import format_expression
@@ -10,6 +10,8 @@ from sysid.models.parameters import Parameter
 
 Criterion = Literal["none", "bic"]
 ErrorKind = Literal["one-step", "simulation"]
+MAX_SUBSTEPS = 1000
+"""Most integration steps in one grid step."""
 
 
 class Term(NamedTuple):
@@ -205,6 +207,16 @@ class Model:
     terms: tuple[Term, ...] = ()
     rule: TermRule | None = None
     selection: Selection | None = field(default=None, compare=False)
+
+
+def replace_substeps(model: Model, substeps: int) -> Model:
+    """Return a model with another number of substeps, in its solver and its document."""
+    solver = {**model.document.get("solver", {}), "substeps": substeps}
+    return replace(
+        model,
+        solver=replace(model.solver, substeps=substeps),
+        document={**model.document, "solver": solver},
+    )
 
 
 def name_initial_state(state: str, experiment: int) -> str:

@@ -8,6 +8,7 @@ from sysid.core.errors import InvalidBounds, join_pointer, suggest_name
 from sysid.language.scope import EquationForm, list_reserved_names
 from sysid.models.documents import DocumentReader, quote_value
 from sysid.models.model import (
+    MAX_SUBSTEPS,
     EstimatedInitial,
     FixedInitial,
     HistoryKind,
@@ -168,7 +169,9 @@ def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solve
             ("interpolation", get_args(InterpolationKind)),
         )
     }
-    substeps = reader.read_whole_number(fields.get("substeps", 1), "/solver/substeps", 1, 1000)
+    substeps = reader.read_whole_number(
+        fields.get("substeps", 1), "/solver/substeps", 1, MAX_SUBSTEPS
+    )
     step = _read_step(reader, fields.get("step", "sample"))
     return Solver(step=step, substeps=substeps, **choices)
 

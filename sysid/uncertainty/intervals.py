@@ -70,7 +70,12 @@ def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: in
         parameter.name, status, lacks_stderr, statistics.groups
     )
     error = None if lacks_stderr else sqrt(max(float(statistics.covariance[d, d]), 0.0))
-    return _make_estimate(parameter, value, error, float(statistics.t_quantile[d]), status, reason)
+    quantile = float(statistics.t_quantile[d])
+    is_wide = error is not None and 2.0 * quantile * error >= parameter.upper - parameter.lower
+    if status == "identified" and is_wide:
+        status = "unidentifiable"
+        reason = "these data determine it poorly: its 95 % interval is wider than its range"
+    return _make_estimate(parameter, value, error, quantile, status, reason)
 
 
 def _make_fixed_or_tied_estimate(

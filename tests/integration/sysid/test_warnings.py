@@ -66,7 +66,7 @@ def told(found: Identification, words: str) -> bool:
 
 
 def test_a_true_model_with_white_noise_has_no_warning() -> None:
-    model = parse_model(FIRST)
+    model = parse_model({**FIRST, "solver": {"substeps": 4}})
     y = response(model, steps(), K=1.5, T=0.3, L=0.2, y0=0.3)
     assert identify(model, record(steps(), y), QUICK).warnings == ()
 
@@ -126,7 +126,7 @@ def test_where_nothing_has_an_effect_the_run_fails_and_says_so() -> None:
 
 
 @pytest.mark.parametrize(("substeps", "too_long"), [(1, True), (8, False)])
-def test_an_estimate_that_the_integration_step_has_made_is_told(
+def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
     substeps: int, too_long: bool
 ) -> None:
     # A time constant of a third of the step: the method of Runge and Kutta is at its limit there.
@@ -138,9 +138,11 @@ def test_an_estimate_that_the_integration_step_has_made_is_told(
     outlet = simulate(exact, [inlet], truth, times=times).channel("y")
     noisy = replace(outlet, values=outlet.values + np.random.default_rng(1).normal(0, 1e-3, 600))
     found = identify(coarse, Record((inlet,), (noisy,)))
-    assert told(found, "the integration step is too long for these estimates") == too_long
-    if too_long:
-        assert told(found, "Give the model solver: {substeps: 4}")
+    assert told(found, "the integration step of the model, substeps: 1") == too_long
+    assert (found.substeps > substeps) == too_long
+    for one in found.estimates:
+        assert one.stderr is not None
+        assert abs(one.value - truth[one.name]) < 3 * one.stderr
 
 
 @pytest.mark.parametrize("level", [0.0, 3.0])

@@ -102,7 +102,7 @@ def test_a_number_that_is_none_is_wrong_usage_at_its_option(
 
 
 WHITE = "If the noise is coloured, use loss: {noise_model: ar1}"
-MODEL = "with half of it L = 1 s instead of 2 s. Give the model solver: {substeps: 8}"
+MODEL = "A reading without rounding needs the model solver: {interpolation: linear}"
 HELD = "If the input was held, use hold: {u: zero}"
 
 
@@ -112,7 +112,7 @@ HELD = "If the input was held, use hold: {u: zero}"
         (identify.FIELD_ORIGINS, WHITE, ", use --noise-model ar1"),
         (identify.FIELD_ORIGINS, HELD, ", use --set hold.u=zero"),
         (FieldOrigins(), WHITE, ", use --set loss.noise_model=ar1"),
-        (identify.FIELD_ORIGINS, MODEL, "Give the model solver: {substeps: 8}"),
+        (identify.FIELD_ORIGINS, MODEL, "needs the model solver: {interpolation: linear}"),
         (FieldOrigins(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
     ],
 )

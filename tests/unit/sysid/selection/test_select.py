@@ -6,7 +6,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from service.models.models import apply_selection
+from service.models.models import apply_result
 from service.pages.diagnostics import to_diagnostics
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
@@ -288,8 +288,8 @@ def test_the_resolved_model_can_be_built_again_from_its_document_and_from_a_resu
     assert model.rule is None
     assert model.selection is not None
     result = {"selection": [one._asdict() for one in model.selection.terms]}
-    assert apply_selection(asked, result) == model
-    assert apply_selection(asked, None) == asked
+    assert apply_result(asked, result) == model
+    assert apply_result(asked, None) == asked
 
 
 def test_a_model_without_a_rule_stays_as_it_is() -> None:
