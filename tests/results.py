@@ -45,7 +45,7 @@ def conclude(
             residual_tests=None,
             onset_delays=(),
             correlation_times={},
-            holds={},
+            input_holds=(),
             sample_time=0.1,
             known_before=(),
             known_before_validation=(),

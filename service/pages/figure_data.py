@@ -241,7 +241,7 @@ def _read_inputs(
 
 
 def _to_signal_trace(channel: Channel) -> SignalTrace:
-    held, before = channel.hold == "zero", None
+    held, before = channel.resolved_hold == "zero", None
     if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
         times, values = (np.append(history, samples[0]) for history, samples in pairs)

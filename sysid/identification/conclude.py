@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import itemgetter
 from time import perf_counter
 from typing import NamedTuple
 
@@ -18,6 +19,11 @@ from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
     make_whitening,
+)
+from sysid.identification.input_hold import (
+    describe_input_holds,
+    list_input_holds,
+    refit_other_holds,
 )
 from sysid.identification.integration_step import warn_integration_step
 from sysid.identification.local_minima import (
@@ -100,6 +106,13 @@ def _build_identification(
         else run_residual_tests(problem, simulated, "estimation", times)
     )
     limit = algorithm.safe_limit
+    holds, spent = list_input_holds(problem), 0
+    if _should_refine(algorithm, len(ends)):
+        left = _count_budget_left(algorithm, state, refined)
+        left = None if left is None else max(0, left - analysis.evaluations)
+        holds, spent = refit_other_holds(
+            problem, holds, theta, min(ends, key=itemgetter(1))[0], left, deadline.is_past_grace
+        )
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -107,7 +120,7 @@ def _build_identification(
         rms_validation=None if validated is None else validated.metrics.rms,
         fit_percent_validation=None if validated is None else validated.metrics.fit_percent,
         valid=limit is None or metrics.rms <= limit,
-        evaluations=_count_evaluations(state, refined, analysis),
+        evaluations=_count_evaluations(state, refined, analysis) + spent,
         generations=max(island.generation for island in state.islands),
         islands=_summarise_islands(state, refined, ends),
         history=_extend_histories(state, refined),
@@ -119,6 +132,7 @@ def _build_identification(
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *describe_input_holds(problem, holds, analysis.estimates, min(rms for _, rms in ends)),
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
@@ -137,7 +151,7 @@ def _build_identification(
         residual_tests=tests,
         onset_delays=estimate_onset_delays(problem.model, problem.records),
         correlation_times=times,
-        holds={channel.name: channel.hold for channel in problem.records[0].inputs},
+        input_holds=holds,
         sample_time=find_common_sample_time(problem.records),
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),

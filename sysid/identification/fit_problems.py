@@ -67,8 +67,11 @@ def prepare_records(
         raise InvalidSettings("/validation", "give either records or a fraction")
     parts = [split_record(record, fraction) for record in whole]
     starts = tuple(find_validation_start(record, fraction) for record in whole)
-    first, last = tuple(part[0] for part in parts), tuple(part[1] for part in parts)
-    return FitRecords(_add_noise(first, noise), last, whole, starts)
+    first = tuple(part[0] for part in parts)
+    last, runs = (
+        tuple(map(_adopt_holds, later, first)) for later in ([part[1] for part in parts], whole)
+    )
+    return FitRecords(_add_noise(first, noise), last, runs, starts)
 
 
 def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> ProblemPair:
@@ -93,6 +96,15 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
         records=records.validation_runs,
         weights=problem.output_weights,
         scored_from=records.scored_from,
+    )
+
+
+def _adopt_holds(record: Record, estimation: Record) -> Record:
+    """Read the inputs as those of the part that the model is fitted to."""
+    pairs = zip(record.inputs, estimation.inputs, strict=True)
+    return replace(
+        record,
+        inputs=tuple(replace(channel, hold=other.resolved_hold) for channel, other in pairs),
     )
 
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sysid.core.types import FloatArray
-from sysid.data.records import Hold
+from sysid.data.holds import Hold
+from sysid.identification.input_hold import InputHold
 from sysid.models.model import SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTests
@@ -35,8 +36,8 @@ class Identification:
         Selected terms, if the model requests a selection.
     correlation_times : mapping of str to float
         Correlation time (s) of each output's noise, where the noise model has one.
-    holds : mapping of str to Hold
-        Behaviour of the inputs of the first experiment between their samples.
+    input_holds : tuple of InputHold
+        How each input is read between its samples, and the estimates if it were read otherwise.
     sample_time : float or None
         Sampling period (s) of all outputs; None if irregular or not the same for all.
     known_before, known_before_validation : tuple of float
@@ -66,10 +67,15 @@ class Identification:
     residual_tests: ResidualTests | None
     onset_delays: tuple[OnsetDelay, ...]
     correlation_times: Mapping[str, float]
-    holds: Mapping[str, Hold]
+    input_holds: tuple[InputHold, ...]
     sample_time: float | None
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
+
+    @property
+    def holds(self) -> dict[str, Hold]:
+        """How each input is read between its samples."""
+        return {hold.input: hold.chosen for hold in self.input_holds}
 
     @property
     def noise_model(self) -> Literal["white", "ar1"]:

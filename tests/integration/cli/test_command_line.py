@@ -236,7 +236,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     )
     assert done.code == 0, done.stderr
     assert "±" in done.stdout
-    assert "If the input was held, use --set hold.u=zero" in " ".join(done.stderr.split())
+    assert "Read as straight lines (--set hold.u=first) it would give" in " ".join(done.stderr.split())
     found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
     truth = {"K": 2.0, "T": 1.0, "L": 0.5}
     for name, value in truth.items():
