@@ -1,7 +1,7 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
@@ -355,12 +355,30 @@ def _load_model(name: str) -> "Model":
     return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
 
 
+def _assign_other_channels(
+    recording: "Recording", model: "Model", channels: Mapping[str, str]
+) -> dict[str, str]:
+    """Assign the channels that are left to the signals that are left, in order, inputs first.
+
+    Only if no signal that is left has a channel of its name, and there are as many of both.
+    """
+    signals = [s.name for s in (*model.inputs, *model.outputs) if s.name not in channels]
+    left = [name for name in recording.names if name not in channels.values()]
+    if len(signals) != len(left) or set(signals) & set(left):
+        return {}
+    assigned = dict(zip(signals, left, strict=True))
+    pairs = ",".join(f"{signal}={name}" for signal, name in assigned.items())
+    err.print(f"note: channels assigned in their order: --channels {pairs}", markup=False)
+    return assigned
+
+
 def _extract_records(
     recording: "Recording", path: Path, model: "Model", body: "JobIn"
 ) -> "list[Record]":
     from service.datasets.signal_channels import map_channels
 
-    channels = map_channels(model, body.channels, body.hold)
+    named = {**_assign_other_channels(recording, model, body.channels), **body.channels}
+    channels = map_channels(model, named, body.hold)
     missing = {
         signal: f"channel {channel!r} for signal {signal!r}{suggest_name(channel, recording.names)}"
         for signal, channel in channels.by_signal.items()

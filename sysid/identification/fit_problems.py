@@ -101,11 +101,11 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
 
 def _adopt_holds(record: Record, estimation: Record) -> Record:
     """Read the inputs as those of the part that the model is fitted to."""
-    pairs = zip(record.inputs, estimation.inputs, strict=True)
-    return replace(
-        record,
-        inputs=tuple(replace(channel, hold=other.resolved_hold) for channel, other in pairs),
-    )
+    holds = [channel.resolved_hold for channel in estimation.inputs]
+    if holds == [channel.resolved_hold for channel in record.inputs]:
+        return record
+    pairs = zip(record.inputs, holds, strict=True)
+    return replace(record, inputs=tuple(replace(channel, hold=hold) for channel, hold in pairs))
 
 
 def _add_noise(records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:
