@@ -46,6 +46,7 @@ def conclude(
             onset_delays=(),
             correlation_times={},
             input_holds=(),
+            data_bounds=(),
             sample_time=0.1,
             known_before=(),
             known_before_validation=(),

@@ -266,6 +266,8 @@ def print_result(
             f", validation {_format_fit(result.fit_percent_validation)}", markup=False, end=""
         )
     out.print(f"; {result.evaluations} simulations in {seconds:.2f} s", markup=False)
+    if result.data_bounds:
+        out.print(f"bounds from the data: {_format_bounds(result)}", markup=False, soft_wrap=True)
     if any(result.known_before):
         out.print(
             f"inputs known before the record: {_format_history_span(result.known_before)}",
@@ -290,6 +292,14 @@ def _residual_verdict(tests: "ResidualTests") -> str:
     ]
     verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
     return f"residuals on {tests.data} data: {verdict}"
+
+
+def _format_bounds(result: "Identification") -> str:
+    return ", ".join(
+        f"{estimate.name} {estimate.lower:.3g} to {estimate.upper:.3g}"
+        for estimate in result.estimates
+        if estimate.name in result.data_bounds
+    )
 
 
 def _format_history_span(durations: Sequence[float]) -> str:
@@ -362,7 +372,8 @@ def _assign_other_channels(
 
     Only if no signal that is left has a channel of its name, and there are as many of both.
     """
-    signals = [s.name for s in (*model.inputs, *model.outputs) if s.name not in channels]
+    names = [signal.name for signal in model.inputs] + [signal.name for signal in model.outputs]
+    signals = [name for name in names if name not in channels]
     left = [name for name in recording.names if name not in channels.values()]
     if len(signals) != len(left) or set(signals) & set(left):
         return {}

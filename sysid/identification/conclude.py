@@ -152,6 +152,7 @@ def _build_identification(
         onset_delays=estimate_onset_delays(problem.model, problem.records),
         correlation_times=times,
         input_holds=holds,
+        data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
         sample_time=find_common_sample_time(problem.records),
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),

@@ -1,7 +1,7 @@
 """Holds chosen by the data: what the estimate is if an input is read the other way."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import log
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
+from sysid.identification.result import InputHold
 from sysid.kernels.reads import is_difference
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -18,32 +19,6 @@ _NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
 _CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_TOLD = 3  # estimates in one sentence
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
-
-
-@dataclass(frozen=True, slots=True)
-class InputHold:
-    """How an input is read between its samples.
-
-    Attributes
-    ----------
-    chosen : {"zero", "first", "band-limited"}
-    reason : str or None
-        Reason of a choice by the values; None if the hold was given.
-    other : {"zero", "first"} or None
-        The reading that was not chosen. None if the hold was given or has no effect.
-    estimates_other : dict or None
-        Estimates of the free parameters with the other reading, from the estimates by least
-        squares. None if they were not computed.
-    rms_other : float or None
-        RMS error with the other reading.
-    """
-
-    input: str
-    chosen: Hold
-    reason: str | None
-    other: Hold | None = None
-    estimates_other: dict[str, float] | None = None
-    rms_other: float | None = None
 
 
 def list_input_holds(problem: Problem) -> tuple[InputHold, ...]:
@@ -159,9 +134,8 @@ def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]
     if not gaps:
         return []
     return [
-        f"input {name!r} is sampled irregularly. Each of its jumps lies between two samples, so "
-        "the time of the jump, and with it a time lag, is uncertain by up to one period "
-        f"({np.median(gaps):.3g} s)"
+        f"input {name!r} is sampled irregularly, and each of its jumps lies between two samples. "
+        f"So a time lag is uncertain by up to one period, {np.median(gaps):.3g} s"
     ]
 
 

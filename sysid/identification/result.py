@@ -6,13 +6,38 @@ from typing import Literal
 
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
-from sysid.identification.input_hold import InputHold
 from sysid.models.model import SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class InputHold:
+    """How an input is read between its samples.
+
+    Attributes
+    ----------
+    chosen : {"zero", "first", "band-limited"}
+    reason : str or None
+        Reason of a choice by the values; None if the hold was given.
+    other : {"zero", "first"} or None
+        The reading that was not chosen. None if the hold was given or has no effect.
+    estimates_other : dict or None
+        Estimates of the free parameters with the other reading, from the estimates by least
+        squares. None if they were not computed.
+    rms_other : float or None
+        RMS error with the other reading.
+    """
+
+    input: str
+    chosen: Hold
+    reason: str | None
+    other: Hold | None = None
+    estimates_other: dict[str, float] | None = None
+    rms_other: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +63,8 @@ class Identification:
         Correlation time (s) of each output's noise, where the noise model has one.
     input_holds : tuple of InputHold
         How each input is read between its samples, and the estimates if it were read otherwise.
+    data_bounds : tuple of str
+        Free parameters whose bounds follow the data, unless given; see the estimates.
     sample_time : float or None
         Sampling period (s) of all outputs; None if irregular or not the same for all.
     known_before, known_before_validation : tuple of float
@@ -68,6 +95,7 @@ class Identification:
     onset_delays: tuple[OnsetDelay, ...]
     correlation_times: Mapping[str, float]
     input_holds: tuple[InputHold, ...]
+    data_bounds: tuple[str, ...]
     sample_time: float | None
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]

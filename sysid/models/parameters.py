@@ -159,7 +159,8 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
 def _move_other_bounds(parameter: Parameter, given: dict[str, Any]) -> dict[str, Any]:
     """Move bounds that follow the data out of the way of a given bound or fixed value.
 
-    Given bounds are kept. An upper bound that is given no longer follows the data.
+    Given bounds are kept. An upper bound that is given no longer follows the data. The lower bound
+    of a delay stays: it cannot be negative.
     """
     width = parameter.upper - parameter.lower
     lower, upper = parameter.lower, parameter.upper
@@ -167,7 +168,7 @@ def _move_other_bounds(parameter: Parameter, given: dict[str, Any]) -> dict[str,
         lower, upper = min(lower, given["fixed"]), max(upper, given["fixed"])
     if "lower" in given and not given["lower"] < upper:
         upper = given["lower"] + width
-    if "upper" in given and not lower < given["upper"]:
+    if "upper" in given and not lower < given["upper"] and parameter.bounds != "delay":
         is_log = given.get("scale", parameter.scale) == "log"
         lower = (
             given["upper"] * parameter.lower / parameter.upper if is_log else given["upper"] - width

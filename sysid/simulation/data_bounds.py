@@ -17,6 +17,7 @@ Interval = tuple[float, float]
 
 _REACH = 10.0  # largest gain in ratios of spans, and largest time constant in durations
 _SETTLED_REACH = 3.0  # the same for a process that settles in the record
+_SLOW = 0.2  # of the record: time constant of a process that an input hardly moves
 _SHORTEST = 0.1  # of a sampling period: smallest time constant
 
 
@@ -29,7 +30,8 @@ class _Spans:
     outputs : tuple of float
         Range of all measured values.
     gain, rate : float
-        Span of the output over that of the input, and over that of the input's integral.
+        Span of the output over that of the input, and over that of the input's integral. The gain
+        is larger for an input that is faster than a slow process.
     offset : float
         Largest input, in its span, times the span of the output.
     period, duration : float
@@ -105,8 +107,9 @@ def _measure_spans(records: Sequence[Record]) -> _Spans:
     measured = np.concatenate([channel.values for channel in outputs])
     driven = np.concatenate([channel.values for channel in inputs]) if inputs else np.zeros(1)
     span, driven_span = float(np.ptp(measured)), float(np.ptp(driven))
-    gain = _divide(span, driven_span)
     areas = [float(np.ptp(_integrate(channel))) for channel in inputs]
+    means = [_measure_slow_span(channel) for channel in inputs]
+    gain = _divide(span, min(driven_span, max(means, default=0.0) / _SLOW))
     return _Spans(
         outputs=(float(np.min(measured)), float(np.max(measured))),
         gain=gain,
@@ -125,6 +128,12 @@ def _drop_missing(channel: Channel) -> Channel:
 def _integrate(channel: Channel) -> FloatArray:
     means = 0.5 * (channel.values[1:] + channel.values[:-1])
     return np.concatenate([[0.0], np.cumsum(means * np.diff(channel.times))])
+
+
+def _measure_slow_span(channel: Channel) -> float:
+    """Measure how far an input moves a process that is as slow as the record."""
+    centred = replace(channel, values=channel.values - np.mean(channel.values))
+    return _divide(float(np.ptp(_integrate(centred))), float(np.ptp(channel.times)))
 
 
 def _find_period(channel: Channel) -> float:

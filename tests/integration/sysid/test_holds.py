@@ -9,8 +9,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Recording
 from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
-from sysid.identification.input_hold import InputHold
-from sysid.identification.result import Identification
+from sysid.identification.result import Identification, InputHold
 from sysid.models.catalogue.load import load_model
 
 PERIOD, LAG = 0.5, 3.2
@@ -114,7 +113,7 @@ def test_jumps_between_irregular_samples_are_uncertain() -> None:
     found = fitted(Recording(record))
     assert found.input_holds[0].chosen == "zero"
     (told,) = [one for one in found.warnings if "sampled irregularly" in one]
-    period = float(told.split("(")[1].split(" s)")[0])
+    period = float(told.split(", ")[-1].removesuffix(" s"))
     assert 0.4 < period < 0.9
     assert abs(lag(found) - LAG) < period
 
