@@ -15,9 +15,10 @@ from sysid.models.parameters import BoundsRule, Parameter
 
 Interval = tuple[float, float]
 
-_REACH = 10.0  # largest gain in ratios of spans, and largest time constant in durations
-_SETTLED_REACH = 3.0  # the same for a process that settles in the record
-_SLOW = 0.2  # of the record: time constant of a process that an input hardly moves
+_REACH = 5.0  # largest gain, in ratios of spans
+_OFFSET_REACH = 2.0  # the same, for what the input adds to an offset
+_SLOW = 0.4  # of the record: time constant of a process that an input hardly moves
+_LONGEST = 2.0  # of the record: largest time constant
 _SHORTEST = 0.1  # of a sampling period: smallest time constant
 
 
@@ -74,14 +75,14 @@ def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Inter
         case "rate":
             return -_REACH * spans.rate, _REACH * spans.rate
         case "time":
-            return _SHORTEST * spans.period, _REACH * spans.duration
+            return _SHORTEST * spans.period, _LONGEST * spans.duration
         case "delay":
             return 0.0, 0.5 * spans.duration
         case "offset":
-            reach = (upper - lower) + _SETTLED_REACH * spans.offset
+            reach = (upper - lower) + _OFFSET_REACH * spans.offset
             return lower - reach, upper + reach
         case "state":
-            reach = (upper - lower) + _SETTLED_REACH * spans.offset
+            reach = (upper - lower) + _OFFSET_REACH * spans.offset
             # Without the offset that is estimated with it, a state is around zero.
             return (
                 (lower - upper - reach, upper - lower + reach)

@@ -69,7 +69,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "parameters": {**NEAR, "theta(0)": {"fixed": 0}},
         }
         steps = store_csv(server, recording())
-        lag = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
+        lag = {
+            "model": "fopdt",
+            "datasets": [steps],
+            "algorithm": SMALL,
+            "parameters": {"K": {"lower": 0, "upper": 10}, "L": {"upper": 5}, "T": {"upper": 10}},
+        }
         _, [first] = identified(parts, arm)
         _, [second] = identified(parts, lag)
         job = server.post("/v1/jobs", json=lag).json()["id"]
