@@ -1,7 +1,7 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
@@ -266,6 +266,8 @@ def print_result(
             f", validation {_format_fit(result.fit_percent_validation)}", markup=False, end=""
         )
     out.print(f"; {result.evaluations} simulations in {seconds:.2f} s", markup=False)
+    if result.data_bounds:
+        out.print(f"bounds from the data: {_format_bounds(result)}", markup=False, soft_wrap=True)
     if any(result.known_before):
         out.print(
             f"inputs known before the record: {_format_history_span(result.known_before)}",
@@ -290,6 +292,14 @@ def _residual_verdict(tests: "ResidualTests") -> str:
     ]
     verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
     return f"residuals on {tests.data} data: {verdict}"
+
+
+def _format_bounds(result: "Identification") -> str:
+    return ", ".join(
+        f"{estimate.name} {estimate.lower:.3g} to {estimate.upper:.3g}"
+        for estimate in result.estimates
+        if estimate.name in result.data_bounds
+    )
 
 
 def _format_history_span(durations: Sequence[float]) -> str:
@@ -355,12 +365,31 @@ def _load_model(name: str) -> "Model":
     return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
 
 
+def _assign_other_channels(
+    recording: "Recording", model: "Model", channels: Mapping[str, str]
+) -> dict[str, str]:
+    """Assign the channels that are left to the signals that are left, in order, inputs first.
+
+    Only if no signal that is left has a channel of its name, and there are as many of both.
+    """
+    names = [signal.name for signal in model.inputs] + [signal.name for signal in model.outputs]
+    signals = [name for name in names if name not in channels]
+    left = [name for name in recording.names if name not in channels.values()]
+    if len(signals) != len(left) or set(signals) & set(left):
+        return {}
+    assigned = dict(zip(signals, left, strict=True))
+    pairs = ",".join(f"{signal}={name}" for signal, name in assigned.items())
+    err.print(f"note: channels assigned in their order: --channels {pairs}", markup=False)
+    return assigned
+
+
 def _extract_records(
     recording: "Recording", path: Path, model: "Model", body: "JobIn"
 ) -> "list[Record]":
     from service.datasets.signal_channels import map_channels
 
-    channels = map_channels(model, body.channels, body.hold)
+    named = {**_assign_other_channels(recording, model, body.channels), **body.channels}
+    channels = map_channels(model, named, body.hold)
     missing = {
         signal: f"channel {channel!r} for signal {signal!r}{suggest_name(channel, recording.names)}"
         for signal, channel in channels.by_signal.items()

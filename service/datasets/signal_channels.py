@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from sysid.data.records import Hold, Record, Recording
+from sysid.data.records import HoldSetting, Record, Recording
 from sysid.models.model import Model
 
 
@@ -21,7 +21,7 @@ class SignalChannels:
 
     inputs: tuple[tuple[str, str], ...]
     outputs: tuple[tuple[str, str], ...]
-    holds: tuple[tuple[str, Hold], ...] = ()
+    holds: tuple[tuple[str, HoldSetting], ...] = ()
 
     @property
     def by_signal(self) -> dict[str, str]:
@@ -41,7 +41,7 @@ class SignalChannels:
 
 
 def map_channels(
-    model: Model, channels: Mapping[str, str], hold: Mapping[str, Hold] | None = None
+    model: Model, channels: Mapping[str, str], hold: Mapping[str, HoldSetting] | None = None
 ) -> SignalChannels:
     """Map every signal of a model to a channel, by default to the channel of its name.
 

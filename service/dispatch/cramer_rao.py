@@ -192,14 +192,17 @@ def _widen_bounds(
     spec: ProblemSpec, values: Mapping[str, float]
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Iterate over the parameter changes, with bounds widened to include the reference values."""
-    bounds = {p.name: (p.lower, p.upper) for p in parse_model(spec.model).parameters}
+    parameters = parse_model(spec.model).parameters
+    bounds = {p.name: (p.lower, p.upper) for p in parameters}
+    follow_data = {p.name for p in parameters if p.bounds is not None}
     changes = spec.settings.parameters
     for name in {**bounds, **changes}:
         change = dict(changes.get(name, {}))
         lower, upper = bounds.get(name, (-math.inf, math.inf))
         lower, upper = change.get("lower", lower), change.get("upper", upper)
         value = values.get(name)
-        if value is not None and "fixed" not in change and not lower <= value <= upper:
+        is_outside = value is not None and not lower <= value <= upper
+        if value is not None and "fixed" not in change and (is_outside or name in follow_data):
             change |= {"lower": min(lower, value), "upper": max(upper, value)}
         if change:
             yield name, change

@@ -23,7 +23,10 @@ class IslandImprovement:
 
 @dataclass(frozen=True, slots=True)
 class FreeParameter:
-    """A free parameter: its bounds, and its estimate if it exists."""
+    """A free parameter: its bounds, and its estimate if it exists.
+
+    If the bounds follow the data, they are unknown (`follows_data`) until there is a result.
+    """
 
     name: str
     unit: str
@@ -32,6 +35,7 @@ class FreeParameter:
     scale: Literal["linear", "log"] = "linear"
     value: float | None = None
     stderr: float | None = None
+    follows_data: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

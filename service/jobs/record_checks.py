@@ -126,6 +126,10 @@ def _check_longest_delay(
     if not duration > 0:
         return RecordTooShort(duration, 0.0, "a simulation")
     spans = {p.name: get_interval(p) for p in parameters}
+    for parameter in parameters:
+        if parameter.bounds == "delay" and parameter.is_free:
+            lower, upper = spans[parameter.name]
+            spans[parameter.name] = (lower, min(upper, max(lower, duration / 2)))
     lagged = sorted(
         list_past_values(model),
         key=lambda past_value: -compute_longest_delay(model, past_value, spans, step),

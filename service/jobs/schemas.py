@@ -26,7 +26,7 @@ from sysid.core.settings import (
     SequenceKind,
     TopologyName,
 )
-from sysid.data.records import Hold
+from sysid.data.records import HoldSetting
 from sysid.models.parameters import ParameterScale
 
 SEARCH, LOSS = GeneticAlgorithm(), Loss()
@@ -241,7 +241,7 @@ class IdentificationIn(Body):
     name: str | None = Field(default=None, max_length=200)
     model: Annotated[Any, AfterValidator(check_model_reference)]
     channels: dict[str, str] = Field(default={})
-    hold: dict[str, Hold] = Field(default={})
+    hold: dict[str, HoldSetting] = Field(default={})
     parameters: dict[str, ParameterIn] = Field(default={})
     prediction: PredictionKind = "simulation"
     loss: LossIn = LossIn()

@@ -152,7 +152,7 @@ def _to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
 
 
 def _to_out(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
-    fields = ("lower", "upper", "unit", "scale", "fixed", "tied")
+    fields = ("lower", "upper", "bounds", "unit", "scale", "fixed", "tied")
     return ModelOut.from_source(
         model,
         version=version,

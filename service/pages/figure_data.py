@@ -1,6 +1,7 @@
 """Load the data of figures: signals from the object store, results from stored rows."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from math import inf, nan
 from typing import Any
@@ -111,8 +112,20 @@ def _match_history_width(
     if not points:
         return parameters
     width = len(points[0].parameters)
+    parameters = [
+        _show_history(parameter, points, column) if parameter.follows_data else parameter
+        for column, parameter in enumerate(parameters[:width])
+    ]
     unknown = range(min(len(parameters), width), width)
     return parameters[:width] + [_infer_parameter(points, column) for column in unknown]
+
+
+def _show_history(
+    parameter: FreeParameter, points: Sequence[IslandImprovement], column: int
+) -> FreeParameter:
+    """Replace unknown bounds by the range of the history."""
+    shown = _infer_parameter(points, column)
+    return replace(parameter, lower=shown.lower, upper=shown.upper)
 
 
 def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreeParameter:
@@ -139,7 +152,12 @@ def _to_estimated_parameter(
 
 def _to_free_parameter(parameter: Parameter) -> FreeParameter:
     return FreeParameter(
-        parameter.name, parameter.unit, parameter.lower, parameter.upper, parameter.scale
+        parameter.name,
+        parameter.unit,
+        parameter.lower,
+        parameter.upper,
+        parameter.scale,
+        follows_data=parameter.bounds is not None,
     )
 
 
@@ -241,7 +259,7 @@ def _read_inputs(
 
 
 def _to_signal_trace(channel: Channel) -> SignalTrace:
-    held, before = channel.hold == "zero", None
+    held, before = channel.resolved_hold == "zero", None
     if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
         times, values = (np.append(history, samples[0]) for history, samples in pairs)

@@ -329,7 +329,13 @@ def _to_experiment_traces(free: FreeRun) -> ExperimentTraces:
 
 def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
     return tuple(
-        SignalTrace(signal.name, signal.unit, signal.times, signal.values, signal.hold == "zero")
+        SignalTrace(
+            signal.name,
+            signal.unit,
+            signal.times,
+            signal.values,
+            signal.resolved_hold == "zero",
+        )
         for signal in record.inputs
     )
 

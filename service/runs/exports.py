@@ -134,9 +134,11 @@ def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
 
 
 def _find_hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
+    """Find how the run read an input; earlier versions did not store it in the result."""
+    listed = stored.result.get("input_hold") or ()
+    hold: Hold | None = next((item["chosen"] for item in listed if item["input"] == name), None)
     channel = next(_find_channels(name, stored, rows), None)
-    hold: Hold = stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
-    return hold
+    return hold or stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
 
 
 def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:

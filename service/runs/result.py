@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from service.core.documents import to_finite
-from sysid.identification.result import Identification
+from sysid.identification.result import Identification, InputHold
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import TEST_LEVEL, ResidualTest, ResidualTests
 from sysid.simulation.metrics import ChannelMetrics
@@ -85,6 +85,8 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
         "correlation_times": dict(identification.correlation_times),
         "residual_tests": to_residual_document(identification.residual_tests),
         "onset_delays": to_onset_document(identification.onset_delays),
+        "data_bounds": list(identification.data_bounds),
+        "input_hold": [_to_hold_document(hold) for hold in identification.input_holds],
         "known_before": {
             "estimation": list(identification.known_before),
             "validation": list(identification.known_before_validation),
@@ -109,6 +111,17 @@ def _to_estimate_document(estimate: Estimate) -> dict[str, Any]:
         "status",
         "reason",
     )
+
+
+def _to_hold_document(hold: InputHold) -> dict[str, Any]:
+    others = hold.estimates_other
+    return {
+        **_read(hold, "input", "chosen", "reason", "other"),
+        "estimates_other": None
+        if others is None
+        else {name: to_finite(value) for name, value in others.items()},
+        **_read(hold, "rms_other"),
+    }
 
 
 def _to_agreement_document(metrics: ChannelMetrics) -> dict[str, Any]:

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
-
-Hold = Literal["zero", "first", "band-limited"]
-HOLDS: tuple[Hold, ...] = get_args(Hold)
+from sysid.data.holds import HOLDS as HOLDS
+from sysid.data.holds import Hold as Hold
+from sysid.data.holds import HoldChoice, choose_hold
+from sysid.data.holds import HoldSetting as HoldSetting
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -66,8 +67,8 @@ class Channel:
         repeats may share a time.
     values : FloatArray, shape (N,)
         In `unit`; ``nan`` is a missing value.
-    hold : {"zero", "first", "band-limited"}
-        Behaviour of an input between its samples.
+    hold : {"auto", "zero", "first", "band-limited"}
+        Behaviour of an input between its samples; ``auto``: chosen by its values.
     history : History or None
         Samples recorded before the first one. Only delayed inputs read it: simulation and
         comparison begin at the first sample. None: not recorded; the first value is assumed for
@@ -84,8 +85,9 @@ class Channel:
     times: FloatArray
     values: FloatArray
     unit: str = "1"
-    hold: Hold = "first"
+    hold: HoldSetting = "auto"
     history: History | None = None
+    _choice: HoldChoice | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
@@ -112,6 +114,19 @@ class Channel:
                 f"the history of channel {self.name!r} does not end before its first sample, or "
                 "its times decrease or are not finite"
             )
+
+    @property
+    def hold_choice(self) -> HoldChoice:
+        """The hold that suits the values, and why; history and samples count."""
+        if self._choice is None:
+            object.__setattr__(self, "_choice", choose_hold(self.history_and_samples.values))
+        assert self._choice is not None
+        return self._choice
+
+    @property
+    def resolved_hold(self) -> Hold:
+        """The hold that was given, or the one chosen by the values."""
+        return self.hold_choice.hold if self.hold == "auto" else self.hold
 
     @property
     def history_and_samples(self) -> "Channel":
@@ -231,7 +246,7 @@ class Recording:
         """Sampling of the longest channel."""
         return max(self.channels, key=lambda channel: channel.times.size).sampling
 
-    def replace_holds(self, holds: Mapping[str, Hold]) -> "Recording":
+    def replace_holds(self, holds: Mapping[str, HoldSetting]) -> "Recording":
         """Return the recording with other intersample behaviour of some channels.
 
         Raises

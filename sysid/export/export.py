@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue
 from sysid.core.errors import InvalidSettings, suggest_name
-from sysid.data.records import HOLDS, Hold
+from sysid.data.records import Hold
 from sysid.export.c import write_c_source
 from sysid.export.description import write_json_source
 from sysid.export.python import write_python_source
@@ -22,6 +22,7 @@ from sysid.models.ties import resolve_ties
 ExportFormat = Literal["json", "python", "c", "control"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 MAX_PADE_ORDER = 20
+_HOLDS: tuple[Hold, ...] = get_args(Hold)
 
 _WRITERS: Mapping[str, Callable[[IdentifiedModel], str]] = {
     "json": write_json_source,
@@ -157,8 +158,8 @@ def _check_options(
         if name not in inputs:
             detail = f"the model has no input {name!r}{suggest_name(name, inputs)}"
             raise InvalidSettings(f"/hold/{name}", detail)
-        if kind not in HOLDS:
-            raise InvalidSettings(f"/hold/{name}", f"{kind!r} is not one of {', '.join(HOLDS)}")
+        if kind not in _HOLDS:
+            raise InvalidSettings(f"/hold/{name}", f"{kind!r} is not one of {', '.join(_HOLDS)}")
 
 
 def _check_values(model: Model, numbers: Mapping[str, float]) -> None:

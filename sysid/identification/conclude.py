@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import itemgetter
 from time import perf_counter
 from typing import NamedTuple
 
@@ -18,6 +19,11 @@ from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
     make_whitening,
+)
+from sysid.identification.input_hold import (
+    describe_input_holds,
+    list_input_holds,
+    refit_other_holds,
 )
 from sysid.identification.integration_step import (
     HalfStep,
@@ -132,6 +138,13 @@ def _build_identification(
         analysis,
         estimates=mark_unsettled(mark_ambiguous(problem, analysis.estimates, found), evidence),
     )
+    holds, spent = list_input_holds(problem), 0
+    if _should_refine(algorithm, len(ends)):
+        left = _count_budget_left(algorithm, state, refined)
+        left = None if left is None else max(0, left - analysis.evaluations)
+        holds, spent = refit_other_holds(
+            problem, holds, theta, min(ends, key=itemgetter(1))[0], left, deadline.is_past_grace
+        )
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -139,7 +152,7 @@ def _build_identification(
         rms_validation=None if validated is None else validated.metrics.rms,
         fit_percent_validation=None if validated is None else validated.metrics.fit_percent,
         valid=limit is None or metrics.rms <= limit,
-        evaluations=_count_evaluations(state, refined, analysis),
+        evaluations=_count_evaluations(state, refined, analysis) + spent,
         generations=max(island.generation for island in state.islands),
         islands=_summarise_islands(state, refined, ends),
         history=_extend_histories(state, refined),
@@ -153,6 +166,7 @@ def _build_identification(
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
             *found.warnings,
             *warn_unsettled(evidence),
+            *describe_input_holds(problem, holds, analysis.estimates, min(rms for _, rms in ends)),
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
@@ -169,7 +183,8 @@ def _build_identification(
         residual_tests=tests,
         onset_delays=estimate_onset_delays(problem.model, problem.records),
         correlation_times=times,
-        holds={channel.name: channel.hold for channel in problem.records[0].inputs},
+        input_holds=holds,
+        data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
         sample_time=find_common_sample_time(problem.records),
         search=evidence,
         substeps=problem.model.solver.substeps,

@@ -67,8 +67,11 @@ def prepare_records(
         raise InvalidSettings("/validation", "give either records or a fraction")
     parts = [split_record(record, fraction) for record in whole]
     starts = tuple(find_validation_start(record, fraction) for record in whole)
-    first, last = tuple(part[0] for part in parts), tuple(part[1] for part in parts)
-    return FitRecords(_add_noise(first, noise), last, whole, starts)
+    first = tuple(part[0] for part in parts)
+    last, runs = (
+        tuple(map(_adopt_holds, later, first)) for later in ([part[1] for part in parts], whole)
+    )
+    return FitRecords(_add_noise(first, noise), last, runs, starts)
 
 
 def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> ProblemPair:
@@ -94,6 +97,15 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
         weights=problem.output_weights,
         scored_from=records.scored_from,
     )
+
+
+def _adopt_holds(record: Record, estimation: Record) -> Record:
+    """Read the inputs as those of the part that the model is fitted to."""
+    holds = [channel.resolved_hold for channel in estimation.inputs]
+    if holds == [channel.resolved_hold for channel in record.inputs]:
+        return record
+    pairs = zip(record.inputs, holds, strict=True)
+    return replace(record, inputs=tuple(replace(channel, hold=hold) for channel, hold in pairs))
 
 
 def _add_noise(records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sysid.core.types import FloatArray
-from sysid.data.records import Hold
+from sysid.data.holds import Hold
 from sysid.models.model import SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTests
@@ -72,6 +72,32 @@ class SearchEvidence:
     minima: tuple[Minimum, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class InputHold:
+    """How an input is read between its samples.
+
+    Attributes
+    ----------
+    chosen : {"zero", "first", "band-limited"}
+    reason : str or None
+        Reason of a choice by the values; None if the hold was given.
+    other : {"zero", "first"} or None
+        The reading that was not chosen. None if the hold was given or has no effect.
+    estimates_other : dict or None
+        Estimates of the free parameters with the other reading, from the estimates by least
+        squares. None if they were not computed.
+    rms_other : float or None
+        RMS error with the other reading.
+    """
+
+    input: str
+    chosen: Hold
+    reason: str | None
+    other: Hold | None = None
+    estimates_other: dict[str, float] | None = None
+    rms_other: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
     """The result of one identification.
@@ -93,8 +119,10 @@ class Identification:
         Selected terms, if the model requests a selection.
     correlation_times : mapping of str to float
         Correlation time (s) of each output's noise, where the noise model has one.
-    holds : mapping of str to Hold
-        Behaviour of the inputs of the first experiment between their samples.
+    input_holds : tuple of InputHold
+        How each input is read between its samples, and the estimates if it were read otherwise.
+    data_bounds : tuple of str
+        Free parameters whose bounds follow the data, unless given; see the estimates.
     sample_time : float or None
         Sampling period (s) of all outputs; None if irregular or not the same for all.
     search : SearchEvidence
@@ -128,12 +156,18 @@ class Identification:
     residual_tests: ResidualTests | None
     onset_delays: tuple[OnsetDelay, ...]
     correlation_times: Mapping[str, float]
-    holds: Mapping[str, Hold]
+    input_holds: tuple[InputHold, ...]
+    data_bounds: tuple[str, ...]
     sample_time: float | None
     search: SearchEvidence
     substeps: int
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
+
+    @property
+    def holds(self) -> dict[str, Hold]:
+        """How each input is read between its samples."""
+        return {hold.input: hold.chosen for hold in self.input_holds}
 
     @property
     def noise_model(self) -> Literal["white", "ar1"]:

@@ -9,7 +9,7 @@ from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.identification.unrecorded_input import warn_unrecorded_input
-from sysid.kernels.reads import is_difference, list_delayed_values
+from sysid.kernels.reads import list_delayed_values
 from sysid.models.ties import collect_parameter_names
 from sysid.models.units import (
     list_mixed_unit_warnings,
@@ -28,9 +28,6 @@ from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
 _RIDGE_CORRELATION, _STRONG_CORRELATION = (
     0.9,
     0.95,
-)
-_HELD_SHARE = (
-    0.5  # share of equal neighbouring samples from which an input counts as piecewise constant
 )
 _NOTABLE_GAIN = 0.01
 _SEPARABLE_STDERRS = 2.0  # standard errors: a smaller time lag is insignificant
@@ -73,7 +70,6 @@ def collect_warnings(
     messages += _warn_constant_outputs(problem)
     messages += _warn_worse_than_line(problem, simulated)
     messages += _warn_constant_inputs(problem, analysis.estimates)
-    messages += _warn_held_inputs(problem)
     messages += _warn_early_response(problem) or warn_unrecorded_input(problem, analysis)
     messages += [text for estimate in analysis.estimates if (text := _warn_unidentified(estimate))]
     delay_names = find_delay_parameters(problem)
@@ -109,27 +105,6 @@ def _warn_active_bounds(analysis: Analysis) -> list[str]:
     also = f", and {', '.join(map(str, others))}" if others else ""
     cures = " and ".join(bound.advice for bound in analysis.active_bounds)
     return [f"{first}{also}. To widen: {cures}, unless it is a physical limit."]
-
-
-def _warn_held_inputs(problem: Problem) -> list[str]:
-    """Warn about inputs that look held between samples, but are interpolated linearly.
-
-    A jump read as a ramp over one sample moves the estimate of a time lag by half a sample.
-    """
-    if is_difference(problem.model):
-        return []  # a recursion reads inputs at the samples only
-    channels = [channel for record in problem.records for channel in record.inputs]
-    names = {
-        channel.name
-        for channel in channels
-        if channel.hold == "first" and _HELD_SHARE <= np.mean(np.diff(channel.values) == 0) < 1
-    }
-    return [
-        f"input {name!r} looks piecewise constant, but is interpolated linearly. This shifts an "
-        f"estimated time lag by about half a sample. If the input was held, use hold: "
-        f"{{{name}: zero}}"
-        for name in sorted(names)
-    ]
 
 
 def _warn_early_response(problem: Problem) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 from sysid.language.printer import format_expression
 from sysid.language.tree import Expression, PastValue
-from sysid.models.parameters import Parameter
+from sysid.models.parameters import BoundsRule, Parameter
 
 Criterion = Literal["none", "bic"]
 ErrorKind = Literal["one-step", "simulation"]
@@ -131,10 +131,14 @@ class FixedInitial:
 
 @dataclass(frozen=True, slots=True)
 class EstimatedInitial:
-    """Initial value of a state that is estimated inside these bounds, for each experiment."""
+    """Initial value of a state that is estimated inside these bounds, for each experiment.
+
+    With `bounds` they follow the data.
+    """
 
     lower: float
     upper: float
+    bounds: BoundsRule | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +231,13 @@ def name_initial_state(state: str, experiment: int) -> str:
 def build_initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
     """Build the parameters of the estimated initial states, for each experiment."""
     return tuple(
-        Parameter(name_initial_state(state.name, e), start.lower, start.upper, state.unit)
+        Parameter(
+            name_initial_state(state.name, e),
+            start.lower,
+            start.upper,
+            state.unit,
+            bounds=start.bounds,
+        )
         for e in range(experiments)
         for state, start in zip(model.states, model.initial, strict=True)
         if isinstance(start, EstimatedInitial)

@@ -105,6 +105,8 @@ def _write_parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[
     }
     if parameter.fixed is not None:
         entry["fixed"] = parameter.fixed
+    if parameter.bounds is not None:
+        entry["bounds"] = parameter.bounds
     if parameter.tied is not None:
         entry["tied"] = _write_text(parameter.tied)
     if description := declared[parameter.name].get("description"):
@@ -116,7 +118,8 @@ def _write_initial_state(start: InitialState) -> object:
     if isinstance(start, FixedInitial):
         return start.value
     if isinstance(start, EstimatedInitial):
-        return {"lower": start.lower, "upper": start.upper}
+        entry: dict[str, Any] = {"lower": start.lower, "upper": start.upper}
+        return entry if start.bounds is None else {**entry, "bounds": start.bounds}
     return "measured"
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from sysid.core.errors import InvalidBounds, InvalidSettings, suggest_name
 
 ParameterScale = Literal["linear", "log"]
+BoundsRule = Literal["gain", "rate", "offset", "time", "delay", "state"]
 
 _INITIAL_STATE_NAME = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
 
@@ -32,6 +33,9 @@ class Parameter:
     tied : str or None
         Expression of other parameters, such as ``"2*a"``. The parameter is then not searched, and
         its bounds have no effect.
+    bounds : str or None
+        What the parameter is, if its bounds follow the data; `lower` and `upper` are then those
+        without data.
 
     Raises
     ------
@@ -47,6 +51,7 @@ class Parameter:
     scale: ParameterScale = "linear"
     fixed: float | None = None
     tied: str | None = None
+    bounds: BoundsRule | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
@@ -139,6 +144,8 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
     fixed = values.get("fixed")
     if fixed is not None:
         values["tied"] = None
+    if parameter.bounds is not None:
+        values = _move_other_bounds(parameter, values)
     lower, upper = (values.get(k, getattr(parameter, k)) for k in ("lower", "upper"))
     if fixed is not None and not lower <= fixed <= upper:
         raise InvalidSettings(
@@ -147,3 +154,24 @@ def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parame
             "a value inside them, or wider 'lower' and 'upper'",
         )
     return replace(parameter, **values)
+
+
+def _move_other_bounds(parameter: Parameter, given: dict[str, Any]) -> dict[str, Any]:
+    """Move bounds that follow the data out of the way of a given bound or fixed value.
+
+    Given bounds are kept. An upper bound that is given no longer follows the data. The lower bound
+    of a delay stays: it cannot be negative.
+    """
+    width = parameter.upper - parameter.lower
+    lower, upper = parameter.lower, parameter.upper
+    if "fixed" in given and given["fixed"] is not None:
+        lower, upper = min(lower, given["fixed"]), max(upper, given["fixed"])
+    if "lower" in given and not given["lower"] < upper:
+        upper = given["lower"] + width
+    if "upper" in given and not lower < given["upper"] and parameter.bounds != "delay":
+        is_log = given.get("scale", parameter.scale) == "log"
+        lower = (
+            given["upper"] * parameter.lower / parameter.upper if is_log else given["upper"] - width
+        )
+    rule = None if "upper" in given else parameter.bounds
+    return {"lower": lower, "upper": upper, **given, "bounds": rule}

@@ -11,6 +11,7 @@ from sysid.language.tree import Expression, PastValue, match_plain_state
 from sysid.models import equations
 from sysid.models.documents import DocumentReader, quote_value
 from sysid.models.model import (
+    EstimatedInitial,
     FixedInitial,
     InitialState,
     MeasuredInitial,
@@ -83,6 +84,7 @@ def parse_model(document: object) -> Model:
         else _read_equation_model(reader, fields)
     )
     check_delay_units(reader, model)
+    _check_bounds_rules(reader, model)
     reader.raise_faults()
     model = replace(model, document=to_normal_form(fields, model))
     try:
@@ -97,6 +99,21 @@ def keep_terms(model: Model, labels: Sequence[str]) -> Model:
     listed = [label for label in labels if label != "1"]
     document = {**model.document, "terms": listed, "constant": "1" in labels}
     return parse_model(document)
+
+
+def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
+    """Check that bounds follow the data only where gains and times are those of a plant."""
+    if model.form == "differential":
+        return
+    starts = zip(model.states, model.initial, strict=True)
+    places = [join_pointer("parameters", p.name) for p in model.parameters if p.bounds is not None]
+    places += [
+        join_pointer("initial", state.name)
+        for state, start in starts
+        if isinstance(start, EstimatedInitial) and start.bounds is not None
+    ]
+    for place in places:
+        reader.add_fault(place + "/bounds", "belongs to the differential form; give numbers")
 
 
 def _read_form(reader: DocumentReader, document: Mapping[str, Any]) -> ModelForm:

@@ -20,13 +20,22 @@ from sysid.models.model import (
     Solver,
     SolverMethod,
 )
-from sysid.models.parameters import Parameter, ParameterScale
+from sysid.models.parameters import BoundsRule, Parameter, ParameterScale
 
 MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
 
 _NAME = re.compile(r"[^\W\d]\w{0,63}")
-_PARAMETER_FIELDS = ("lower", "upper", "unit", "scale", "fixed", "tied", "description")
+_PARAMETER_FIELDS = (
+    "lower",
+    "upper",
+    "bounds",
+    "unit",
+    "scale",
+    "fixed",
+    "tied",
+    "description",
+)
 _SOLVER_FIELDS = ("method", "step", "substeps", "history", "interpolation")
 _DIFFERENTIAL_FIELDS = ("method", "step")
 
@@ -92,13 +101,26 @@ def _read_parameter(reader: DocumentReader, name: str, entry: object) -> Paramet
         reader.add_fault(
             place + "/tied", "a parameter is either fixed or tied; leave one of them out"
         )
+    bounds = _read_bounds_rule(reader, fields, place)
     if reader.count_faults() > faults_before:
         return None
     try:
-        return Parameter(name, unit=unit, scale=cast(ParameterScale, scale), tied=tied, **numbers)
+        return Parameter(
+            name, unit=unit, scale=cast(ParameterScale, scale), tied=tied, bounds=bounds, **numbers
+        )
     except InvalidBounds as error:
         reader.add_fault(place, str(error))
         return None
+
+
+def _read_bounds_rule(
+    reader: DocumentReader, fields: Mapping[str, Any], place: str
+) -> BoundsRule | None:
+    """Read what a parameter is, if its bounds follow the data."""
+    if fields.get("bounds") is None:
+        return None
+    rule = reader.read_choice(fields["bounds"], get_args(BoundsRule), place + "/bounds")
+    return cast(BoundsRule, rule)
 
 
 def get_interval(parameter: Parameter) -> tuple[float, float]:
@@ -130,15 +152,15 @@ def _read_initial_state(reader: DocumentReader, value: object, place: str) -> In
     if value == "measured":
         return MeasuredInitial()
     if isinstance(value, Mapping):
-        fields = reader.read_section(value, place, ("lower", "upper"))
+        fields = reader.read_section(value, place, ("lower", "upper", "bounds"))
         for bound in ("lower", "upper"):
             reader.require_field(
                 fields, bound, place, "an estimated initial state needs both bounds"
             )
         lower, upper = (reader.read_number(fields.get(b) or 0.0, place) for b in ("lower", "upper"))
-        if len(fields) == 2 and not lower < upper:
+        if {"lower", "upper"} <= fields.keys() and not lower < upper:
             reader.add_fault(place, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
-        return EstimatedInitial(lower, upper)
+        return EstimatedInitial(lower, upper, _read_bounds_rule(reader, fields, place))
     if isinstance(value, bool) or not isinstance(value, int | float):
         need = "need a number, {lower, upper} to estimate it, or measured"
         reader.add_fault(place, f"{quote_value(value)} is not an initial state; {need}")

@@ -123,11 +123,11 @@ def _check_duration(duration: float) -> None:
 
 def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
     """Simulate angle and pressure; the result has shape (samples, 2)."""
-    times, values = supply.times, supply.values
+    times, values, hold = supply.times, supply.values, supply.resolved_hold
     simulated = np.zeros((times.size, 2))
     for k in range(times.size - 1):
         step = float(times[k + 1] - times[k])
-        slope = 0.0 if supply.hold == "zero" else float(values[k + 1] - values[k]) / step
+        slope = 0.0 if hold == "zero" else float(values[k + 1] - values[k]) / step
         plant.advance(float(values[k]), slope, step)
         if not np.all(np.isfinite(plant.state)):
             raise InvalidSettings(

@@ -18,6 +18,7 @@ from sysid.models.delays import check_delays
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.ties import Ties, apply_ties, resolve_ties
+from sysid.simulation.data_bounds import bound_by_data
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
 from sysid.simulation.experiments import (
     GridExperiment,
@@ -124,9 +125,8 @@ class Problem:
                 "/scored_from",
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
-        all_parameters = override_parameters(
-            (*model.parameters, *build_initial_parameters(model, len(records))), settings.parameters
-        )
+        declared = (*model.parameters, *build_initial_parameters(model, len(records)))
+        all_parameters = override_parameters(bound_by_data(declared, records), settings.parameters)
         ties = resolve_ties(model, all_parameters)
         tied = apply_ties(model, ties)
         check_delays(tied, all_parameters)
@@ -199,6 +199,8 @@ class Problem:
 
         If runs differ in their noise only, most of the work is done once.
         """
+        if any(parameter.bounds for parameter in self.all_parameters):
+            return self.rebuild(records=records)  # bounds follow the noise too
         skip, scoring_starts = self.settings.skip, self.settings.scored_from
         per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
         experiments = tuple(

@@ -37,7 +37,9 @@ export function fillTable(model, changes) {
       input.dataset.parameter = name;
       input.dataset.column = column;
       input.dataset.pointer = `/parameters/${name}/${column}`;
-      input.dataset.bound = bounds?.[column] ?? '';
+      const followsData = bounds?.bounds !== undefined && bounds.bounds !== null && column !== 'fixed';
+      input.placeholder = followsData ? 'from the data' : '';
+      input.dataset.bound = followsData ? '' : bounds?.[column] ?? '';
       input.value = changes[name]?.[column] ?? input.dataset.bound;
       row.append(document.createElement('td'));
       row.lastChild.append(input);

@@ -94,7 +94,7 @@ def test_a_job_with_faults_of_types_is_told_all_of_these_and_no_others(
         ),
         ({"skip": 10_000, "hold": {"y": "zero"}}, {"/datasets/0", "/hold/y"}),
         (
-            {"channels": {"u": "volts"}, "parameters": {"L": {"lower": 9}}},
+            {"channels": {"u": "volts"}, "parameters": {"L": {"lower": 9, "upper": 5}}},
             {"/channels/u", "/parameters/L"},
         ),
         (
@@ -140,7 +140,10 @@ def test_a_job_of_right_types_is_told_all_its_faults_and_none_that_follows_from_
             {"/truth/inputs/u", "/replicates", "/hold/y"},
         ),
         (
-            {"truth": {**TRUTH, "samples": 50}, "parameters": {"LL": {"upper": 1}}},
+            {
+                "truth": {**TRUTH, "samples": 50},
+                "parameters": {"LL": {"upper": 1}, "L": {"upper": 5}},
+            },
             {"/truth", "/parameters/LL"},
         ),
         (

@@ -78,7 +78,11 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"validation": {"fraction": 0.9}, "skip": 30}, "/datasets/0", "30 samples"),
     ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
     ({"validation": {"fraction": 0.999}}, "/validation/fraction", "would be empty"),
-    ({"parameters": {"L": {"fixed": 40}}}, "/parameters/L/fixed", "40 lies outside the bounds"),
+    (
+        {"parameters": {"L": {"fixed": 40, "upper": 5}}},
+        "/parameters/L/fixed",
+        "40 lies outside the bounds",
+    ),
     ({"parameters": {"K": {"tied": "2*K"}}}, "/parameters/K/tied", "circular, K → K"),
     (
         {"parameters": {"K": {"tied": "T"}, "T": {"tied": "K"}}},

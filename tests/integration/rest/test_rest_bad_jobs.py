@@ -111,7 +111,10 @@ def test_fewer_scored_samples_than_parameters_are_refused(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--set", "parameters.L.fixed=9"], "9 lies outside the bounds [0, 5] of 'L'"),
+        (
+            ["--set", "parameters.L.fixed=9", "--set", "parameters.L.upper=5"],
+            "9 lies outside the bounds [0, 5] of 'L'",
+        ),
         (["--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"], "circular, K → T → K"),
         (["--set", "weights.z=1"], "no output 'z'"),
     ],
@@ -161,7 +164,11 @@ def test_a_lag_that_the_record_has_no_room_for_is_refused_by_its_name(
 ) -> None:
     own = parts[0]
     short = store_csv(own, recording(40))
-    body: dict[str, Any] = {"model": "fopdt", "datasets": [short]}
+    body: dict[str, Any] = {
+        "model": "fopdt",
+        "datasets": [short],
+        "parameters": {"L": {"upper": 5}},
+    }
     fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert fault["pointer"] == "/datasets/0"
     assert "lasts 3.9 s" in fault["detail"]

@@ -76,7 +76,7 @@ def test_what_the_reference_was_made_with_otherwise_is_told(served: ServedBatch)
     (note,) = other["notes"]
     assert note.startswith("the reference was made with ")
     for told in (
-        "hold of u = first (here zero)",
+        "hold of u = auto (here zero)",
         "K = none (here 1, fixed)",
         "u = u (here y)",
         "loss = squares (here soft-l1 of scale 0.05)",

@@ -111,7 +111,7 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
 ) -> None:
     wrong = [f"m{n}" if path == "/model" else -100 - n for n in range(3000)]
     axis = {"path": path, "values": wrong}
-    body = {"model": "fopdt", "datasets": [dataset], "sweep": {"axes": [axis]}}
+    body = {"model": "tube", "datasets": [dataset], "sweep": {"axes": [axis]}}
     faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
     assert [one["pointer"] for one in faults[:-1]] == [
         f"/sweep/axes/0/values/{n}" for n in range(200)
@@ -120,7 +120,7 @@ def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
         "pointer": "",
         "detail": "200 faulty axis values are reported. The rest is not checked",
     }
-    axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "fopdt"]
+    axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "tube"]
     assert len(refused(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201
 
 

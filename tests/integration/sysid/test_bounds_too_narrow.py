@@ -15,13 +15,14 @@ TRUTH = {"K": 2.0, "T": 0.6, "L": 0.3, "y0": 0.0, "x(0)": 0.0}
 
 
 def fitted(offset: float, y0: dict[str, float] | None = None) -> Identification:
-    """A first-order response on top of an offset that the catalogue's bounds do not foresee."""
+    """A first-order response on top of an offset that given bounds may not foresee."""
     times = 0.05 * np.arange(400.0)
     u = Channel("u", times, np.where((times // 3) % 2 < 1, 0.0, 1.0), hold="zero")
     clean = simulate(load_model("fopdt"), [u], TRUTH, times=times).channels[0]
     noise = np.random.default_rng(1).normal(0, 0.02, times.size)
     y = Channel("y", times, clean.values + offset + noise)
-    changes = {} if y0 is None else {"y0": y0}
+    # The input repeats every 6 s, and a lag of half of it with a negative gain fits as well.
+    changes = {"y0": y0 or {"lower": -10, "upper": 10}, "L": {"upper": 2.0}}
     return identify(load_model("fopdt"), Record((u,), (y,)), QUICK, parameters=changes)
 
 

@@ -1,13 +1,15 @@
-"""How an input is held between its samples: said by the user, asked about by a warning."""
+"""How an input is held between its samples: said by the user, or chosen by its values."""
 
 import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.settings import GeneticAlgorithm
-from sysid.data.records import Channel, Recording
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold, Recording
+from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
+from sysid.identification.result import Identification, InputHold
 from sysid.models.catalogue.load import load_model
 
 PERIOD, LAG = 0.5, 3.2
@@ -38,15 +40,99 @@ def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
     assert lag(fitted(step_test().replace_holds({"u": "zero"}))) == pytest.approx(LAG, abs=0.02)
 
 
-def test_a_step_that_is_read_as_a_ramp_is_asked_about() -> None:
+def test_a_step_is_held_without_being_told() -> None:
     found = fitted(step_test())
-    assert abs(lag(found) - LAG) > 0.1
-    assert any("use hold: {u: zero}" in one for one in found.warnings)
+    (hold,) = found.input_holds
+    assert lag(found) == pytest.approx(LAG, abs=0.02)
+    assert (hold.input, hold.chosen, hold.other) == ("u", "zero", "first")
+    assert hold.reason == "has two levels"
 
 
-def test_a_held_input_is_not_asked_about() -> None:
-    found = fitted(step_test().replace_holds({"u": "zero"}))
+def test_the_estimate_of_the_other_reading_is_told() -> None:
+    found, lines = fitted(step_test()), fitted(step_test().replace_holds({"u": "first"}))
+    (hold,) = found.input_holds
+    assert hold.estimates_other is not None
+    assert hold.estimates_other["L"] == pytest.approx(lag(lines), abs=1e-4)
+    assert hold.rms_other == pytest.approx(lines.rms, rel=1e-3)
+    told = [one for one in found.warnings if "(hold: {u: first})" in one]
+    assert len(told) == 1
+    assert f"L = {lag(lines):.4g} s instead of {lag(found):.4g}" in told[0]
+    assert found.evaluations > lines.evaluations
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_of_a_given_hold_nothing_is_told(hold: Hold) -> None:
+    found = fitted(step_test().replace_holds({"u": hold}))
     assert not any("hold" in one for one in found.warnings)
+    assert found.input_holds == (InputHold("u", hold, None),)
+
+
+def test_a_budget_is_kept() -> None:
+    record = step_test().to_record({"u": "u"}, {"y": "y"})
+    search = GeneticAlgorithm(generations=100, stop=Stop(evaluations=400))
+    found = identify(load_model("fopdt"), record, search)
+    assert found.evaluations <= 400 + 50  # the search ends with a whole generation
+
+
+def moving_test() -> Recording:
+    """A held input that takes a new value at every sample, as a controller's."""
+    u = np.random.default_rng(1).standard_normal(200)
+    times, fine = PERIOD * np.arange(200), PERIOD / 50 * np.arange(200 * 50)
+    held = u[np.clip(np.floor((fine - LAG) / PERIOD + 1e-9).astype(int), 0, 199)]
+    x = np.empty(fine.size)
+    x[0] = 0.0
+    for k in range(1, fine.size):
+        x[k] = x[k - 1] + PERIOD / 50 / 8 * (1.5 * held[k - 1] - x[k - 1])
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(200)
+    return Recording((Channel("u", times, u, "V"), Channel("y", times, x[::50] + noise, "bar")))
+
+
+def test_a_reading_that_fits_worse_than_the_other_is_told() -> None:
+    found = fitted(moving_test())
+    assert found.input_holds[0].chosen == "first"
+    assert any("(hold: {u: zero})" in one and "fits better" in one for one in found.warnings)
+
+
+def test_jumps_between_irregular_samples_are_uncertain() -> None:
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.uniform(0.2, 1.0, 200))
+    jumps = np.sort(rng.uniform(5, 110, 12))
+    levels = rng.uniform(-1, 1, 13)
+
+    def drive(t: FloatArray) -> FloatArray:
+        return np.asarray(levels[np.searchsorted(jumps, t)])
+
+    fine = np.arange(0, float(times[-1]) + 0.01, 0.01)
+    x = np.zeros(fine.size)
+    u = drive(fine - LAG)
+    x[0] = 1.5 * u[0]
+    for k in range(1, fine.size):
+        x[k] = x[k - 1] + 0.01 / 8 * (1.5 * u[k - 1] - x[k - 1])
+    measured = np.interp(times, fine, x) + 1e-3 * rng.standard_normal(200)
+    record = (Channel("u", times, drive(times), "V"), Channel("y", times, measured, "bar"))
+    found = fitted(Recording(record))
+    assert found.input_holds[0].chosen == "zero"
+    (told,) = [one for one in found.warnings if "sampled irregularly" in one]
+    period = float(told.split(", ")[-1].removesuffix(" s"))
+    assert 0.4 < period < 0.9
+    assert abs(lag(found) - LAG) < period
+
+
+def test_the_validation_part_is_read_as_the_estimation_part() -> None:
+    times = np.arange(200.0)
+    u = np.where(times < 100, np.where(times >= 10, 1.0, 0.0), np.sin(times))
+    record = Recording((Channel("u", times, u), Channel("y", times, u))).to_record(
+        {"u": "u"}, {"y": "y"}
+    )
+    parts = prepare_records([record], fraction=0.5)
+    assert parts.validation is not None
+    assert parts.validation_runs is not None
+    holds = [
+        part[0].inputs[0].resolved_hold
+        for part in (parts.estimation, parts.validation, parts.validation_runs)
+    ]
+    assert holds == ["zero"] * 3
+    assert record.inputs[0].resolved_hold == "first"
 
 
 def test_the_hold_of_a_channel_that_is_not_there_is_refused() -> None:

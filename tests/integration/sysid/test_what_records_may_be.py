@@ -211,6 +211,7 @@ def test_the_hold_of_an_input_is_worth_half_a_sample_of_lag() -> None:
     held = replace(source(), hold="zero")
     data = Record((held,), (answer(held),))
     right = values(identify(lag_model(), data, QUICK))["L"]
-    ramps = values(identify(lag_model(), replace(data, inputs=(source(),)), QUICK))["L"]
+    lines = replace(source(), hold="first")
+    ramps = values(identify(lag_model(), replace(data, inputs=(lines,)), QUICK))["L"]
     assert right == pytest.approx(TRUTH["L"], abs=1e-4)
     assert ramps == pytest.approx(right + 0.025, abs=1e-3)

@@ -101,4 +101,4 @@ def test_channels_and_holds_of_a_job_are_those_of_its_signals() -> None:
     assert channels.holds == (("P1", "zero"),)
     recording = Recording(tuple(Channel(name, TIMES, TIMES) for name in ("u", "P1", "w", "P2")))
     [record] = channels.cut_records(recording, "a")
-    assert [(item.name, item.hold) for item in record.inputs] == [("u", "zero"), ("w", "first")]
+    assert [(item.name, item.hold) for item in record.inputs] == [("u", "zero"), ("w", "auto")]

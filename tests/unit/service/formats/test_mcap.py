@@ -223,7 +223,7 @@ def test_names_units_holds_and_segments_come_back() -> None:
     back = read_recording(recorded(two_bases()))
     assert back.names == ("u [x]", "other/base", "t")
     assert [one.unit for one in back.channels] == ["V", "m", "1"]
-    assert [one.hold for one in back.channels] == ["zero", "first", "band-limited"]
+    assert [one.hold for one in back.channels] == ["zero", "auto", "band-limited"]
     assert back.segments == two_bases().segments
 
 

@@ -264,7 +264,7 @@ def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None
 
 def advised(u: FloatArray, y: FloatArray) -> list[str]:
     times = STEP * np.arange(u.size)
-    one = Record((Channel("u", times, u),), (Channel("y", times, y),))
+    one = Record((Channel("u", times, u, hold="first"),), (Channel("y", times, y),))
     told = identify(load_model(GAIN), one, SMALL, skip=1).warnings
     return [text for text in told if "noise_model: ar1" in text]
 

@@ -15,7 +15,13 @@ from tests.searching import DUFFING, bits, example, noisy, record
 
 Given = Mapping[str, float] | Sequence[Mapping[str, float]]
 
-BOUNDS = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
+BOUNDS = {
+    "K": {"lower": -10.0, "upper": 10.0},
+    "T": {"lower": 0.01, "upper": 10.0},
+    "L": {"upper": 2.0},
+    "y0": {"lower": -10.0, "upper": 10.0},
+    "x(0)": {"lower": -10.0, "upper": 10.0},
+}
 
 
 @cache
