@@ -222,6 +222,7 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
     fine = {**stiff, "solver": {"method": "rk4", "step": "sample", "substeps": 40}}
     true = Problem.build(load_model(fine), [record(np.zeros(N))])
     y = true.predict(np.array([[K, 3.0, 1.0]]))[0]
+    y = y + 1e-5 * np.random.default_rng(1).standard_normal(y.size)
     auto, white = (found(stiff, y, loss) for loss in (AUTO, WHITE))
     assert same(auto, white)
     assert auto.warnings == white.warnings
