@@ -14,6 +14,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges, find_exchanges, order_exchangeable
 from sysid.identification.deadline import Clock, Deadline
+from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
@@ -139,6 +140,7 @@ def _build_identification(
         agreement=metrics.channels,
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
+            *warn_fixed_starts(problem, theta, analysis, deadline.is_past_grace),
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
             *found.warnings,
             *warn_unsettled(evidence),
