@@ -106,7 +106,9 @@ def _predict_starts(
     for state in _get_fixed_values(problem.model):
         slopes = _compute_start_slopes(problem, theta, state, np.sqrt(loss / error.size))
         others = slopes - basis @ (basis.T @ slopes)
-        moves: FloatArray = -np.linalg.lstsq(others, rest, rcond=RANK_TOLERANCE)[0]
+        moves = np.asarray(
+            -np.linalg.lstsq(others, rest, rcond=RANK_TOLERANCE)[0], dtype=np.float64
+        )
         after = rest + others @ moves
         if _is_significant(error.size, loss, float(after @ after), moves.size):
             predicted[state] = moves
