@@ -16,10 +16,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from sysid.core.errors import InvalidModel
 from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.models.model import EstimatedInitial, FixedInitial, Model, name_initial_state
+from sysid.models.parse import parse_model
+from sysid.models.sections import STEADY
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
@@ -256,10 +259,20 @@ def _describe_starts(
     cures = ", ".join(
         f"{state}: {_suggest_bounds(fixed[state], starts)}" for state, starts in wrong.items()
     )
+    steady = ", or initial: steady for a plant at rest" if _can_rest(problem.untied_model) else ""
     return (
         f"the record does not start at {assumed}. The data give {found}.{effect} "
-        f"Let the start be estimated: initial: {{{cures}}}"
+        f"Let the start be estimated: initial: {{{cures}}}{steady}"
     )
+
+
+def _can_rest(model: Model) -> bool:
+    """Whether the equations determine a rest of all states."""
+    try:
+        parse_model({**model.document, "initial": STEADY})
+    except InvalidModel:
+        return False
+    return True
 
 
 def _suggest_bounds(value: float, starts: Sequence[Estimate]) -> str:

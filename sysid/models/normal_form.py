@@ -3,7 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.models.model import EstimatedInitial, FixedInitial, InitialState, Model, Output
+from sysid.models.model import (
+    DerivedInitial,
+    EstimatedInitial,
+    FixedInitial,
+    InitialState,
+    Model,
+    Output,
+)
 from sysid.models.parameters import Parameter
 
 _TEXT_FIELDS = ("description", "source")
@@ -117,7 +124,7 @@ def _write_initial_state(start: InitialState) -> object:
         return start.value
     if isinstance(start, EstimatedInitial):
         return {"lower": start.lower, "upper": start.upper}
-    return "measured"
+    return start.text if isinstance(start, DerivedInitial) else "measured"
 
 
 def _write_solver(model: Model) -> dict[str, Any]:

@@ -91,7 +91,10 @@ def test_the_moves_are_those_of_an_estimate_with_that_start_free() -> None:
     record = measured(3, 3.0)
     [note] = notes(Problem.build(FIRST_ORDER, [record]))
     document = {**FIRST_ORDER.document, "initial": {"x": {"lower": -3, "upper": 6}}}
-    assert note.endswith("Let the start be estimated: initial: {x: {lower: -3, upper: 6}}")
+    assert note.endswith(
+        "Let the start be estimated: initial: {x: {lower: -3, upper: 6}}, or initial: steady for a "
+        "plant at rest"
+    )
     freed = identify(parse_model(document), record, GeneticAlgorithm(generations=50))
     for estimate in freed.estimates[:3]:
         assert f"{estimate.name} is {estimate.value:.4g} ± {estimate.stderr:.2g}" in note
@@ -168,4 +171,5 @@ def test_a_result_warns_also_under_a_noise_model() -> None:
     record = measured(0, 2.0, TANK)
     for loss in (Loss(), Loss(noise_model="ar1")):
         found = identify(TANK, record, GeneticAlgorithm(generations=50), loss=loss)
-        assert any("does not start at x = 0 V" in warning for warning in found.warnings)
+        [note] = [one for one in found.warnings if "does not start at x = 0 V" in one]
+        assert "steady" not in note  # a tank has no rest
