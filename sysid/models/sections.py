@@ -33,6 +33,10 @@ MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
 
 _NAME = re.compile(r"[^\W\d]\w{0,63}")
+_NEED_START = (
+    "need a number, {lower, upper} to estimate it, measured, steady, or an expression of "
+    "parameters and first input values, such as K*u0"
+)
 _PARAMETER_FIELDS = ("lower", "upper", "unit", "scale", "fixed", "tied", "description")
 _SOLVER_FIELDS = ("method", "step", "substeps", "history", "interpolation")
 _DIFFERENTIAL_FIELDS = ("method", "step")
@@ -157,11 +161,7 @@ def _read_initial_state(
             reader.add_fault(place, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
         return EstimatedInitial(lower, upper)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        need = (
-            "need a number, {lower, upper} to estimate it, measured, steady, or an expression of "
-            "parameters and first input values"
-        )
-        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {need}")
+        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {_NEED_START}")
         return FixedInitial(0.0)
     return FixedInitial(reader.read_number(value, place))
 
@@ -171,6 +171,9 @@ def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> 
     declared = (*scope.names, *scope.states)
     first_values = {f"{name}0": name for name in scope.inputs if f"{name}0" not in declared}
     inputs = (*scope.inputs, *first_values)
+    if _NAME.fullmatch(text) and text not in (*scope.names, *inputs):
+        reader.add_fault(place, f"{quote_value(text)} is not an initial state; {_NEED_START}")
+        return Number(0.0)
     checked = check_expression(text, replace(scope, states=(), inputs=inputs))
     for column, detail in checked.faults:
         reader.add_fault(place, detail, column)
