@@ -12,7 +12,13 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
-from sysid.models.model import EstimatedInitial, MeasuredInitial, Model, name_initial_state
+from sysid.models.model import (
+    DerivedInitial,
+    EstimatedInitial,
+    MeasuredInitial,
+    Model,
+    name_initial_state,
+)
 from sysid.simulation.experiments import GridExperiment
 from sysid.simulation.problem import Problem
 
@@ -87,16 +93,20 @@ class Twin:
         self.difference = model.form != "differential"
         self.step = experiment.grid.integration_step
         self.names = [state.name for state in model.states]
+        self.started = False
         self.past: dict[str, list[float]] = {}
         self.given: dict[str, list[float]] = {}
         for i, start in enumerate(model.initial):
             name = self.names[i]
             given = experiment.starts[i].first_values
+            if isinstance(start, DerivedInitial):
+                given = np.array([self._value(start.expression, 0, 0.0, {}, 0)])
             if isinstance(start, EstimatedInitial):
                 given = np.array([values[name_initial_state(name, number)]])
             self.past[name] = [float(given[0])]
             later = given[1:] if isinstance(start, MeasuredInitial) else given[:0]
             self.given[name] = [float(v) for v in later]
+        self.started = True
         self.first = {name: past[0] for name, past in self.past.items()}
         zero = model.solver.history == "zero"
         self.before = dict.fromkeys(self.names, 0.0) if zero else self.first
@@ -240,6 +250,8 @@ class Twin:
 
     def _input(self, past: PastValue, m: int, c: float) -> float:
         names = [quantity.name for quantity in self.model.inputs]
+        if not self.started:
+            return self.experiment.first_inputs[names.index(past.name)]
         fine = self.experiment.inputs[names.index(past.name)]
         start = fine.begin if self.difference else 0
         place = m + c - past.offset

@@ -261,9 +261,12 @@ def print_result(
         markup=False,
         end="",
     )
-    if result.fit_percent_validation is not None:
+    if result.rms_validation is not None and result.fit_percent_validation is not None:
         out.print(
-            f", validation {_format_fit(result.fit_percent_validation)}", markup=False, end=""
+            f"; validation RMS {result.rms_validation:.6g}{plain_unit(unit)}, "
+            f"fit {_format_fit(result.fit_percent_validation, 'it hardly moves')}",
+            markup=False,
+            end="",
         )
     out.print(f"; {result.evaluations} simulations in {seconds:.2f} s", markup=False)
     if result.data_bounds:
@@ -307,8 +310,8 @@ def _format_history_span(durations: Sequence[float]) -> str:
     return f"{least:.4g} s" if least == most else f"{least:.4g} to {most:.4g} s"
 
 
-def _format_fit(fit: float) -> str:
-    return f"{fit:.2f} %" if isfinite(fit) else "none (the output is constant)"
+def _format_fit(fit: float, why: str = "the output is constant") -> str:
+    return f"{fit:.2f} %" if isfinite(fit) else f"none ({why})"
 
 
 def _run_identification(

@@ -27,7 +27,7 @@ from service.storage.sessions import Database
 from sysid.core.errors import suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.models.model import FixedInitial, Model
+from sysid.models.model import DerivedInitial, FixedInitial, Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ def _collect_values(stored: StoredRun, changes: Mapping[str, float]) -> dict[str
     rest = {
         f"{state.name}(0)": 0.0
         for state, start in zip(model.states, model.initial, strict=True)
-        if not isinstance(start, FixedInitial)
+        if not isinstance(start, FixedInitial | DerivedInitial)
     }
     names = {parameter.name for parameter in model.parameters}
     estimates = {p["name"]: p["value"] for p in stored.estimates if p["name"] in names}

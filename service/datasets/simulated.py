@@ -22,7 +22,7 @@ from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 from sysid.models.delays import check_delays
-from sysid.models.model import FixedInitial, Model
+from sysid.models.model import DerivedInitial, FixedInitial, Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ def _simulate_recording(
     initial_values = {
         f"{state.name}(0)": 0.0
         for state, start in zip(model.states, model.initial, strict=True)
-        if not isinstance(start, FixedInitial)
+        if not isinstance(start, FixedInitial | DerivedInitial)
     }
     values = {**initial_values, **body.parameters}
     outputs = simulate_model(model, inputs, values, times=times).channels

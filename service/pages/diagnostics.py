@@ -164,4 +164,5 @@ def _describe_search(search: Document) -> str:
 
 
 def _format_group(group: Document) -> str:
-    return f"{group['expression']} = {join_estimate(group['value'], group.get('stderr'))}"
+    where = " near the estimate" if group.get("is_local") else ""
+    return f"{group['expression']} = {join_estimate(group['value'], group.get('stderr'))}{where}"

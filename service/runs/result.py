@@ -149,7 +149,8 @@ def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, A
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
     groups = [
-        _read(group, "members", "expression", "value", "stderr") for group in uncertainty.groups
+        _read(group, "members", "expression", "value", "stderr", "is_local")
+        for group in uncertainty.groups
     ]
     return {
         **_read(uncertainty, "condition"),

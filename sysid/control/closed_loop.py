@@ -25,7 +25,7 @@ from sysid.data.records import Channel, Recording
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Number, PastValue, Symbol
-from sysid.models.model import FixedInitial, Model, name_initial_state
+from sysid.models.model import DerivedInitial, FixedInitial, Model, name_initial_state
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
 
@@ -122,10 +122,17 @@ class ClosedLoop:
             for state, start in zip(self.model.states, self.model.initial, strict=True)
             if isinstance(start, FixedInitial)
         }
+        derived = {
+            state.name: start.expression
+            for state, start in zip(self.model.states, self.model.initial, strict=True)
+            if isinstance(start, DerivedInitial)
+        }
 
         def substitute_values(node: Expression) -> Expression | None:
             match node:
                 case PastValue(name):
+                    if name in derived and name_initial_state(name, 0) not in values:
+                        return substitute(derived[name], substitute_values)
                     start = values.get(name_initial_state(name, 0), starts.get(name, 0.0))
                     return Number(input_values.get(name, start))
                 case Symbol(_, "time" | "index"):

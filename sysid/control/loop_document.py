@@ -15,8 +15,8 @@ from sysid.language.delays import collect_past_values
 from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.transform import add_delays, shift_expression, substitute
-from sysid.language.tree import Binary, Expression, PastValue, Symbol
-from sysid.models.model import EstimatedInitial, FixedInitial, InitialState, Model
+from sysid.language.tree import Binary, Expression, Number, PastValue, Symbol
+from sysid.models.model import DerivedInitial, EstimatedInitial, FixedInitial, InitialState, Model
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 
@@ -188,7 +188,7 @@ class LoopDocumentBuilder:
             for state, tree in zip(model.states, model.equations, strict=True)
         }
         initial = {
-            s.name: _to_initial_value(start)
+            s.name: _to_initial_value(start, name)
             for s, start in zip(model.states, model.initial, strict=True)
         }
         if equation is not None:
@@ -278,10 +278,20 @@ def _to_declaration(parameter: Parameter) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if value is not None}
 
 
-def _to_initial_value(initial: InitialState) -> Mapping[str, float] | float:
-    """Convert to a start without measurement; an estimated or measured one becomes a range."""
+def _to_initial_value(initial: InitialState, plant_input: str) -> Mapping[str, float] | float | str:
+    """Convert to a start without measurement; an estimated or measured one becomes a range.
+
+    Before the loop closes the plant's input is 0.
+    """
+
+    def stop_input(node: Expression) -> Expression | None:
+        is_input = isinstance(node, PastValue) and node.name == plant_input
+        return Number(0.0) if is_input else None
+
     if isinstance(initial, FixedInitial):
         return initial.value
+    if isinstance(initial, DerivedInitial):
+        return format_expression(substitute(initial.expression, stop_input))
     if isinstance(initial, EstimatedInitial):
         return {"lower": initial.lower, "upper": initial.upper}
     return {"lower": -1.0, "upper": 1.0}

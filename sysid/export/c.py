@@ -187,6 +187,8 @@ def _write_identified_function(program: GeneratedProgram, stem: str) -> str:
         for item in identified.model.parameters
     ]
     for i, state in enumerate(identified.model.states):
+        if not program.is_start_given(i):
+            continue
         start, name = program.find_initial_value(i), program.start_names[state.name]
         value = write_number(0.0 if start is None else start)
         note = " /* give the measured value */" if start is None else ""
@@ -281,12 +283,12 @@ def _write_state_arrays(program: GeneratedProgram) -> list[str]:
     for i, state in enumerate(states):
         offset = f" + {i}*(steps + 1)" if i else ""
         lines.append(f"double *const {program.array_names[state.name]} = work{offset};")
-    for state in states:
-        every, start = program.array_names[state.name], program.start_names[state.name]
-        size = _write_array_size(program, start)
+    for i, state in enumerate(states):
+        every, start = program.array_names[state.name], program.write_start(i)
+        size = _write_array_size(program, program.start_names[state.name])
         lines += [
             f"for (long i = 0; i < {program.n_start_samples} && i <= steps; ++i)",
-            f"    {every}[i] = p->{start}{'[i]' if size else ''};",
+            f"    {every}[i] = {start}{'[i]' if size else ''};",
         ]
     return lines
 

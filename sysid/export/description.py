@@ -13,7 +13,7 @@ from typing import Any
 
 from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
 from sysid.export.identifiers import to_one_line
-from sysid.models.model import MeasuredInitial, name_initial_state
+from sysid.models.model import DerivedInitial, MeasuredInitial, name_initial_state
 
 _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
@@ -77,6 +77,8 @@ def describe_values(
             head + _describe_value(value or IdentifiedValue(parameter.name, 0.0, parameter.unit)),
         )
     for state, initial in zip(model.states, model.initial, strict=True):
+        if isinstance(initial, DerivedInitial):
+            continue  # the program computes it
         name = name_initial_state(state.name, 0)
         value = identified.find_value(name)
         head = f"{name}: start of {state.name}, "

@@ -19,7 +19,7 @@ from sysid.export.identifiers import Identifiers
 from sysid.kernels.reads import find_averaged_inputs, is_difference
 from sysid.language.functions import Level
 from sysid.language.tree import Expression, PastValue, Symbol
-from sysid.models.model import FixedInitial, MeasuredInitial, name_initial_state
+from sysid.models.model import DerivedInitial, FixedInitial, MeasuredInitial, name_initial_state
 
 EvaluationStage = Literal["slope", "update", "recursion", "output"]
 
@@ -96,7 +96,7 @@ class GeneratedProgram:
         return max(self.identified.model.memory, 1) if self.is_recursion else 1
 
     def find_initial_value(self, state: int) -> float | None:
-        """Find the start of a state; None if it must be measured.
+        """Find the start of a state; None if it must be measured, or is computed.
 
         Raises
         ------
@@ -110,9 +110,21 @@ class GeneratedProgram:
             return value.value
         if isinstance(initial, FixedInitial):
             return initial.value
-        if isinstance(initial, MeasuredInitial):
+        if isinstance(initial, MeasuredInitial | DerivedInitial):
             return None
         raise InvalidSettings(f"/values/{name}", "a value is missing")
+
+    def is_start_given(self, state: int) -> bool:
+        """Whether the start of a state is given to the program, not computed by it."""
+        return not isinstance(self.identified.model.initial[state], DerivedInitial)
+
+    def write_start(self, state: int) -> str:
+        """Write the start of a state: its name, or what it follows from."""
+        model = self.identified.model
+        initial = model.initial[state]
+        if isinstance(initial, DerivedInitial):
+            return write_expression(initial.expression, self.language, StartScope(self))
+        return self.prefix + self.start_names[model.states[state].name]
 
     def write_history(self, state: str) -> str:
         """Write the value of a state before the start."""
@@ -303,6 +315,15 @@ class DelayScope(ExportScope):
     def write_past_value(self, past: PastValue) -> str:
         """Never called: the language allows no signals in a time lag."""
         raise AssertionError(f"a time lag contains no signal such as {past.name}")
+
+
+@dataclass(frozen=True, slots=True)
+class StartScope(DelayScope):
+    """Scope of a start: parameters, the sampling period and the inputs' first values."""
+
+    def write_past_value(self, past: PastValue) -> str:
+        """Write the first value of an input."""
+        return f"{self.program.input_names[past.name]}[0]"
 
 
 def write_delay_steps(program: GeneratedProgram, delay: Expression) -> str:

@@ -141,7 +141,7 @@ def _write_signature(program: GeneratedProgram) -> str:
     required = [
         program.start_names[state.name]
         for i, state in enumerate(identified.model.states)
-        if program.find_initial_value(i) is None
+        if program.is_start_given(i) and program.find_initial_value(i) is None
     ]
     defaults = [
         f"{program.parameter_names[parameter.name]}={write_number(numbers[parameter.name])}"
@@ -241,8 +241,8 @@ def _write_delays(program: GeneratedProgram) -> list[str]:
 
 def _write_starts(program: GeneratedProgram) -> list[str]:
     lines = []
-    for state in program.identified.model.states:
-        every, start = program.array_names[state.name], program.start_names[state.name]
+    for i, state in enumerate(program.identified.model.states):
+        every, start = program.array_names[state.name], program.write_start(i)
         lines += [
             f"{every} = np.empty(steps + 1)",
             f"{every}[:{program.n_start_samples}] = {start}",

@@ -35,12 +35,21 @@ class IdentifiableCombination:
     value : float
     stderr : float or None
         Standard error of `value`.
+    is_local : bool
+        Whether the combination holds near the estimate only, as a sum in place of
+        ``K*exp(-E/300)``.
     """
 
     members: tuple[str, ...]
     expression: str
     value: float
     stderr: float | None
+    is_local: bool = False
+
+    @property
+    def text(self) -> str:
+        """The expression, and where it holds."""
+        return f"{self.expression} (near the estimate)" if self.is_local else self.expression
 
 
 _LINK_TOLERANCE = 1e-4  # parameters with a weaker link are not moved together: it is rounding
@@ -119,14 +128,17 @@ def express_combinations(
         texts = [(e, _format_product([names[d] for d in block.members], e)) for e in powers[0]]
         products = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
         combinations = [(text, total, total * slope) for text, total, slope in products]
+        is_local = False
     else:
+        is_local = terms is None
         factors = sums if terms is None else terms[0]
         combinations = [
             (_format_sum([names[d] for d in block.members], c), float(c @ value), c)
             for c in factors
         ]
     return tuple(
-        _make_combination(block, names, covariance, *combination) for combination in combinations
+        _make_combination(block, names, covariance, is_local, *combination)
+        for combination in combinations
     )
 
 
@@ -134,6 +146,7 @@ def _make_combination(
     block: ParameterBlock,
     names: Sequence[str],
     covariance: FloatArray,
+    is_local: bool,
     text: str,
     value: float,
     slope: FloatArray,
@@ -141,7 +154,7 @@ def _make_combination(
     inside = covariance[np.ix_(block.members, block.members)]
     stderr = sqrt(max(float(slope @ inside @ slope), 0.0))
     members = tuple(names[d] for d, s in zip(block.members, slope, strict=True) if s != 0.0)
-    return IdentifiableCombination(members, text, value, stderr)
+    return IdentifiableCombination(members, text, value, stderr, is_local)
 
 
 def _iterate_orthogonal(rows: FloatArray) -> Iterator[FloatArray]:

@@ -22,6 +22,7 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 from sysid.models.model import (
+    DerivedInitial,
     EstimatedInitial,
     FixedInitial,
     InitialState,
@@ -105,6 +106,8 @@ def _add_initial_conditions(
         match start:
             case FixedInitial(value) if value != 0.0:
                 weights.require_equal({}, weight)
+            case DerivedInitial(expression):
+                weights.require_equal(weight, weights.weigh_expression(expression))
             case MeasuredInitial():
                 weights.require_equal({}, weight)
             case EstimatedInitial():

@@ -11,6 +11,7 @@ from itertools import combinations
 
 from sysid.language.tree import Binary, Expression, FunctionCall, PastValue, Symbol, Unary
 from sysid.models.model import (
+    DerivedInitial,
     EstimatedInitial,
     FixedInitial,
     InitialState,
@@ -158,6 +159,8 @@ def _locate_exchange(
 def _have_same_start(first: InitialState, second: InitialState) -> bool:
     if isinstance(first, EstimatedInitial):
         return isinstance(second, EstimatedInitial)
+    if isinstance(first, DerivedInitial):  # the exchange is simulated before it counts
+        return isinstance(second, DerivedInitial)
     return isinstance(first, FixedInitial) and first == second
 
 

@@ -1,6 +1,7 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
 from time import perf_counter
@@ -8,18 +9,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
+from sysid.core.errors import DivergedEverywhere, InvalidRecord, NothingIdentifiable
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
 from sysid.data.records import find_common_sample_time
 from sysid.identifiability.exchange import describe_exchanges, find_exchanges, order_exchangeable
 from sysid.identification.deadline import Clock, Deadline
+from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
     make_whitening,
 )
+from sysid.identification.hard_switching import warn_hard_switching
 from sysid.identification.input_hold import (
     describe_input_holds,
     list_input_holds,
@@ -75,6 +79,9 @@ from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 
 _SCAN_DIVISOR = 4  # of the simulations that are left, a scan takes this part at most
+_STILL_SHARE = 0.3  # of the estimation data's variation: validation data with less hardly move
+_STILL_NOISE = 2.0  # of the estimation RMS: and with less they show mostly noise
+_START_SHARE = 0.3  # of a validation record: its first part gives its initial states
 
 
 def conclude_run(
@@ -125,7 +132,7 @@ def _build_identification(
     validated = (
         None
         if validation is None
-        else _validate_estimates(validation, problem, analysis.estimates, times)
+        else _validate_estimates(validation, problem, analysis.estimates, times, metrics)
     )
     tests = (
         validated.tests
@@ -163,6 +170,7 @@ def _build_identification(
         agreement=metrics.channels,
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
+            *warn_fixed_starts(problem, theta, analysis, deadline.is_past_grace),
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
             *found.warnings,
             *warn_unsettled(evidence),
@@ -172,6 +180,8 @@ def _build_identification(
                 analysis.exchanges,
                 {estimate.name for estimate in analysis.estimates if estimate.stderr is not None},
             ),
+            *warn_hard_switching(problem, theta, _list_final_rms(refined, ends)),
+            *_warn_still_validation(problem, metrics, validated),
             *warn_time_limit(any(end.is_cut_short for end in refined if end is not None)),
             *_check_feedback(problem, simulated, analysis),
             *explain_finer_step(asked, problem, first, analysis.estimates),
@@ -675,10 +685,24 @@ def _split_outputs(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArr
     return tuple(tuple(part[name] for name in names) for part in problem.split_by_output(values))
 
 
+def _list_final_rms(
+    refined: tuple[RefinedCandidate | None, ...], ends: list[tuple[FloatArray, float]]
+) -> list[float]:
+    """List the RMS of the refined champions, or of all; one near a better one is not refined."""
+    return [end.rms for end in refined if end is not None] or [rms for _, rms in ends]
+
+
 class _ValidationResult(NamedTuple):
+    """Agreement with validation data; `spread` is the RMS of their mean.
+
+    `is_still`: they hardly move, so that their fit % says nothing and is undefined.
+    """
+
     metrics: Metrics
     simulated: tuple[tuple[FloatArray, ...], ...]
     tests: ResidualTests
+    spread: float
+    is_still: bool
 
 
 def _validate_estimates(
@@ -686,12 +710,14 @@ def _validate_estimates(
     estimation: Problem,
     estimates: tuple[Estimate, ...],
     correlation_times: Mapping[str, float],
+    metrics: Metrics,
 ) -> _ValidationResult:
     """Simulate data that were not used for the estimate, and measure the agreement.
 
     Parameters and output weights are those of the estimate, so both RMS use the same measure. An
     initial state belongs to its record. If the last part of the same records is validated, it is
-    the estimated one. On other records only the initial state is estimated.
+    the estimated one. On other records only the initial state is estimated, on their first part.
+    `metrics` are those of the estimation data.
     """
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
@@ -703,17 +729,68 @@ def _validate_estimates(
         parameters={**other_changes, **fixed},
         weights=estimation.output_weights,
     )
-    theta = np.zeros(0)
-    if fixed_problem.free_parameters:
-        middle = 0.5 * (fixed_problem.evaluator.lower + fixed_problem.evaluator.upper)
-        start = refine_candidates(fixed_problem, [middle])[0]
-        theta = middle if start is None else start.theta
+    theta = _estimate_starts(fixed_problem) if fixed_problem.free_parameters else np.zeros(0)
     simulated = fixed_problem.predict(theta[None])[0]
+    agreement, spread = compute_metrics(fixed_problem, simulated), fixed_problem.output_scale
+    is_still = spread < _STILL_SHARE * estimation.output_scale and (
+        agreement.fit_percent < 0.0 or spread < _STILL_NOISE * metrics.rms
+    )
     return _ValidationResult(
-        compute_metrics(fixed_problem, simulated),
+        _leave_out_fit(agreement) if is_still else agreement,
         _select_scored_part(fixed_problem, _split_outputs(fixed_problem, simulated)),
         run_residual_tests(fixed_problem, simulated, "validation", correlation_times),
+        spread,
+        is_still,
     )
+
+
+def _estimate_starts(problem: Problem) -> FloatArray:
+    """Estimate the initial states of validation data on the first part of each record.
+
+    So the rest is predicted. A record of which nothing is scored there is used as a whole.
+    """
+    first = [
+        replace(
+            record,
+            outputs=tuple(
+                replace(
+                    channel,
+                    values=np.where(
+                        np.arange(channel.values.size) < _START_SHARE * channel.values.size,
+                        channel.values,
+                        np.nan,
+                    ),
+                )
+                for channel in record.outputs
+            ),
+        )
+        for record in problem.records
+    ]
+    with suppress(InvalidRecord):  # nothing in it is scored
+        problem = problem.rebuild(records=first, weights=problem.output_weights)
+    middle = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
+    start = refine_candidates(problem, [middle])[0]
+    return middle if start is None else start.theta
+
+
+def _leave_out_fit(metrics: Metrics) -> Metrics:
+    channels = tuple(replace(channel, fit_percent=float("nan")) for channel in metrics.channels)
+    return replace(metrics, fit_percent=float("nan"), channels=channels)
+
+
+def _warn_still_validation(
+    problem: Problem, metrics: Metrics, validated: _ValidationResult | None
+) -> list[str]:
+    """Warn about validation data that hardly move: their fit % would say nothing."""
+    if validated is None or not validated.is_still:
+        return []
+    unit = format_unit(metrics.unit)
+    return [
+        f"the validation data hardly move: their standard deviation is {validated.spread:.3g}{unit}"
+        f", that of the estimation data {problem.output_scale:.3g}{unit}. So their fit % says "
+        f"nothing. Compare the RMS: {validated.metrics.rms:.3g}{unit} in validation, "
+        f"{metrics.rms:.3g}{unit} in estimation."
+    ]
 
 
 def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:

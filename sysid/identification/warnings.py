@@ -223,7 +223,7 @@ def _warn_vague_group(group: IdentifiableCombination) -> str:
     if not group.stderr or group.stderr < _VAGUE_SHARE * abs(group.value):
         return ""
     return (
-        f"{group.expression} is practically unidentifiable: {group.value:.3g} with a standard "
+        f"{group.text} is practically unidentifiable: {group.value:.3g} with a standard "
         f"error of {group.stderr:.3g}"
     )
 

@@ -10,7 +10,7 @@ from sysid.core.memo import cache_by_identity
 from sysid.kernels.kernel import KERNEL_NAME, emit_kernel
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.machine_code import compile_bounded, describe_machine, load_object_code
-from sysid.models.model import EstimatedInitial, Model
+from sysid.models.model import DerivedInitial, Model
 
 _kernel_addresses: dict[str, int] = {}
 
@@ -34,7 +34,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
     Bounds, units, titles and the grid's step are data. Changing them does not recompile.
     """
     starts = tuple(
-        "estimated" if isinstance(start, EstimatedInitial) else type(start).__name__
+        start.expression if isinstance(start, DerivedInitial) else type(start).__name__
         for start in model.initial
     )
     parts = (

@@ -7,6 +7,7 @@ from llvmlite import ir
 from sysid.kernels import reads
 from sysid.kernels.abi import KERNEL_ARGUMENTS, LANES, NARROW_LANES, build_kernel_type
 from sysid.kernels.delayed_reads import TimeStep
+from sysid.kernels.expressions import emit_expression
 from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
 from sysid.kernels.layout import ExperimentLayout, KernelVariant
 from sysid.kernels.loss import LossAccumulator
@@ -15,10 +16,11 @@ from sysid.kernels.signals import (
     ExperimentHead,
     ParameterEnvironment,
     SignalReaders,
+    StartEnvironment,
     States,
 )
 from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
-from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
+from sysid.models.model import DerivedInitial, EstimatedInitial, MeasuredInitial, Model
 
 KERNEL_NAME = "kernel"
 """Name of the kernel's function in its module."""
@@ -86,7 +88,7 @@ class _Block:
             },
             step,
         )
-        start = [self._load_initial_state(i) for i in range(len(model.states))]
+        start = self._emit_start(scope)
         states = States(lanes, model, experiment, self.arguments["work"], start)
         row = states.fill_history()
         delays = Delays(lanes, model, scope, step)
@@ -107,7 +109,7 @@ class _Block:
         if self.variant.one_step:
             states.store_states(time_step.row)
             signals.begin_step(time_step)
-        following = self._emit_following_states(time_step, states, build_environment)
+        following = self._emit_following_states(time_step, states, build_environment, start)
         signals.end_step(loop, following)
         states.end_step(loop, following)
         comparison.end_step(loop)
@@ -128,15 +130,28 @@ class _Block:
         index = b.add(b.mul(row, self.arguments["stride"]), self.first)
         return self.lanes.load_row(self.arguments["theta"], index)
 
-    def _load_initial_state(self, i: int) -> IrValue:
-        """Load a state's initial value: a number of the experiment, or a row of theta."""
-        initial = self.experiment.initial[i]
-        if not isinstance(self.model.initial[i], EstimatedInitial):
-            return initial
-        return self._load_parameter(self.experiment.get_state_field(i, "row"))
+    def _emit_start(self, scope: ParameterEnvironment) -> list[IrValue]:
+        """Emit the initial values: numbers of the experiment, rows of theta, or expressions."""
+        names = [signal.name for signal in self.model.inputs]
+        first_inputs = dict(zip(names, self.experiment.first_inputs, strict=True))
+        environment = StartEnvironment(scope.values, scope.period, first_inputs)
+        values = []
+        for i, initial in enumerate(self.model.initial):
+            value = self.experiment.initial[i]
+            if isinstance(initial, EstimatedInitial):
+                value = self._load_parameter(self.experiment.get_state_field(i, "row"))
+            elif isinstance(initial, DerivedInitial):  # the number shifts it
+                derived = emit_expression(self.lanes, initial.expression, environment)
+                value = self.lanes.add(derived, value)
+            values.append(value)
+        return values
 
     def _emit_following_states(
-        self, time_step: TimeStep, states: States, build_environment: EnvironmentBuilder
+        self,
+        time_step: TimeStep,
+        states: States,
+        build_environment: EnvironmentBuilder,
+        start: list[IrValue],
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
@@ -146,7 +161,8 @@ class _Block:
             )
         following = lanes.builder.add(time_step.index, lanes.make_integer(1))
         measured = [
-            lanes.splat(self._load_measured_state(i, following)) for i in range(len(states.names))
+            lanes.splat(self._load_measured_state(i, following, start[i]))
+            for i in range(len(states.names))
         ]
 
         def emit_computed() -> list[IrValue]:
@@ -159,9 +175,9 @@ class _Block:
         merged = lanes.branch(is_computed, emit_computed, measured)
         return dict(zip(states.names, merged, strict=True))
 
-    def _load_measured_state(self, i: int, sample: IrValue) -> IrValue:
+    def _load_measured_state(self, i: int, sample: IrValue, start: IrValue) -> IrValue:
         if not isinstance(self.model.initial[i], MeasuredInitial):
-            return self._load_initial_state(i)
+            return start
         b, lanes = self.lanes.builder, self.lanes
         last = lanes.make_integer(self.model.memory - 1)
         inside = b.select(b.icmp_signed("<", sample, last), sample, last)

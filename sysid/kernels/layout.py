@@ -32,7 +32,7 @@ predictions; place of the measurement interpolated to the grid.
 FLOAT_FIELDS = ("step", "cap", "scale")
 """Integration step in s (difference form: h); largest delay in steps; scale of soft-l1.
 
-The states' initial values follow.
+The states' initial values follow, then the inputs' values at the start.
 """
 
 
@@ -99,8 +99,12 @@ class ExperimentLayout:
     @property
     def n_floats(self) -> int:
         """Length of the head in floats."""
-        return len(FLOAT_FIELDS) + self.states
+        return self.locate_first_input(self.inputs)
 
     def locate_initial(self, number: int) -> int:
         """Return the place (in floats) of a state's initial value."""
         return len(FLOAT_FIELDS) + number
+
+    def locate_first_input(self, number: int) -> int:
+        """Return the place (in floats) of an input's value at the start."""
+        return self.locate_initial(self.states) + number

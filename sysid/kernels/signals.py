@@ -65,6 +65,10 @@ class ExperimentHead:
             lanes.load_double(floats, lanes.make_integer(layout.locate_initial(i)))
             for i in range(layout.states)
         ]
+        self.first_inputs = [
+            lanes.load_double(floats, lanes.make_integer(layout.locate_first_input(i)))
+            for i in range(layout.inputs)
+        ]
 
     def get_head(self, field: str) -> IrValue:
         """Return a whole number of the experiment."""
@@ -101,6 +105,17 @@ class ParameterEnvironment(Environment):
     def emit_past_value(self, past: PastValue) -> IrValue:
         """Raise: the language allows no signals in a delay."""
         raise AssertionError(f"a delay contains no signal such as {past.name}")
+
+
+@dataclass(frozen=True, slots=True)
+class StartEnvironment(ParameterEnvironment):
+    """Environment of an initial value: parameters and the inputs' values at the start."""
+
+    first_inputs: dict[str, IrValue]
+
+    def emit_past_value(self, past: PastValue) -> IrValue:
+        """Emit the value of an input at the start."""
+        return self.first_inputs[past.name]
 
 
 class Delays:

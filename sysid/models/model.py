@@ -150,7 +150,19 @@ class MeasuredInitial:
     """
 
 
-InitialState = FixedInitial | EstimatedInitial | MeasuredInitial
+@dataclass(frozen=True, slots=True)
+class DerivedInitial:
+    """Initial value of a state that follows from parameters and the inputs' first values.
+
+    `text` is what the document says: an expression such as ``K*u0``, or ``steady``. In
+    `expression`, an input without delay is its value at the start of the record.
+    """
+
+    expression: Expression
+    text: str
+
+
+InitialState = FixedInitial | EstimatedInitial | MeasuredInitial | DerivedInitial
 
 
 @dataclass(frozen=True, slots=True)

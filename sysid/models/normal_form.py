@@ -3,7 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.models.model import EstimatedInitial, FixedInitial, InitialState, Model, Output
+from sysid.models.model import (
+    DerivedInitial,
+    EstimatedInitial,
+    FixedInitial,
+    InitialState,
+    Model,
+    Output,
+)
 from sysid.models.parameters import Parameter
 
 _TEXT_FIELDS = ("description", "source")
@@ -120,7 +127,7 @@ def _write_initial_state(start: InitialState) -> object:
     if isinstance(start, EstimatedInitial):
         entry: dict[str, Any] = {"lower": start.lower, "upper": start.upper}
         return entry if start.bounds is None else {**entry, "bounds": start.bounds}
-    return "measured"
+    return start.text if isinstance(start, DerivedInitial) else "measured"
 
 
 def _write_solver(model: Model) -> dict[str, Any]:

@@ -7,10 +7,11 @@ from typing import Any, cast
 
 from sysid.core.errors import Fault, InvalidModel, InvalidSettings, join_pointer
 from sysid.language.scope import EquationForm, Scope
-from sysid.language.tree import Expression, PastValue, match_plain_state
+from sysid.language.tree import Expression, Number, PastValue, match_plain_state
 from sysid.models import equations
 from sysid.models.documents import DocumentReader, quote_value
 from sysid.models.model import (
+    DerivedInitial,
     EstimatedInitial,
     FixedInitial,
     InitialState,
@@ -24,7 +25,9 @@ from sysid.models.normal_form import to_normal_form
 from sysid.models.parameters import Parameter
 from sysid.models.polynomial import POLYNOMIAL_FIELDS as POLYNOMIAL_FIELDS
 from sysid.models.polynomial import expand_polynomial
+from sysid.models.rest import NoRestError, solve_rest
 from sysid.models.sections import (
+    STEADY,
     check_names,
     get_interval,
     read_constants,
@@ -157,9 +160,10 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
     _, trees = equations.read_equations(reader, fields.get("equations"), scope)
     _, outputs = equations.read_outputs(reader, fields.get("outputs"), scope, states)
     _check_output_names(reader, outputs, scope)
-    initial = read_initial_states(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
+    initial = read_initial_states(reader, fields.get("initial"), scope, FixedInitial(0.0))
     solver = read_solver(reader, fields.get("solver"), form)
     reader.raise_faults()
+    initial = _solve_steady_starts(reader, initial, trees, scope)
     _check_measured_starts(reader, initial, trees, outputs, scope)
     return Model(
         name=fields["name"],
@@ -175,6 +179,41 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
         memory=equations.compute_memory(trees) if form == "difference" else 0,
         solver=solver,
         document={},
+    )
+
+
+def _solve_steady_starts(
+    reader: DocumentReader,
+    starts: tuple[InitialState, ...],
+    trees: tuple[Expression, ...],
+    scope: Scope,
+) -> tuple[InitialState, ...]:
+    """Solve for the starts that are steady; the other states are at their own starts."""
+    others: dict[str, Expression] = {}
+    steady: dict[str, Expression] = {}
+    for name, start, tree in zip(scope.states, starts, trees, strict=True):
+        if isinstance(start, FixedInitial):
+            others[name] = Number(start.value)
+        elif isinstance(start, DerivedInitial):
+            target = steady if start.text == STEADY else others
+            target[name] = tree if start.text == STEADY else start.expression
+    if not steady:
+        return starts
+    try:
+        rest = solve_rest(steady, others, scope.parameters, is_rate=scope.form == "differential")
+    except NoRestError as error:
+        detail = (
+            f"{', '.join(steady)} cannot start steady: {error}. Give a number, "
+            "{lower, upper}, measured, or an expression such as K*u0"
+        )
+        place = "/initial" if len(steady) > 1 else join_pointer("initial", *steady)
+        reader.add_fault(place, detail)
+        reader.raise_faults()
+    return tuple(
+        replace(start, expression=rest[name])
+        if isinstance(start, DerivedInitial) and name in rest
+        else start
+        for name, start in zip(scope.states, starts, strict=True)
     )
 
 
@@ -242,9 +281,12 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
         },
     )
     equation = expand_polynomial(reader, fields, scope)
-    initial = read_initial_states(reader, fields.get("initial"), scope.states, MeasuredInitial())
+    initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
     solver = read_solver(reader, fields.get("solver"), "polynomial")
     reader.raise_faults()
+    named = {parameter.name: get_interval(parameter) for parameter in equation.coefficients}
+    whole = replace(scope, parameters={**named, **scope.parameters})
+    initial = _solve_steady_starts(reader, initial, (equation.tree,), whole)
     return Model(
         name=fields["name"],
         title=reader.read_text(fields.get("title"), "/title", fields["name"]),

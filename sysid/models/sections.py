@@ -2,13 +2,18 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast, get_args
 
 from sysid.core.errors import InvalidBounds, join_pointer, suggest_name
-from sysid.language.scope import EquationForm, list_reserved_names
+from sysid.language.checker import check_expression
+from sysid.language.scope import EquationForm, Scope, list_reserved_names
+from sysid.language.transform import substitute
+from sysid.language.tree import Expression, Number, PastValue, Symbol, walk
 from sysid.models.documents import DocumentReader, quote_value
 from sysid.models.model import (
     MAX_SUBSTEPS,
+    DerivedInitial,
     EstimatedInitial,
     FixedInitial,
     HistoryKind,
@@ -21,6 +26,9 @@ from sysid.models.model import (
     SolverMethod,
 )
 from sysid.models.parameters import BoundsRule, Parameter, ParameterScale
+
+STEADY = "steady"
+"""A start at which the equations rest with the inputs' first values."""
 
 MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
@@ -35,6 +43,10 @@ _PARAMETER_FIELDS = (
     "fixed",
     "tied",
     "description",
+)
+_NEED_START = (
+    "need a number, {lower, upper} to estimate it, measured, steady, or an expression of "
+    "parameters and first input values, such as K*u0"
 )
 _SOLVER_FIELDS = ("method", "step", "substeps", "history", "interpolation")
 _DIFFERENTIAL_FIELDS = ("method", "step")
@@ -131,26 +143,36 @@ def get_interval(parameter: Parameter) -> tuple[float, float]:
 
 
 def read_initial_states(
-    reader: DocumentReader, value: object, states: Sequence[str], default: InitialState
+    reader: DocumentReader, value: object, scope: Scope, default: InitialState
 ) -> tuple[InitialState, ...]:
-    """Read the initial value of each state."""
-    fields = reader.read_section(value, "/initial")
+    """Read the initial value of each state; the expressions of steady ones are still open."""
+    states = scope.states
+    fields = (
+        dict.fromkeys(states, STEADY) if value == STEADY else reader.read_section(value, "/initial")
+    )
     for name in fields:
         if name not in states:
             reader.add_fault(
                 join_pointer("initial", name), f"there is no such state{suggest_name(name, states)}"
             )
     return tuple(
-        _read_initial_state(reader, fields[name], join_pointer("initial", name))
+        _read_initial_state(reader, fields[name], join_pointer("initial", name), scope)
         if name in fields
         else default
         for name in states
     )
 
 
-def _read_initial_state(reader: DocumentReader, value: object, place: str) -> InitialState:
+def _read_initial_state(
+    reader: DocumentReader, value: object, place: str, scope: Scope
+) -> InitialState:
     if value == "measured":
         return MeasuredInitial()
+    if isinstance(value, str):
+        text = " ".join(value.split())
+        return DerivedInitial(
+            Number(0.0) if text == STEADY else _read_start(reader, text, place, scope), text
+        )
     if isinstance(value, Mapping):
         fields = reader.read_section(value, place, ("lower", "upper", "bounds"))
         for bound in ("lower", "upper"):
@@ -162,10 +184,36 @@ def _read_initial_state(reader: DocumentReader, value: object, place: str) -> In
             reader.add_fault(place, f"has bounds [{lower:g}, {upper:g}]; need lower < upper")
         return EstimatedInitial(lower, upper, _read_bounds_rule(reader, fields, place))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        need = "need a number, {lower, upper} to estimate it, or measured"
-        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {need}")
+        reader.add_fault(place, f"{quote_value(value)} is not an initial state; {_NEED_START}")
         return FixedInitial(0.0)
     return FixedInitial(reader.read_number(value, place))
+
+
+def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> Expression:
+    """Read the expression of a start; an input u has its first value, which is also ``u0``."""
+    declared = (*scope.names, *scope.states)
+    first_values = {f"{name}0": name for name in scope.inputs if f"{name}0" not in declared}
+    inputs = (*scope.inputs, *first_values)
+    if _NAME.fullmatch(text) and text not in (*scope.names, *inputs):
+        reader.add_fault(place, f"{quote_value(text)} is not an initial state; {_NEED_START}")
+        return Number(0.0)
+    checked = check_expression(text, replace(scope, states=(), inputs=inputs))
+    for column, detail in checked.faults:
+        reader.add_fault(place, detail, column)
+    for value, column in checked.uses:
+        if value.offset or value.delay is not None:
+            detail = f"a start has no past; write {value.name.removesuffix('0')}0, its first value"
+            reader.add_fault(place, detail, column)
+    tree = checked.tree or Number(0.0)
+    for node in walk(tree):
+        if isinstance(node, Symbol) and node.kind in ("time", "index"):
+            reader.add_fault(place, f"a start does not depend on {node.name}")
+
+    def find_input(node: Expression) -> Expression | None:
+        is_first = isinstance(node, PastValue) and node.name in first_values
+        return PastValue(first_values[node.name], "input") if is_first else None  # type: ignore[union-attr]
+
+    return substitute(tree, find_input)
 
 
 def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solver:

@@ -14,7 +14,7 @@ from sysid.language.delays import mentions_time
 from sysid.language.scope import Scope
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Symbol, walk
-from sysid.models.model import Model
+from sysid.models.model import DerivedInitial, Model
 from sysid.models.parameters import Parameter
 
 Ties = Mapping[str, Expression]
@@ -58,6 +58,12 @@ def apply_ties(model: Model, ties: Ties) -> Model:
         outputs=tuple(
             replace(output, expression=_substitute_ties(output.expression, ties))
             for output in model.outputs
+        ),
+        initial=tuple(
+            replace(start, expression=_substitute_ties(start.expression, ties))
+            if isinstance(start, DerivedInitial)
+            else start
+            for start in model.initial
         ),
     )
 

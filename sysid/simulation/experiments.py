@@ -12,6 +12,7 @@ from sysid.data.records import Channel, Record
 from sysid.kernels.reads import is_difference
 from sysid.language.tree import PastValue, match_plain_state
 from sysid.models.model import (
+    DerivedInitial,
     EstimatedInitial,
     FixedInitial,
     MeasuredInitial,
@@ -40,6 +41,8 @@ class GridExperiment:
     grid : Grid
     inputs, outputs, starts : tuple
         In the model's order of inputs, outputs and states.
+    first_inputs : tuple of float
+        Values of the inputs at the start.
     largest_delay_steps : float
         Largest delay of a state, in integration steps.
     """
@@ -48,6 +51,7 @@ class GridExperiment:
     inputs: tuple[FineInput, ...]
     outputs: tuple[OutputSamples, ...]
     starts: tuple[StateStart, ...]
+    first_inputs: tuple[float, ...]
     largest_delay_steps: float
 
 
@@ -139,6 +143,7 @@ def place_on_grid(
         tuple(interpolate_inputs(model, inputs, spans, grid)),
         tuple(_make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs),
         tuple(_make_starts(model, grid, outputs, experiment, rows)),
+        tuple(_read_first_value(channel, grid.start) for channel in inputs),
         max([0.0, *find_largest_delays(model, "state", spans, grid).values()]),
     )
 
@@ -257,12 +262,22 @@ def _make_starts(
     for i, initial in enumerate(model.initial):
         if isinstance(initial, FixedInitial):
             starts.append(StateStart(np.array([initial.value])))
+        elif isinstance(initial, DerivedInitial):
+            starts.append(StateStart(np.zeros(1)))
         elif isinstance(initial, EstimatedInitial):
             row = rows[name_initial_state(model.states[i].name, experiment)]
             starts.append(StateStart(np.zeros(1), row))
         else:
             starts.append(StateStart(_read_measured_start(model, i, grid, outputs)))
     return starts
+
+
+def _read_first_value(channel: Channel, start: float) -> float:
+    """Read an input at the start of the simulation: its first value if it begins later."""
+    if channel.hold == "zero":
+        last = int(np.searchsorted(channel.times, start, side="right")) - 1
+        return float(channel.values[max(last, 0)])
+    return float(np.interp(start, channel.times, channel.values))
 
 
 def _read_measured_start(

@@ -107,6 +107,7 @@ def pack_experiment(
     inputs: Sequence[FineInput],
     outputs: Sequence[OutputSamples],
     starts: Sequence[StateStart],
+    first_inputs: Sequence[float],
     largest_delay_steps: float,
     scale: float,
 ) -> PackedExperiment:
@@ -114,6 +115,8 @@ def pack_experiment(
 
     Parameters
     ----------
+    first_inputs : sequence of float
+        Values of the inputs at the start.
     largest_delay_steps : float
         Largest delay of a state, in integration steps.
     scale : float
@@ -132,6 +135,8 @@ def pack_experiment(
         builder.write_entries(
             "state", i, row=start.row, given=builder.add_floats(start.first_values)
         )
+    for i, value in enumerate(first_inputs):
+        builder.floats[builder.layout.locate_first_input(i)] = value
     for i, signal in enumerate(inputs):
         offset = builder.add_floats(signal.values)
         builder.write_entries(

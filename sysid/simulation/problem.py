@@ -393,7 +393,15 @@ def _build_evaluator(
     variant = KernelVariant(one_step, is_robust, on_grid, weighted)
     packed = [
         pack_experiment(
-            model, variant, e.grid, e.inputs, e.outputs, e.starts, e.largest_delay_steps, loss.scale
+            model,
+            variant,
+            e.grid,
+            e.inputs,
+            e.outputs,
+            e.starts,
+            e.first_inputs,
+            e.largest_delay_steps,
+            loss.scale,
         )
         for e in experiments
     ]

@@ -10,7 +10,7 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record, Recording
 from sysid.language.evaluation import evaluate_expression as value_of
-from sysid.models.model import FixedInitial, InitialState, Model, name_initial_state
+from sysid.models.model import DerivedInitial, FixedInitial, InitialState, Model, name_initial_state
 from sysid.models.parameters import Parameter
 from sysid.models.ties import resolve_ties
 from sysid.simulation.problem import build_simulation_problem
@@ -102,11 +102,11 @@ def _fix_parameter(parameter: Parameter, value: float) -> Parameter:
     return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear", tied=None)
 
 
-def _fix_initial(start: InitialState, state: str, values: Mapping[str, float]) -> FixedInitial:
+def _fix_initial(start: InitialState, state: str, values: Mapping[str, float]) -> InitialState:
     name = name_initial_state(state, 0)
     if name in values:
         return FixedInitial(float(values[name]))
-    if isinstance(start, FixedInitial):
+    if isinstance(start, FixedInitial | DerivedInitial):
         return start
     raise InvalidSettings(
         f"/parameters/{name}", f"a value is missing. The model does not fix where {state!r} starts"

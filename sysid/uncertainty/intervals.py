@@ -122,7 +122,7 @@ def _explain_status(
 ) -> str:
     """Explain why there is no standard error, or its limits."""
     if status == "group":
-        expressions = [group.expression for group in groups if name in group.members]
+        expressions = [group.text for group in groups if name in group.members]
         more = ", …" if len(expressions) > _MAX_NAMED_GROUPS else ""
         others = f": {', '.join(expressions[:_MAX_NAMED_GROUPS])}{more}" if expressions else ""
         if lacks_stderr:

@@ -243,7 +243,9 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     truth = {"K": 2.0, "T": 1.0, "L": 0.5}
     for name, value in truth.items():
         assert np.isclose(found[name]["value"], value, atol=0.2)
-    assert json.loads(result.read_text())["fit_percent"]["validation"] > 80
+    document = json.loads(result.read_text())
+    assert document["fit_percent"]["validation"] > 80
+    assert f"; validation RMS {document['rms_validation']:.6g}" in done.stdout
     verdict = "passed" if json.loads(result.read_text())["residual_tests"]["passed"] else "failed"
     assert f"residuals on validation data: {verdict}" in done.stdout
 

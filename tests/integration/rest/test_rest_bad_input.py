@@ -164,6 +164,8 @@ def test_every_fault_of_a_job_is_told_at_once(server: TestClient, dataset: str) 
 
 MODELS: list[tuple[dict[str, Any], str, int | None, str]] = [
     ({"equations": {"x": "K*u(t - L) - z"}}, "/equations/x", 14, "'z'"),
+    ({"initial": {"x": "K*z0"}}, "/initial/x", 3, "'z0'"),
+    ({"initial": "steady", "equations": {"x": "K*u(t - L)"}}, "/initial/x", None, "integrator"),
     ({"equations": {"x": "__import__('os')"}}, "/equations/x", 1, "__import__"),
     ({"equations": {"x": "K*u(t + L) - x"}}, "/equations/x", 3, "L"),
     (

@@ -151,6 +151,11 @@ def written(text: str, **solver: Any) -> Model:
     return parse_model({**document, "solver": solver} if solver else document)
 
 
+def starting(text: str, initial: Any, **solver: Any) -> Model:
+    """A model whose states start there."""
+    return parse_model({**yaml.safe_load(text), "initial": initial, "solver": solver})
+
+
 def selected() -> Model:
     """A polynomial whose terms were selected."""
     labels = [term.label for term in parse_model(LINEAR_NARX).terms]
@@ -162,12 +167,28 @@ COEFFICIENTS = dict(
 )
 _TWO = Case({"lambda": 0.1337, "n": 2.5, "np": 0.7, "int(0)": 0.2})
 _RECURSION = Case({"L": 0.0712, "d": 1.3})
+RESTING = """
+name: resting
+form: differential
+inputs: {u: "1", q: "1"}
+states: {w: "1", x: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+equations: {w: (K*(u(t - L) - 0.3*q) - w)/T, x: 2*w(t - L) - 3*x + K}
+outputs: {y: x}
+"""
+_RESTING = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
 WRITTEN: dict[str, tuple[Model, Case]] = {
     "rk4": (written(TWO), _TWO),
     "rk4_substeps_cubic": (written(TWO, substeps=3, interpolation="cubic"), _TWO),
     "rk4_own_step": (written(TWO, step=0.017, history="zero"), _TWO),
     "euler_nearest": (written(TWO, method="euler", substeps=2, interpolation="nearest"), _TWO),
     "semi_implicit": (written(TWO, method="semi-implicit", history="zero", step=0.03), _TWO),
+    "steady": (starting(RESTING, "steady"), _RESTING),
+    "steady_substeps_cubic": (
+        starting(RESTING, "steady", substeps=2, interpolation="cubic"),
+        _RESTING,
+    ),
+    "start_of_recursion": (starting(RECURSION, {"x": "d*u0 - L", "w": "u0/d"}), _RECURSION),
     "selected": (selected(), Case({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
     "recursion": (written(RECURSION), _RECURSION),
     "recursion_cubic": (written(RECURSION, interpolation="cubic", history="zero"), _RECURSION),

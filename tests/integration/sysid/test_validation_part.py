@@ -16,6 +16,7 @@ from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
 from tests.searching import DUFFING, force
 from workers.protocol import ProblemSpec
 from workers.tasks import build_pack_problems, prepare_run_records
@@ -138,3 +139,51 @@ def test_times_to_score_from_are_one_for_each_record() -> None:
     record = free_run("duffing-eq16", DUFFING)
     with pytest.raises(InvalidSettings, match="2 times for 1 records"):
         Problem.build(load_model("duffing-eq16"), [record], scored_from=[1.0, 2.0])
+
+
+def test_the_start_of_another_record_is_estimated_on_its_first_part_only() -> None:
+    """What comes later does not move the start: it is there to be predicted."""
+    other = decay()
+    late = tuple(
+        replace(one, values=np.where(np.arange(100) < 30, one.values, one.values + 0.5))
+        for one in other.outputs
+    )
+    found = identify(
+        parse_model(DECAY), decay(sd=0.001), BRIEF, validation=replace(other, outputs=late)
+    )
+    simulated = found.simulated_validation[0][0]
+    np.testing.assert_allclose(simulated, other.outputs[0].values, atol=5e-3)
+
+
+def heated(last: float) -> tuple[Identification, float]:
+    """A first-order plant whose input stands still in the last 30 %, 0.02 of noise."""
+    rng, times = np.random.default_rng(2), 0.1 * np.arange(300)
+    u = np.repeat(rng.uniform(-1, 1, 30), 10)
+    u[180:] *= last
+    model = load_model("fopdt")
+    command = Channel("u", times, u, "1", "zero")
+    [y] = simulate(
+        model, [command], {"K": 2, "T": 0.5, "L": 0.33, "y0": 0, "x(0)": 0}, times=times
+    ).channels
+    record = Record((command,), (replace(y, values=y.values + 0.02 * rng.normal(size=300)),))
+    bounds = {"L": {"upper": 2}}
+    found = identify(model, record, parameters=bounds, validation_fraction=FRACTION)
+    return found, float(np.std(record.outputs[0].values[210:]))
+
+
+def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
+    found, spread = heated(0.0)
+    assert found.fit_percent > 95
+    assert found.fit_percent_validation is not None
+    assert np.isnan(found.fit_percent_validation)
+    assert np.isnan(found.agreement_validation[0].fit_percent)
+    assert found.rms_validation == pytest.approx(0.02, rel=0.3)
+    [note] = [one for one in found.warnings if "hardly move" in one]
+    assert f"their standard deviation is {spread:.3g}, " in note
+
+
+def test_a_part_that_moves_less_than_the_rest_keeps_its_fit() -> None:
+    found, _ = heated(0.25)
+    assert found.fit_percent_validation is not None
+    assert found.fit_percent_validation > 80
+    assert not any("hardly move" in one for one in found.warnings)

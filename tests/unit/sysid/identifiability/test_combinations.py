@@ -101,8 +101,18 @@ def test_a_sum_is_written_as_a_sum() -> None:
 def test_a_combination_that_is_neither_is_told_with_numbers() -> None:
     written = document({"x": "(a + sin(b))*u - c*x"}, ("a", "b", "c"))
     problem, theta = posed(written, {"a": 0.7, "b": 0.3, "c": 1.1})
-    (text,) = told(analyse_estimate(problem, theta))
+    analysis = analyse_estimate(problem, theta)
+    [(text, group)] = told(analysis).items()
     assert text == "a + 0.9553*b"  # cos(0.3)
+    assert group.is_local
+    assert analysis.estimates[0].reason.endswith(": a + 0.9553*b (near the estimate)")
+
+
+def test_a_combination_that_holds_everywhere_is_not_said_to_hold_near_the_estimate() -> None:
+    problem, theta = posed(ARM, TRUTH)
+    analysis = analyse_estimate(problem, theta)
+    assert not any(group.is_local for group in told(analysis).values())
+    assert not any("near the estimate" in estimate.reason for estimate in analysis.estimates)
 
 
 def test_groups_that_have_no_parameter_in_common_are_told_apart() -> None:
