@@ -68,6 +68,11 @@ def test_unit_and_offset_do_not_matter(scale: float, offset: float) -> None:
             assert choose_hold(scale * values + offset * scale).hold == hold
 
 
+def test_rounding_is_no_movement() -> None:
+    rounding = 1e-12 * RNG.standard_normal(N)
+    assert choose_hold(np.repeat(RNG.uniform(0, 60, 20), 50) + rounding).hold == "zero"
+
+
 def test_missing_values_do_not_count() -> None:
     values = HELD["heater steps"].copy()
     values[5:9] = np.nan
