@@ -16,7 +16,8 @@ def compile_search() -> None:
     """
     times = 0.1 * np.arange(40.0)
     step = np.where(times < 0.5, 0.0, 1.0)
-    record = Record((Channel("u", times, step),), (Channel("y", times, 0.5 * step),))
+    u = Channel("u", times, step, hold="first")
+    record = Record((u,), (Channel("y", times, 0.5 * step),))
     changes = {"L": {"upper": 1.0}}
     settings = GeneticAlgorithm(population=8, islands=1, generations=2)
     identify(load_model("fopdt"), record, settings, parameters=changes)

@@ -21,8 +21,14 @@ def fitted(offset: float, y0: dict[str, float] | None = None) -> Identification:
     clean = simulate(load_model("fopdt"), [u], TRUTH, times=times).channels[0]
     noise = np.random.default_rng(1).normal(0, 0.02, times.size)
     y = Channel("y", times, clean.values + offset + noise)
-    # The input repeats every 6 s, and a lag of half of it with a negative gain fits as well.
-    changes = {"y0": y0 or {"lower": -10, "upper": 10}, "L": {"upper": 2.0}}
+    ten = {"lower": -10.0, "upper": 10.0}
+    changes = {
+        "K": ten,
+        "T": {"lower": 0.01, "upper": 100.0},
+        "L": {"upper": 5.0},
+        "y0": y0 or ten,
+        "x(0)": ten,
+    }
     return identify(load_model("fopdt"), Record((u,), (y,)), QUICK, parameters=changes)
 
 
