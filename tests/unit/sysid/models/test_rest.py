@@ -187,6 +187,7 @@ def test_a_plant_at_rest_is_identified_without_a_start_to_estimate() -> None:
         {
             **document(DIFFERENTIAL["first order"]),
             "parameters": {n: {"lower": 0.1, "upper": 5} for n in "KTL"},
+            "solver": {"substeps": 8},
         }
     )
     rng = np.random.default_rng(3)
