@@ -17,7 +17,8 @@ def compile_search() -> None:
     times = 0.1 * np.arange(40.0)
     step = np.where(times < 0.5, 0.0, 1.0)
     u = Channel("u", times, step, hold="first")
-    record = Record((u,), (Channel("y", times, 0.5 * step),))
+    response = 0.5 * (1.0 - np.exp(-np.maximum(times - 0.8, 0.0) / 0.5))  # inside all bounds
+    record = Record((u,), (Channel("y", times, response),))
     changes = {"L": {"upper": 1.0}}
     settings = GeneticAlgorithm(population=8, islands=1, generations=2)
     identify(load_model("fopdt"), record, settings, parameters=changes)
