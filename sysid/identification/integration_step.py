@@ -132,14 +132,16 @@ def find_limit(
     """Name the limit that forbids a fit with half the step; empty if there is none."""
     fine = half.problem
     if not _can_halve(fine):
-        return f"the limit of {MAX_SUBSTEPS} substeps or {_MAX_STEPS:,} steps of a simulation"
-    if is_late is not None and is_late():
-        return "the time limit"
-    if not _can_fit(fine, max_simulations):
-        return "the budget of evaluations"
-    if not _can_fit(fine, work_left // fine.n_steps):
-        return "the limit on the work of finer fits"
-    return ""
+        limit = f"{MAX_SUBSTEPS} substeps or {_MAX_STEPS:,} steps of a simulation"
+    elif is_late is not None and is_late():
+        limit = "the time limit"
+    elif not _can_fit(fine, max_simulations):
+        limit = "the budget of evaluations"
+    elif not _can_fit(fine, work_left // fine.n_steps):
+        limit = "the limit on the work of finer fits"
+    else:
+        return ""
+    return f"a finer step is beyond {limit}"
 
 
 def compute_work_limit(problem: Problem, evaluations: int) -> int:
@@ -171,13 +173,12 @@ def choose_starts(
 def mark_changing(
     estimates: tuple[Estimate, ...], changes: Mapping[str, str], limit: str
 ) -> tuple[Estimate, ...]:
-    """Mark estimates that change with half the step as not identified."""
+    """Mark estimates that change with half the step, beyond a limit, as not identified."""
     return tuple(
         replace(
             estimate,
             status="unidentifiable",
-            reason=f"half the integration step still changes it: {changes[estimate.name]}. "
-            f"A finer step is beyond {limit}",
+            reason=f"half the integration step still changes it: {changes[estimate.name]}; {limit}",
         )
         if estimate.name in changes and estimate.status in ("identified", "at bound")
         else estimate

@@ -37,10 +37,10 @@ _MOST_MINIMA = 10  # that a result lists
 
 
 class FoundMinima(NamedTuple):
-    """All minima, the lowest first; `has_gained`: the scan ended lower than the search."""
+    """All minima, the lowest first; `is_of_search`: the search itself ended in the best one."""
 
     minima: tuple[Minimum, ...]
-    has_gained: bool
+    is_of_search: bool
     warnings: tuple[str, ...] = ()
 
 
@@ -58,6 +58,8 @@ def scan_parameters(
     delays: Sequence[int],
     budget: int,
     is_late: Callable[[], bool] | None = None,
+    *,
+    only_delays: bool = False,
 ) -> ScanResult:
     """Scan each parameter alone from a minimum, with at most `budget` simulations.
 
@@ -66,14 +68,17 @@ def scan_parameters(
     start : RefinedCandidate
         A minimum. It counts as one of the ends.
     delays : sequence of int
-        Numbers of the free parameters that time lags depend on.
+        Numbers of the free parameters that time lags depend on. They are scanned first.
+    only_delays : bool
+        Whether no other parameter is scanned.
     """
+    others = () if only_delays else [d for d in range(start.theta.size) if d not in delays]
     best, ends, spent = start, [start], 0
     for _ in range(_MAX_ROUNDS):
-        scanned = _scan_around(problem, best, delays, budget - spent)
+        scanned = _scan_around(problem, best, delays, others, budget - spent)
         spent += sum(series.values.size - 1 for series in scanned)
         reached = best
-        for place, rms in _find_dips(scanned):
+        for place, rms in _find_dips(scanned, problem.output_scale):
             if is_late is not None and is_late():
                 break
             trial = refine_candidate(problem, place, rms, budget - spent, _TRIAL_STEPS)
@@ -104,12 +109,16 @@ class _Series(NamedTuple):
 
 
 def _scan_around(
-    problem: Problem, centre: RefinedCandidate, delays: Sequence[int], budget: int
+    problem: Problem,
+    centre: RefinedCandidate,
+    delays: Sequence[int],
+    others: Sequence[int],
+    budget: int,
 ) -> list[_Series]:
     """Simulate the range of each parameter, time lags first, as far as the budget goes."""
     middle = to_unit(problem.evaluator, centre.theta[None])[0]
     scanned, moved = [], []
-    for d in (*delays, *(d for d in range(middle.size) if d not in delays)):
+    for d in (*delays, *others):
         count = _DELAY_PLACES if d in delays else _PLACES
         budget -= count
         if budget < 0:
@@ -144,12 +153,15 @@ def _insert_centre(
     )
 
 
-def _find_dips(scanned: Sequence[_Series]) -> list[tuple[FloatArray, float]]:
-    """Find the lowest local minima of the series, without their centre: places and fitness."""
+def _find_dips(scanned: Sequence[_Series], limit: float) -> list[tuple[FloatArray, float]]:
+    """Find the lowest local minima of the series, without their centre: places and fitness.
+
+    Above the limit, the RMS of the mean of the output, the model explains nothing.
+    """
     dips = []
     for places, values, centre in scanned:
         framed = np.pad(np.where(np.isfinite(values), values, np.inf), 1, constant_values=np.inf)
-        is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:])
+        is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:]) & (values < limit)
         is_dip[centre] = False
         dips += [(places[i], float(values[i])) for i in np.flatnonzero(is_dip)]
     return sorted(dips, key=lambda dip: dip[1])[:_STARTS]
@@ -166,7 +178,7 @@ def collect_minima(
     n = problem.n_scored * variance_ratio
     for theta, rms in sorted(ends, key=lambda end: end[1]):
         for i, minimum in enumerate(kept):
-            if _is_same_place(problem, minimum.values, theta):
+            if is_same_place(problem, minimum.values, theta):
                 kept[i] = replace(minimum, count=minimum.count + 1)
                 break
         else:
@@ -176,7 +188,8 @@ def collect_minima(
     return tuple(kept[:_MOST_MINIMA])
 
 
-def _is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
+def is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
+    """Whether two ends (D,) of least squares are one minimum."""
     places = to_unit(problem.evaluator, np.array([first, second]))
     return bool(np.max(np.abs(places[0] - places[1]), initial=0.0) < _SAME_PLACE)
 

@@ -31,7 +31,7 @@ def assess_search(
 ) -> SearchEvidence:
     """Assess the evidence that the estimate, with its RMS and residual tests, is the best."""
     restarts = count_restarts(*state.champions_and_counters)
-    agreeing = 0 if found.has_gained else restarts.confirmed
+    agreeing = restarts.confirmed if found.is_of_search else 0
     is_negligible = rms <= _NEGLIGIBLE_SHARE * problem.output_scale
     because: Literal["starts", "residuals"] | None = None
     if agreeing >= _ENOUGH_STARTS:

@@ -231,7 +231,8 @@ def compare_where_recorded(
     (end,) = refine_candidates(others, [theta], min(budget, _MAX_STEPS * (theta.size + 1)))
     if end is None or not _is_contradicted(problem, end, others, analysis):
         return RecordedComparison(evaluations=0 if end is None else end.evaluations)
-    scanned = scan_parameters(others, end, delays, budget - end.evaluations, is_late)
+    left = budget - end.evaluations
+    scanned = scan_parameters(others, end, delays, left, is_late, only_delays=True)
 
     def reaches_back(values: FloatArray) -> float:
         found = zip(problem.free_names, values.tolist(), strict=True)

@@ -13,7 +13,7 @@ import pytest
 import workers.tasks
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
-from sysid.identification import conclude, generalised_least_squares
+from sysid.identification import best_estimate, conclude, generalised_least_squares
 from sysid.identification.identify import identify
 from sysid.identification.run import begin_run
 from sysid.models.catalogue.load import copy_catalogue_document
@@ -185,8 +185,8 @@ def interrupts() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("module", "part"),
     [
-        (conclude, "refine_candidates"),
-        (conclude, "analyse_estimate"),
+        (best_estimate, "refine_candidates"),
+        (best_estimate, "analyse_estimate"),
         (conclude, "run_residual_tests"),
         (conclude, "estimate_onset_delays"),
         (generalised_least_squares, "_estimate_correlation_times"),

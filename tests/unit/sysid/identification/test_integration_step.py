@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.data.records import Channel, Record
+from sysid.identification import integration_step
 from sysid.identification.conclude import conclude_run
 from sysid.identification.identify import identify
 from sysid.identification.integration_step import (
@@ -243,6 +245,20 @@ def test_estimates_that_are_not_refined_stay_and_are_not_called_identified() -> 
     assert unsettled(found)
 
 
+def test_under_a_noise_model_estimates_that_still_change_are_not_called_identified(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    record = sampled(STIFF)
+    (outlet,) = record.outputs
+    slow = lfilter([1.0], [1.0, -0.8], np.random.default_rng(5).normal(0.0, 0.02, N))
+    record = replace(record, outputs=(replace(outlet, values=outlet.values + slow),))
+    monkeypatch.setattr(integration_step, "_MAX_STEPS", 3 * N)
+    found = identify(two_lags(1), record, QUICK, loss=Loss(noise_model="ar1"))
+    assert found.substeps == 1
+    assert found.correlation_times["y"] > 0
+    assert unsettled(found)
+
+
 def test_the_limits_of_a_finer_fit_have_names() -> None:
     record = sampled(STIFF)
     finest, coarse = (
@@ -252,9 +268,11 @@ def test_the_limits_of_a_finer_fit_have_names() -> None:
     work = 10**9
     assert "1000 substeps" in find_limit(finest, work)
     assert find_limit(coarse, work) == ""
-    assert find_limit(coarse, 10 * coarse.problem.n_steps) == "the limit on the work of finer fits"
-    assert find_limit(coarse, work, 10) == "the budget of evaluations"
-    assert find_limit(coarse, work, None, lambda: True) == "the time limit"
+    few = 10 * coarse.problem.n_steps
+    beyond = "a finer step is beyond the "
+    assert find_limit(coarse, few) == f"{beyond}limit on the work of finer fits"
+    assert find_limit(coarse, work, 10) == f"{beyond}budget of evaluations"
+    assert find_limit(coarse, work, None, lambda: True) == f"{beyond}time limit"
 
 
 def test_a_finer_fit_starts_from_what_is_best_with_the_finer_step() -> None:

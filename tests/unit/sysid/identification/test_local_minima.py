@@ -18,6 +18,7 @@ from sysid.identification.local_minima import (
     find_local_minima,
     widen_intervals,
 )
+from sysid.identification.minima import scan_parameters
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.search.refine import refine_candidates
@@ -137,8 +138,10 @@ def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.Monke
     late = conclude_run(problem, algorithm, replace(state, seconds=1e9))
     assert not any(said in text for text in in_time.warnings)
     assert any(said in text for text in late.warnings)
-    scan_and_probes = in_time.evaluations - late.evaluations
-    assert scan_and_probes > 24
+    (start,) = refine_candidates(problem, [np.array([one.value for one in late.estimates])])
+    assert start is not None
+    scan = scan_parameters(problem, start, [problem.free_names.index("L")], 1800).evaluations
+    assert late.evaluations == in_time.evaluations - scan - 24
 
 
 def test_where_on_its_plateau_a_search_ends_says_nothing_of_a_rounded_lag() -> None:

@@ -1,14 +1,20 @@
 """Minima that one search misses, and minima that the data do not tell apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
+from sysid.core.settings import SearchMethod
 from sysid.core.types import FloatArray
+from sysid.identification.conclude import conclude_run
 from sysid.identification.minima import FoundMinima, collect_minima, mark_ambiguous, scan_parameters
+from sysid.identification.run import advance_run, begin_run
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.refine import RefinedCandidate, refine_candidates
+from sysid.search.state import Improvement
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 from tests import searching
@@ -89,7 +95,8 @@ def reason(found: Identification, name: str) -> str:
     return next(one.reason for one in found.estimates if one.name == name)
 
 
-def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:
+def regenerate() -> tuple[Problem, FloatArray]:
+    """A noisy record of the regenerative model, and the truth."""
     model = parse_model(REGENERATIVE)
     times = np.arange(400) * 0.05
     force = np.where((times % 7 < 0.5), 20.0, 0.0)
@@ -98,7 +105,11 @@ def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:
     blank = Problem.build(model, [clean])
     y = blank.predict(truth[None])[0]
     y = y + 0.02 * np.std(y) * np.random.default_rng(2).standard_normal(y.size)
-    problem = Problem.build(model, [Record(clean.inputs, (Channel("y", times, y, "m"),))])
+    return Problem.build(model, [Record(clean.inputs, (Channel("y", times, y, "m"),))]), truth
+
+
+def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:
+    problem, truth = regenerate()
     (false,) = refine_candidates(problem, [np.array([6.0, 8.0, 2.95])])
     assert false is not None
     (best,) = refine_candidates(problem, [truth])
@@ -173,6 +184,35 @@ def test_a_search_is_settled_by_starts_that_agree_or_by_residuals_that_are_noise
     assert quick.search.agreeing_starts < 2
     assert quick.search.because == "residuals"
     assert {one.status for one in quick.estimates} == {"identified"}
+
+
+def test_starts_count_only_if_they_agree_on_the_minimum_of_the_result() -> None:
+    """The best champion of the search lies beside a false minimum. Its starts show nothing."""
+    problem, truth = regenerate()
+    search = GeneticAlgorithm(generations=20, islands=2)
+    state = advance_run(problem, search, begin_run(problem, search, 1))
+    (false,) = refine_candidates(problem, [np.array([6.0, 8.0, 2.95])])
+    assert false is not None
+    (rms,) = problem.evaluate_fitness(truth[None])
+    for first, agreeing in ((truth, 3), (false.theta, 0)):
+        islands = []
+        champions = ((first, 0.99 * rms), (truth, rms))
+        for island, (place, rms) in zip(state.islands, champions, strict=True):
+            counters = island.search.copy()
+            counters["random_starts"] = counters["confirmed_starts"] = 3
+            champion = Improvement(20, 100, rms, "sequence", tuple(place.tolist()))
+            islands.append(replace(island, search=counters, history=(champion,)))
+        found = conclude_run(problem, search, replace(state, islands=tuple(islands)))
+        assert found.search.agreeing_starts == agreeing
+        assert {one.name: one.value for one in found.estimates}["tau"] == pytest.approx(
+            truth[2], rel=1e-2
+        )
+
+
+@pytest.mark.parametrize("method", ["simple", "improved-paper"])
+def test_champions_that_are_not_refined_are_no_minima(method: SearchMethod) -> None:
+    search = GeneticAlgorithm(method=method, generations=5, islands=2)
+    assert identify(load_model("duffing-eq16"), _duffing_record(), search).search.minima == ()
 
 
 def _duffing_record() -> Record:

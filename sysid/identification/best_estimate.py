@@ -1,0 +1,440 @@
+"""The best estimate that a search leads to, and its analysis.
+
+Least squares continues from the champion of each island. From the best end each parameter alone is
+scanned for a better minimum (`minima`). The best is analysed, and the minima near it are searched
+(`local_minima`). If half the integration step would change the estimates, all this is repeated with
+it (`integration_step`). At last residuals that are not white get a noise model
+(`generalised_least_squares`). The champions of the paper's two methods are analysed as they are.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.identifiability.exchange import find_exchanges, order_exchangeable
+from sysid.identification.budget import Budget
+from sysid.identification.deadline import Deadline
+from sysid.identification.generalised_least_squares import (
+    GeneralisedEstimate,
+    fit_generalised_least_squares,
+    make_whitening,
+)
+from sysid.identification.integration_step import (
+    HalfStep,
+    choose_starts,
+    compare_half_step,
+    compute_work_limit,
+    find_limit,
+    mark_changing,
+)
+from sysid.identification.local_minima import (
+    LocalMinima,
+    count_affordable_simulations,
+    find_local_minima,
+    widen_intervals,
+)
+from sysid.identification.minima import (
+    FoundMinima,
+    collect_minima,
+    is_same_place,
+    scan_parameters,
+)
+from sysid.identification.noise_model_choice import confirm_noise_model, is_ar1_indicated
+from sysid.identification.unrecorded_input import compare_where_recorded
+from sysid.identification.warnings import find_delay_parameters
+from sysid.islands.state import RunState
+from sysid.residuals.whitening import Whitening
+from sysid.search.island import Island, compute_analysis_budget, get_island_settings
+from sysid.search.refine import RefinedCandidate, refine_candidates
+from sysid.search.state import SAME_OPTIMUM
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
+from sysid.uncertainty.estimates import Estimate
+
+_SCAN_SHARES = 4  # a scan takes at most one such share of the simulations that are left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IslandEnd:
+    """Where an island ended.
+
+    Attributes
+    ----------
+    theta : FloatArray, shape (D,)
+    rms : float
+        The fitness there.
+    is_refined : bool
+        Whether least squares ended there; else it is the champion of the search.
+    evaluations : int
+        Simulations of least squares and of scans from here.
+    is_cut_short : bool
+        Whether the time limit ended least squares.
+    """
+
+    theta: FloatArray
+    rms: float
+    is_refined: bool = False
+    evaluations: int = 0
+    is_cut_short: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BestEstimate:
+    """The best estimate of a search, analysed.
+
+    Attributes
+    ----------
+    problem : Problem
+        With the integration step that the estimate needs.
+    ends : tuple of IslandEnd
+        Of all islands, by least squares.
+    minima : FoundMinima
+    first : tuple of Estimate
+        The estimates with the model's own integration step; empty if that is the one.
+    noise : GeneralisedEstimate
+        The estimate under the noise model.
+    analysis : Analysis
+        Of that estimate.
+    """
+
+    problem: Problem
+    ends: tuple[IslandEnd, ...]
+    minima: FoundMinima
+    first: tuple[Estimate, ...]
+    noise: GeneralisedEstimate
+    analysis: Analysis
+
+    @property
+    def fitted(self) -> IslandEnd:
+        """The best end of least squares, before a noise model."""
+        return min(self.ends, key=lambda end: end.rms)
+
+
+def is_refining(algorithm: GeneticAlgorithm, islands: int) -> bool:
+    """Whether least squares continues from the end of a search."""
+    methods = {get_island_settings(algorithm, i).method for i in range(islands)}
+    return algorithm.refine and "improved" in methods
+
+
+def find_best_estimate(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    budget: Budget,
+    deadline: Deadline,
+) -> BestEstimate:
+    """Find the best estimate of a search that has ended, and analyse it.
+
+    The integration step is halved until the estimates and their errors stand still, or until a
+    limit is reached. Then those that still change are not identified.
+    """
+    refines = is_refining(algorithm, len(state.islands))
+    search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
+    first: tuple[Estimate, ...] = ()
+    limit = ""
+    while True:
+        search.analyse_best()
+        half = search.compare_half_step()
+        if half is None or not half.changes:
+            break
+        estimates = search.analysis.estimates
+        limit = search.use_half_step(half)
+        if limit:
+            break
+        first = first or estimates
+    changes = {} if half is None else half.changes
+    noise = search.apply_noise_model(is_settled=not changes)
+    minima = search.collect_minima(noise.theta)
+    marked = mark_changing(search.analysis.estimates, changes, limit)
+    analysis = replace(search.analysis, estimates=marked)
+    return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
+
+
+class _EstimateSearch:
+    """The steps from the champions of all islands to the best estimate.
+
+    `ends` are those of the islands with the integration step of `problem`. The best of them is
+    analysed. All simulations are counted in the budget.
+    """
+
+    analysis: Analysis
+    _best: int
+    _fits: list[IslandEnd]
+
+    def __init__(
+        self,
+        problem: Problem,
+        state: RunState,
+        budget: Budget,
+        deadline: Deadline,
+        *,
+        refines: bool,
+    ) -> None:
+        self.problem, self._state, self._budget = problem, state, budget
+        self._deadline, self._refines = deadline, refines
+        self._reserved = compute_analysis_budget(len(state.islands[0].point))
+        self._work = compute_work_limit(problem, state.evaluations)
+        self._searched = min(range(len(state.islands)), key=lambda i: state.islands[i].champion_rms)
+        self._is_of_search = True
+        self._scanned: FloatArray | None = None
+        champions = [_get_champion(problem, island) for island in state.islands]
+        self.ends = [
+            IslandEnd(champion, island.champion_rms)
+            for champion, island in zip(champions, state.islands, strict=True)
+        ]
+        if refines:
+            most = budget.count_left(self._reserved)
+            found = refine_candidates(problem, champions, most, deadline.is_past_grace)
+            self.ends = [
+                self._continue_end(end, candidate)
+                for end, candidate in zip(self.ends, found, strict=True)
+            ]
+
+    @property
+    def theta(self) -> FloatArray:
+        """The best estimate (D,) by least squares."""
+        return self.ends[self._best].theta
+
+    def analyse_best(self) -> None:
+        """Scan from the best of the ends, analyse the result, and search for minima near it."""
+        self._best = min(range(len(self.ends)), key=lambda i: self.ends[i].rms)
+        before = self.ends[self._best]
+        self._is_of_search &= self._is_same_optimum(self.ends[self._searched], before)
+        self._fits = [
+            *(end for end in self.ends if end.is_refined or end is before),
+            *(self._find_other_minima() if self._refines else ()),
+        ]
+        best = self.ends[self._best]
+        groups, spent = find_exchanges(
+            self.problem, best.theta, self._budget.count_left(self._reserved)
+        )
+        self._budget.spend(spent)
+        self.ends = [
+            replace(end, theta=order_exchangeable(self.problem, end.theta, groups))
+            for end in self.ends
+        ]
+        self._scanned = self.theta
+        self._analyse(self.theta)
+        self.analysis = replace(self.analysis, exchanges=groups)
+        if self._refines:
+            self._search_local_minima()
+
+    def compare_half_step(self) -> HalfStep | None:
+        """Compare the estimate with that of half the integration step."""
+        most = self._budget.count_left(self._reserved)
+        half = compare_half_step(self.problem, self.theta, self.analysis, most, self._is_late)
+        self._budget.spend(0 if half is None else half.evaluations)
+        return half
+
+    def use_half_step(self, half: HalfStep) -> str:
+        """Fit the champions of all islands with half the step; name the limit that forbids it.
+
+        An island starts from the best of its champions with that step.
+        """
+        if not self._refines:
+            return "estimates of this method are not refined"
+        most = self._budget.count_left(self._reserved)
+        limit = find_limit(half, self._work, most, self._deadline.is_past_grace)
+        if limit:
+            return limit
+        most = self._budget.cap(self._work // half.problem.n_steps, self._reserved)
+        latest = [[end.theta] for end in self.ends]
+        latest[self._best].append(half.theta)
+        champions = [
+            [*(np.array(one.parameters) for one in island.history), *ends]
+            for island, ends in zip(self._state.islands, latest, strict=True)
+        ]
+        starts, values, spent = choose_starts(half, champions)
+        self._budget.spend(spent)
+        if not np.isfinite(values).any():
+            return "with half the step no simulation is finite"
+        self._is_of_search &= any(starts[self._searched] is one for one in latest[self._searched])
+        found = refine_candidates(
+            half.problem, starts, max(0, most - spent), self._deadline.is_past_grace
+        )
+        each = spent // len(starts)
+        self.ends = [
+            self._continue_end(IslandEnd(start, rms, evaluations=end.evaluations + each), candidate)
+            for start, rms, end, candidate in zip(
+                starts, values.tolist(), self.ends, found, strict=True
+            )
+        ]
+        self.problem = half.problem
+        fitted = sum(0 if candidate is None else candidate.evaluations for candidate in found)
+        self._work -= self.problem.n_steps * (fitted + spent)
+        return ""
+
+    def apply_noise_model(self, *, is_settled: bool) -> GeneralisedEstimate:
+        """Estimate and analyse under the noise model that was requested or selected.
+
+        Estimates of the paper's methods stay unchanged. So do all if the residuals are consistent
+        with white noise, or if the integration step is too long for them (not `is_settled`).
+        """
+        problem, theta, state = self.problem, self.theta, self._state
+        requested = problem.loss.noise_model
+        if requested == "white" or not self._refines:
+            return GeneralisedEstimate(theta, {}, 0, requested != "ar1")
+        in_time = self._deadline.count_simulations_left(
+            state.seconds, state.evaluations, problem.n_steps
+        )
+        is_indicated = is_settled and is_ar1_indicated(problem, theta, self.analysis, in_time)
+        if requested == "auto" and not is_indicated:
+            return GeneralisedEstimate(theta, {}, 0, True)
+        left = self._budget.count_left(self._reserved)
+        most = min((limit for limit in (left, in_time) if limit is not None), default=None)
+        uncertainty = self.analysis.uncertainty
+        nothing = np.zeros((theta.size, theta.size))
+        covariance = nothing if uncertainty is None else uncertainty.covariance
+        estimate = fit_generalised_least_squares(problem, theta, covariance, state.seed, most)
+        self._budget.spend(estimate.evaluations)
+        if requested == "auto":
+            estimate = confirm_noise_model(problem, theta, estimate)
+        if any(estimate.correlation_times.values()):
+            white = make_whitening(problem, estimate.correlation_times)
+            groups, is_cut = self.analysis.exchanges, self.analysis.is_cut_short
+            estimate = estimate._replace(theta=order_exchangeable(problem, estimate.theta, groups))
+            self._analyse(estimate.theta, white)
+            self.analysis = replace(self.analysis, exchanges=groups, is_cut_short=is_cut)
+            self._widen_intervals(LocalMinima(None, estimate.minima, estimate.rms, 0))
+        return estimate
+
+    def collect_minima(self, theta: FloatArray) -> FoundMinima:
+        """Collect the minima in which least squares ended; `theta` (D,) is the estimate.
+
+        Those where the input is recorded are added, if they contradict the input assumed before.
+        """
+        if not any(end.is_refined for end in self._fits):
+            return FoundMinima((), self._is_of_search)
+        problem, groups = self.problem, self.analysis.exchanges
+        ends = [(order_exchangeable(problem, end.theta, groups), end.rms) for end in self._fits]
+        minima = collect_minima(problem, ends, _get_variance_ratio(self.analysis))
+        recorded = compare_where_recorded(
+            problem,
+            theta,
+            self.analysis,
+            self._list_delays(),
+            self._count_scan_simulations(),
+            self._deadline.is_past_grace,
+        )
+        self._budget.spend(recorded.evaluations)
+        return FoundMinima((*minima, *recorded.minima), self._is_of_search, recorded.warnings)
+
+    def _is_late(self) -> bool:
+        """Whether no search may begin: the paper's methods have none."""
+        return not self._refines or self._deadline.is_past_grace()
+
+    def _continue_end(self, end: IslandEnd, found: RefinedCandidate | None) -> IslandEnd:
+        """Continue from an end to what least squares found from there, if anything."""
+        if found is None:
+            return end
+        self._budget.spend(found.evaluations)
+        return IslandEnd(
+            found.theta, found.rms, True, end.evaluations + found.evaluations, found.is_cut_short
+        )
+
+    def _is_same_optimum(self, end: IslandEnd, best: IslandEnd) -> bool:
+        is_as_low = end.rms <= best.rms * (1.0 + SAME_OPTIMUM)
+        return is_as_low or is_same_place(self.problem, end.theta, best.theta)
+
+    def _find_other_minima(self) -> list[IslandEnd]:
+        """Scan for other minima from the best end, and move to a better one.
+
+        Beside the estimate of a longer integration step the minima of its scan are fitted again.
+        """
+        end, most = self.ends[self._best], self._count_scan_simulations()
+        is_late = self._deadline.is_past_grace
+        if self._scanned is None or not is_same_place(self.problem, self._scanned, end.theta):
+            start = RefinedCandidate(end.theta, end.rms, 0)
+            delays = self._list_delays()
+            scanned = scan_parameters(self.problem, start, delays, most, is_late)
+            found, spent = scanned.ends[1:], scanned.evaluations
+        else:
+            far = [fit.theta for fit in self._fits if not self._is_an_end(fit.theta)]
+            fits = refine_candidates(self.problem, far, most, is_late) if far else ()
+            found = tuple(fit for fit in fits if fit is not None)
+            spent = sum(fit.evaluations for fit in found)
+        self._budget.spend(spent)
+        reached = [IslandEnd(one.theta, one.rms, True) for one in found]
+        best = min((end, *reached), key=lambda one: one.rms)
+        self._is_of_search &= best.rms >= end.rms * (1.0 - SAME_OPTIMUM)
+        self._move_best(best, spent)
+        return reached
+
+    def _is_an_end(self, theta: FloatArray) -> bool:
+        return any(is_same_place(self.problem, theta, end.theta) for end in self.ends)
+
+    def _search_local_minima(self) -> None:
+        """Search the minima near the estimate; move to the best, with intervals that cover all."""
+        problem, state, end = self.problem, self._state, self.ends[self._best]
+        linear = self.analysis.linear_model
+        if linear is None:
+            return
+        is_late = self._deadline.is_over()
+        most = count_affordable_simulations(problem, is_late)
+        if most == 0 and is_late:
+            self.analysis = replace(self.analysis, is_cut_short=True)
+            return
+        shares = 2 if problem.loss.noise_model == "ar1" else 1  # the other is the noise model's
+        most = self._budget.cap(most, self._reserved, shares)
+        minima = find_local_minima(problem, end.theta, end.rms, linear, state.seed, most)
+        self._budget.spend(minima.evaluations)
+        self._move_best(end, minima.evaluations)
+        if minima.best is not None:
+            groups = self.analysis.exchanges
+            theta = order_exchangeable(problem, minima.best.theta, groups)
+            self._move_best(IslandEnd(theta, minima.best.rms, True))
+            self._analyse(theta)
+            self.analysis = replace(self.analysis, exchanges=groups)
+        self._widen_intervals(minima)
+
+    def _move_best(self, reached: IslandEnd, evaluations: int = 0) -> None:
+        """Move the best end to where these simulations led from it."""
+        end = self.ends[self._best]
+        self.ends[self._best] = replace(
+            reached, evaluations=end.evaluations + evaluations, is_cut_short=end.is_cut_short
+        )
+
+    def _analyse(self, theta: FloatArray, *whitening: Whitening) -> None:
+        self.analysis = analyse_estimate(self.problem, theta, self._budget.count_left(), *whitening)
+        self._budget.spend(self.analysis.evaluations)
+
+    def _widen_intervals(self, minima: LocalMinima) -> None:
+        """Widen the intervals so that they contain those of all minima."""
+        linear, problem = self.analysis.linear_model, self.problem
+        if linear is None:
+            return
+        values = order_exchangeable(problem, minima.values, self.analysis.exchanges)
+        estimates = widen_intervals(
+            self.analysis.estimates,
+            problem.free_names,
+            problem.n_scored,
+            replace(minima, values=values),
+            linear.variance_ratio,
+        )
+        self.analysis = replace(self.analysis, estimates=estimates)
+
+    def _count_scan_simulations(self) -> int:
+        """Count the simulations that a scan may take."""
+        most = count_affordable_simulations(self.problem, self._deadline.is_over())
+        return self._budget.cap(most, shares=_SCAN_SHARES)
+
+    def _list_delays(self) -> list[int]:
+        """List the numbers of the free parameters that time lags depend on."""
+        names = find_delay_parameters(self.problem)
+        return [d for d, name in enumerate(self.problem.free_names) if name in names]
+
+
+def _get_champion(problem: Problem, island: Island) -> FloatArray:
+    if island.history:
+        return np.array(island.history[-1].parameters)
+    return 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
+
+
+def _get_variance_ratio(analysis: Analysis) -> float:
+    """Get the least variance ratio of all parameters; 1 for white residuals."""
+    if analysis.linear_model is None:
+        return 1.0
+    ratios = analysis.linear_model.variance_ratio
+    return float(np.min(ratios[np.isfinite(ratios)], initial=1.0))
