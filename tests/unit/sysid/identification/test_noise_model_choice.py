@@ -223,7 +223,8 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
     true = Problem.build(load_model(fine), [record(np.zeros(N))])
     y = true.predict(np.array([[K, 3.0, 1.0]]))[0]
     y = y + 1e-5 * np.random.default_rng(1).standard_normal(y.size)
-    auto, white = (found(stiff, y, loss) for loss in (AUTO, WHITE))
+    auto, white, ar1 = (found(stiff, y, loss) for loss in (AUTO, WHITE, AR1))
+    assert not ar1.correlation_times  # nothing of the step is left in the residuals
     assert same(auto, white)
     assert auto.warnings == white.warnings
     assert auto.substeps > 1

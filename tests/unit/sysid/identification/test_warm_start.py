@@ -49,7 +49,7 @@ def test_a_warm_start_halves_the_simulations_and_ends_at_the_same_result() -> No
         for one, other in zip(cold.estimates, warm.estimates, strict=True):
             if one.stderr is not None:
                 assert abs(one.value - other.value) <= 0.01 * one.stderr
-    assert spent["warm"] <= 0.55 * spent["cold"]
+    assert 2 * spent["warm"] <= spent["cold"]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
