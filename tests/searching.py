@@ -58,5 +58,5 @@ def bits(state: RunState | Island) -> tuple[object, ...]:
     if isinstance(state, RunState):
         islands = tuple(bits(island) for island in state.islands)
         return (state.generation, state.epoch, state.has_ended, state.migrations, islands)
-    arrays = (state.chromosomes, state.fitness, state.search, state.point)
+    arrays = (state.chromosomes, state.fitness, state.search, state.point, state.archive)
     return (state.index, state.history, *(array.tobytes() for array in arrays))

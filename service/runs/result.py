@@ -138,7 +138,7 @@ def _to_search_document(identification: Identification) -> dict[str, Any]:
                 "parameters": dict(zip(evidence.names, minimum.values.tolist(), strict=True)),
                 "rms": to_finite(minimum.rms),
                 "likelihood_ratio": to_finite(minimum.likelihood_ratio),
-                **_read(minimum, "count", "is_compatible", "recorded_from"),
+                **_read(minimum, "count", "independent", "is_compatible", "recorded_from"),
             }
             for minimum in evidence.minima
         ],

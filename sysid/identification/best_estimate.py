@@ -36,8 +36,11 @@ from sysid.identification.local_minima import (
     widen_intervals,
 )
 from sysid.identification.minima import (
+    Fit,
     FoundMinima,
     collect_minima,
+    compute_distance,
+    continue_from_archive,
     is_same_place,
     scan_parameters,
 )
@@ -46,9 +49,9 @@ from sysid.identification.unrecorded_input import compare_where_recorded
 from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
 from sysid.residuals.whitening import Whitening
+from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
 from sysid.search.refine import RefinedCandidate, refine_candidates
-from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -161,7 +164,7 @@ class _EstimateSearch:
 
     analysis: Analysis
     _best: int
-    _fits: list[IslandEnd]
+    _fits: list[Fit]
 
     def __init__(
         self,
@@ -176,8 +179,6 @@ class _EstimateSearch:
         self._deadline, self._refines = deadline, refines
         self._reserved = compute_analysis_budget(len(state.islands[0].point))
         self._work = compute_work_limit(problem, state.evaluations)
-        self._searched = min(range(len(state.islands)), key=lambda i: state.islands[i].champion_rms)
-        self._is_of_search = True
         self._scanned: FloatArray | None = None
         champions = [_get_champion(problem, island) for island in state.islands]
         self.ends = [
@@ -200,12 +201,8 @@ class _EstimateSearch:
     def analyse_best(self) -> None:
         """Scan from the best of the ends, analyse the result, and search for minima near it."""
         self._best = min(range(len(self.ends)), key=lambda i: self.ends[i].rms)
-        before = self.ends[self._best]
-        self._is_of_search &= self._is_same_optimum(self.ends[self._searched], before)
-        self._fits = [
-            *(end for end in self.ends if end.is_refined or end is before),
-            *(self._find_other_minima() if self._refines else ()),
-        ]
+        if self._refines:
+            self._fits = self._find_minima()
         best = self.ends[self._best]
         groups, spent = find_exchanges(
             self.problem, best.theta, self._budget.count_left(self._reserved)
@@ -250,7 +247,6 @@ class _EstimateSearch:
         self._budget.spend(spent)
         if not np.isfinite(values).any():
             return "with half the step no simulation is finite"
-        self._is_of_search &= any(starts[self._searched] is one for one in latest[self._searched])
         found = refine_candidates(
             half.problem, starts, max(0, most - spent), self._deadline.is_past_grace
         )
@@ -305,11 +301,14 @@ class _EstimateSearch:
 
         Those where the input is recorded are added, if they contradict the input assumed before.
         """
-        if not any(end.is_refined for end in self._fits):
-            return FoundMinima((), self._is_of_search)
+        if not self._refines:
+            return FoundMinima((), 0)
         problem, groups = self.problem, self.analysis.exchanges
-        ends = [(order_exchangeable(problem, end.theta, groups), end.rms) for end in self._fits]
-        minima = collect_minima(problem, ends, _get_variance_ratio(self.analysis))
+        fits = [
+            replace(fit, theta=order_exchangeable(problem, fit.theta, groups)) for fit in self._fits
+        ]
+        minima = collect_minima(problem, fits, self.analysis.linear_model)
+        own = min(minima, key=lambda one: compute_distance(problem, one.values, self.theta))
         recorded = compare_where_recorded(
             problem,
             theta,
@@ -319,7 +318,7 @@ class _EstimateSearch:
             self._deadline.is_past_grace,
         )
         self._budget.spend(recorded.evaluations)
-        return FoundMinima((*minima, *recorded.minima), self._is_of_search, recorded.warnings)
+        return FoundMinima((*minima, *recorded.minima), own.independent, recorded.warnings)
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
@@ -334,36 +333,51 @@ class _EstimateSearch:
             found.theta, found.rms, True, end.evaluations + found.evaluations, found.is_cut_short
         )
 
-    def _is_same_optimum(self, end: IslandEnd, best: IslandEnd) -> bool:
-        is_as_low = end.rms <= best.rms * (1.0 + SAME_OPTIMUM)
-        return is_as_low or is_same_place(self.problem, end.theta, best.theta)
+    def _find_minima(self) -> list[Fit]:
+        """Find minima by a scan from the best end and from those of the search; move to the best.
 
-    def _find_other_minima(self) -> list[IslandEnd]:
-        """Scan for other minima from the best end, and move to a better one.
-
-        Beside the estimate of a longer integration step the minima of its scan are fitted again.
+        Beside the estimate of a longer integration step its minima are fitted again instead.
         """
         end, most = self.ends[self._best], self._count_scan_simulations()
         is_late = self._deadline.is_past_grace
+        ends = [Fit(one.theta, one.rms) for one in self.ends if one.is_refined or one is end]
         if self._scanned is None or not is_same_place(self.problem, self._scanned, end.theta):
             start = RefinedCandidate(end.theta, end.rms, 0)
             delays = self._list_delays()
             scanned = scan_parameters(self.problem, start, delays, most, is_late)
-            found, spent = scanned.ends[1:], scanned.evaluations
+            ends += [Fit(one.theta, one.rms) for one in scanned.ends[1:]]
+            archived = [
+                one for island in self._state.islands for one in read_archive(island.archive)
+            ]
+            most -= scanned.evaluations
+            found, spent = continue_from_archive(self.problem, archived, ends, most, is_late)
+            spent += scanned.evaluations
         else:
-            far = [fit.theta for fit in self._fits if not self._is_an_end(fit.theta)]
-            fits = refine_candidates(self.problem, far, most, is_late) if far else ()
-            found = tuple(fit for fit in fits if fit is not None)
-            spent = sum(fit.evaluations for fit in found)
+            found, spent = self._repeat_fits(ends, most)
         self._budget.spend(spent)
-        reached = [IslandEnd(one.theta, one.rms, True) for one in found]
-        best = min((end, *reached), key=lambda one: one.rms)
-        self._is_of_search &= best.rms >= end.rms * (1.0 - SAME_OPTIMUM)
-        self._move_best(best, spent)
-        return reached
+        fits = [*ends, *found]
+        best = min(fits, key=lambda fit: fit.rms)
+        reached = end if best.rms >= end.rms else IslandEnd(best.theta, best.rms, True)
+        self._move_best(reached, spent)
+        return fits
 
-    def _is_an_end(self, theta: FloatArray) -> bool:
-        return any(is_same_place(self.problem, theta, end.theta) for end in self.ends)
+    def _repeat_fits(self, ends: list[Fit], most: int) -> tuple[list[Fit], int]:
+        """Fit the minima of a longer integration step again, unless they are among the ends."""
+        moved, found, spent = [(end.theta, end) for end in ends], [], 0
+        for fit in self._fits:
+            near = next(
+                (new for old, new in moved if is_same_place(self.problem, old, fit.theta)), None
+            )
+            if near is None:
+                late = self._deadline.is_past_grace
+                (end,) = refine_candidates(self.problem, [fit.theta], most - spent, late)
+                if end is None:
+                    continue
+                spent += end.evaluations
+                near = Fit(end.theta, end.rms)
+                moved.append((fit.theta, near))
+            found.append(replace(near, count=fit.count, independent=fit.independent))
+        return found, spent
 
     def _search_local_minima(self) -> None:
         """Search the minima near the estimate; move to the best, with intervals that cover all."""
@@ -430,11 +444,3 @@ def _get_champion(problem: Problem, island: Island) -> FloatArray:
     if island.history:
         return np.array(island.history[-1].parameters)
     return 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
-
-
-def _get_variance_ratio(analysis: Analysis) -> float:
-    """Get the least variance ratio of all parameters; 1 for white residuals."""
-    if analysis.linear_model is None:
-        return 1.0
-    ratios = analysis.linear_model.variance_ratio
-    return float(np.min(ratios[np.isfinite(ratios)], initial=1.0))

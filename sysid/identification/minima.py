@@ -5,42 +5,59 @@ periodic, or where the model has mirror images. From the best estimate each para
 moved over its whole range, time lags first, with all places in one batch. Least squares continues
 from the lowest dips. If it ends lower, the scan is repeated from there.
 
-All ends are kept. The data do not rule out a minimum whose likelihood ratio n ln(Σe²/Σe²₀) is
-below the quantile of χ² with one degree of freedom: its value lies in the profile likelihood region
-(Venzon and Moolgavkar, Appl. Statist. 37 (1988) 87). A parameter that differs between such minima
-is ambiguous. Coloured residuals hold less information than white ones. The ratio is multiplied by
-the least `variance_ratio` of all parameters (`sysid.uncertainty.linear_model`).
+All ends are kept, those of the search too (`sysid.search.archive`). The data do not rule out a
+minimum whose likelihood ratio n ln(Σe²/Σe²₀) is below the quantile of χ² with one degree of
+freedom: its value lies in the profile likelihood region (Venzon and Moolgavkar, Appl. Statist. 37
+(1988) 87). A parameter that differs between such minima is ambiguous. Coloured residuals hold less
+information than white ones. The ratio is multiplied by the least `variance_ratio` of all parameters
+(`sysid.uncertainty.linear_model`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.identification.result import Minimum
+from sysid.identification.result import CHI_SQUARE_95, Minimum
+from sysid.search.archive import SAME_PLACE, ArchivedMinimum
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.linear_model import LinearOutputModel
 
 _DELAY_PLACES, _PLACES = 128, 16  # of a scan: over the range of a time lag, of another parameter
 _STARTS = 6  # dips from which least squares continues, in a round
 _TRIAL_STEPS, _MAX_STEPS = 4, 20  # of least squares from each, and from a promising one
 _PROMISING = 1.5  # times the RMS of the best: least squares continues below it
 _MAX_ROUNDS = 4
-_SAME_PLACE = 1e-3  # of the range: nearer ends are one minimum
+_MOST_CONTINUED = 8  # minima of the search from which least squares continues
+_SAME_VALLEY = 1e-2  # of the range: nearer ends of the same RMS are one minimum
 _MOST_MINIMA = 10  # that a result lists
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Where least squares ended: the values (D,), their RMS, and how often it ended there.
+
+    `independent` is the number of fits from random points.
+    """
+
+    theta: FloatArray
+    rms: float
+    count: int = 1
+    independent: int = 0
+
+
 class FoundMinima(NamedTuple):
-    """All minima, the lowest first; `is_of_search`: the search itself ended in the best one."""
+    """All minima, the lowest first; `agreeing`: independent fits that ended in the best one."""
 
     minima: tuple[Minimum, ...]
-    is_of_search: bool
+    agreeing: int
     warnings: tuple[str, ...] = ()
 
 
@@ -98,6 +115,43 @@ def scan_parameters(
         if not gains:
             break
     return ScanResult(best, tuple(ends), spent)
+
+
+def continue_from_archive(
+    problem: Problem,
+    archived: Sequence[ArchivedMinimum],
+    ends: Sequence[Fit],
+    budget: int,
+    is_late: Callable[[], bool] | None = None,
+) -> tuple[list[Fit], int]:
+    """Continue least squares from the lowest minima of a search, with at most `budget` simulations.
+
+    A minimum near one of the `ends` counts for it. The simulations spent are returned too.
+    """
+    if not archived or len(archived) > budget:
+        return [], 0
+    places = from_unit(problem.evaluator, np.array([one.place for one in archived]))
+    fitness, spent = problem.evaluate_fitness(places), len(archived)
+    best = min(end.rms for end in ends)
+    fits: list[Fit] = []
+    continued = 0
+    for i in np.argsort(fitness, kind="stable"):
+        theta, rms, count = places[i], float(fitness[i]), archived[i].count
+        if not rms < _PROMISING * best:
+            break
+        near = min((*ends, *fits), key=lambda fit: compute_distance(problem, fit.theta, theta))
+        same = _SAME_VALLEY if rms <= best * (1.0 + SAME_OPTIMUM) else SAME_PLACE
+        if compute_distance(problem, near.theta, theta) < same:
+            fits.append(replace(near, count=count, independent=count))
+            continue
+        if continued == _MOST_CONTINUED or (is_late is not None and is_late()):
+            break
+        end = refine_candidate(problem, theta, rms, budget - spent, _MAX_STEPS)
+        if end is None:
+            break
+        spent, continued = spent + end.evaluations, continued + 1
+        fits.append(Fit(end.theta, end.rms, count, count))
+    return fits, spent
 
 
 class _Series(NamedTuple):
@@ -169,29 +223,64 @@ def _find_dips(scanned: Sequence[_Series], limit: float) -> list[tuple[FloatArra
 
 def collect_minima(
     problem: Problem,
-    ends: Sequence[tuple[FloatArray, float]],
-    variance_ratio: float = 1.0,
+    fits: Sequence[Fit],
+    linear: LinearOutputModel | None = None,
     recorded_from: float | None = None,
 ) -> tuple[Minimum, ...]:
-    """Group the ends of least squares, (D,) and RMS each, by minimum; the lowest first."""
+    """Group the ends of least squares by minimum; the lowest first.
+
+    Least squares ends anywhere in a flat valley. So an end that the data do not rule out belongs to
+    the lowest one if the linear model at the estimate says so too.
+    """
     kept: list[Minimum] = []
-    n = problem.n_scored * variance_ratio
-    for theta, rms in sorted(ends, key=lambda end: end[1]):
-        for i, minimum in enumerate(kept):
-            if is_same_place(problem, minimum.values, theta):
-                kept[i] = replace(minimum, count=minimum.count + 1)
-                break
+    n = problem.n_scored * _get_variance_ratio(linear)
+    for fit in sorted(fits, key=lambda fit: fit.rms):
+        rms, count, independent = fit.rms, fit.count, fit.independent
+        least = kept[0].rms if kept else rms
+        ratio = 0.0 if rms <= least else np.inf if least == 0 else 2.0 * n * np.log(rms / least)
+        near = next(
+            (i for i, one in enumerate(kept) if is_same_place(problem, one.values, fit.theta)), None
+        )
+        if near is None and kept and linear is not None and ratio <= CHI_SQUARE_95:
+            near = 0 if _is_in_valley(problem, linear, n, fit.theta, kept[0].values) else None
+        if near is None:
+            kept.append(Minimum(fit.theta, rms, count, independent, float(ratio), recorded_from))
         else:
-            least = kept[0].rms if kept else rms
-            ratio = 0.0 if rms <= least else np.inf if least == 0 else 2.0 * n * np.log(rms / least)
-            kept.append(Minimum(theta, rms, 1, float(ratio), recorded_from))
+            count, independent = kept[near].count + count, kept[near].independent + independent
+            kept[near] = replace(kept[near], count=count, independent=independent)
     return tuple(kept[:_MOST_MINIMA])
+
+
+def _get_variance_ratio(linear: LinearOutputModel | None) -> float:
+    """Get the least variance ratio of all parameters; 1 for white residuals."""
+    ratios = np.ones(1) if linear is None else linear.variance_ratio
+    return float(np.min(ratios[np.isfinite(ratios)], initial=1.0))
+
+
+def _is_in_valley(
+    problem: Problem, linear: LinearOutputModel, n: float, theta: FloatArray, best: FloatArray
+) -> bool:
+    """Whether the data do not rule out a place (D,), by the linear model at the best minimum.
+
+    A parameter that is on a plateau or has no variance is not in the model. It must not move.
+    """
+    places = to_unit(problem.evaluator, np.array([theta, best]))
+    is_left_out = ~np.isfinite(linear.variance_ratio)
+    if np.any(np.abs(places[0] - places[1])[is_left_out] >= SAME_PLACE):
+        return False
+    (increase,) = linear.predict_relative_increase((theta - best)[None])
+    return bool(n * np.log1p(increase) <= CHI_SQUARE_95)
 
 
 def is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bool:
     """Whether two ends (D,) of least squares are one minimum."""
+    return compute_distance(problem, first, second) < SAME_PLACE
+
+
+def compute_distance(problem: Problem, first: FloatArray, second: FloatArray) -> float:
+    """Compute the largest distance of two places (D,) in one parameter, as a share of its range."""
     places = to_unit(problem.evaluator, np.array([first, second]))
-    return bool(np.max(np.abs(places[0] - places[1]), initial=0.0) < _SAME_PLACE)
+    return float(np.max(np.abs(places[0] - places[1]), initial=0.0))
 
 
 def mark_ambiguous(

@@ -27,7 +27,9 @@ class Minimum:
         Of the free parameters.
     rms : float
     count : int
-        How many least-squares fits ended in it.
+        How many least-squares fits ended in it, in the search and after it.
+    independent : int
+        How many of them began at random points.
     likelihood_ratio : float
         n ln(Σe²/Σe²₀) to the best minimum, twice the logarithm of the ratio of likelihoods, made
         smaller for coloured residuals.
@@ -38,6 +40,7 @@ class Minimum:
     values: FloatArray
     rms: float
     count: int
+    independent: int
     likelihood_ratio: float
     recorded_from: float | None = None
 

@@ -31,10 +31,9 @@ def assess_search(
 ) -> SearchEvidence:
     """Assess the evidence that the estimate, with its RMS and residual tests, is the best."""
     restarts = count_restarts(*state.champions_and_counters)
-    agreeing = restarts.confirmed if found.is_of_search else 0
     is_negligible = rms <= _NEGLIGIBLE_SHARE * problem.output_scale
     because: Literal["starts", "residuals"] | None = None
-    if agreeing >= _ENOUGH_STARTS:
+    if found.agreeing >= _ENOUGH_STARTS:
         because = "starts"
     elif is_negligible or _is_noise(tests):
         because = "residuals"
@@ -42,7 +41,7 @@ def assess_search(
         because is not None,
         because,
         restarts.independent,
-        agreeing,
+        found.agreeing,
         problem.free_names,
         found.minima,
     )

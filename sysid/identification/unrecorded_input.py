@@ -24,7 +24,7 @@ from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray, Interval
 from sysid.data.records import Channel, Record
-from sysid.identification.minima import collect_minima, scan_parameters
+from sysid.identification.minima import Fit, collect_minima, scan_parameters
 from sysid.identification.result import Minimum
 from sysid.kernels.reads import list_delayed_values
 from sysid.models.delays import compute_longest_delay, list_past_values
@@ -240,7 +240,7 @@ def compare_where_recorded(
             problem, spans | {name: (value, value) for name, value in found}
         )
 
-    kept = [(one.theta, one.rms) for one in scanned.ends if reaches_back(one.theta) <= reach]
+    kept = [Fit(one.theta, one.rms) for one in scanned.ends if reaches_back(one.theta) <= reach]
     since = _find_recorded_starts(problem, reach)[0] - problem.records[0].start
     count = max(map(np.count_nonzero, find_assumed_samples(problem, analysis)))
     return RecordedComparison(

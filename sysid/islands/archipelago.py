@@ -8,6 +8,7 @@ import numpy as np
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
+from sysid.search.archive import make_archive
 from sysid.search.evolution import draw_initial_places
 from sysid.search.island import (
     NO_TARGET_RMS,
@@ -129,6 +130,7 @@ def create_islands(
                 np.full(size, np.nan),
                 search,
                 np.zeros(n),
+                make_archive(n),
             )
         )
     return tuple(islands)

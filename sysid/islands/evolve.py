@@ -284,7 +284,11 @@ def _evolve_to_border(
         begin, end = packed.offsets[i], packed.offsets[i + 1]
         plan, search, written = unpack_plan(plans, i), packed.search[i], log.counts[0]
         island = IslandArrays(
-            packed.chromosomes[begin:end], packed.fitness[begin:end], search, packed.points[i]
+            packed.chromosomes[begin:end],
+            packed.fitness[begin:end],
+            search,
+            packed.points[i],
+            packed.archives[i],
         )
         if search.generation >= target or is_island_resting(plan, island, packed.champion_rms[i]):
             continue

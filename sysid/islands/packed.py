@@ -21,6 +21,7 @@ class PackedIslands(NamedTuple):
     fitness : FloatArray, shape (P,)
     search : SearchArray, shape (I,)
     points : FloatArray, shape (I, D)
+    archives : FloatArray, shape (I, 16, 2 + D)
         This array and those above are those of `sysid.search.island.Island`.
     champion_rms : FloatArray, shape (I,)
         RMS of each island's best individual so far; ``inf`` before the first evaluation.
@@ -33,6 +34,7 @@ class PackedIslands(NamedTuple):
     fitness: FloatArray
     search: SearchArray
     points: FloatArray
+    archives: FloatArray
     champion_rms: FloatArray
     champions: FloatArray
 
@@ -69,6 +71,7 @@ def pack_islands(islands: Sequence[Island]) -> PackedIslands:
         np.concatenate([island.fitness for island in islands]),
         stack_search(islands),
         np.array([island.point for island in islands]),
+        np.array([island.archive for island in islands]),
         np.array([island.champion_rms for island in islands]),
         champions,
     )
@@ -95,6 +98,7 @@ def unpack_islands(
             packed.fitness[begin:end],
             packed.search[i, ...],
             packed.points[i],
+            packed.archives[i],
             (*island.history, *new_improvements[i]),
         )
         for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))

@@ -14,6 +14,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
+from sysid.search.archive import archive_end
 from sysid.search.basin_hopping import (
     COUNTED_HOP,
     SINGLE_PARAMETER_HOP,
@@ -257,6 +258,9 @@ def _finish_part(
     if races and is_behind_champion(evaluator, plan, island, search.horizon, reached):
         search.horizon = 1.0
     _extend_horizon(search, island.fitness[0])
+    has_ended = search.in_sequence_search == 0 and np.isfinite(search.reached_fitness)
+    if has_ended and search.from_random_start:
+        archive_end(island.archive, island.point, search.reached_fitness)
 
 
 @jit_compile

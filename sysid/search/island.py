@@ -44,6 +44,8 @@ class Island:
         State of the search (see `sysid.search.state.SEARCH_RECORD`).
     point : FloatArray, shape (D,)
         Present point of the local search.
+    archive : FloatArray, shape (16, 2 + D)
+        Minima in which searches from random points ended (`sysid.search.archive`).
     history : tuple of Improvement
         Every better champion since the start.
     """
@@ -54,6 +56,7 @@ class Island:
     fitness: FloatArray
     search: SearchArray
     point: FloatArray
+    archive: FloatArray
     history: tuple[Improvement, ...] = ()
 
     @property
@@ -74,7 +77,9 @@ class Island:
     @property
     def arrays(self) -> IslandArrays:
         """The arrays themselves, not copies, for compiled code to change."""
-        return IslandArrays(self.chromosomes, self.fitness, self.search[()], self.point)
+        return IslandArrays(
+            self.chromosomes, self.fitness, self.search[()], self.point, self.archive
+        )
 
 
 def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -> Island:
@@ -88,6 +93,7 @@ def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -
         fitness=island.fitness.copy(),
         search=island.search.copy(),
         point=island.point.copy(),
+        archive=island.archive.copy(),
     )
     rows = np.empty((count + 1, COLUMN_VALUES + island.point.size))
     written = run_generations(evaluator, plan, count, after.arrays, rows)

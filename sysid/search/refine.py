@@ -7,12 +7,12 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
+from sysid.search.archive import SAME_PLACE
 from sysid.search.least_squares import N_TRIED, ScoredSamples, solve_least_squares, steps_at_once
 from sysid.simulation.evaluator import Evaluator, evaluate_population
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import AT_BOUND, from_unit, to_unit
 
-_SAME_VALLEY = 1e-3  # of the range: nearer champions are in one valley
 _MAX_STEPS = 60
 _LONG_RECORD = 2_000_000  # measured values times parameters: above, only two starts
 _END_EVALUATIONS = 3  # simulations of a start and of an end, in addition to the steps
@@ -55,7 +55,7 @@ def refine_candidates(
     last: tuple[int, RefinedCandidate] | None = None
     for i in np.argsort(values, kind="stable"):
         place = to_unit(problem.evaluator, np.array(starts[i])[None])[0]
-        is_near_better = any(np.max(np.abs(place - other)) < _SAME_VALLEY for other in taken)
+        is_near_better = any(np.max(np.abs(place - other)) < SAME_PLACE for other in taken)
         if is_near_better or len(taken) == most_starts or not np.isfinite(values[i]):
             continue
         if budget < place.size + N_TRIED + _END_EVALUATIONS:

@@ -96,12 +96,15 @@ class IslandArrays(NamedTuple):
     search : SearchRecord
     point : FloatArray, shape (D,)
         Present point of the local search, in [0, 1].
+    archive : FloatArray, shape (16, 2 + D)
+        Minima in which searches from random points ended (`sysid.search.archive`).
     """
 
     chromosomes: WordArray
     fitness: FloatArray
     search: SearchRecord
     point: FloatArray
+    archive: FloatArray
 
 
 # Columns of an improvement; the D physical values follow.

@@ -24,6 +24,7 @@ from service.repositories.runs import RunRepository
 from service.storage.errors import LeaseLost, ObjectStoreFailed
 from service.storage.tables import Checkpoint
 from sysid.islands.state import RunState
+from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
 from tests.dispatching import Place
@@ -123,7 +124,7 @@ def searched(
         for number, value in enumerate(rms)
     )
     nothing = np.zeros((0, 1), np.uint64), np.zeros(0)
-    island = Island(0, 1, *nothing, search, np.zeros(1), history)
+    island = Island(0, 1, *nothing, search, np.zeros(1), make_archive(1), history)
     return RunState(1, (island,), generation, migrations=migrants)
 
 

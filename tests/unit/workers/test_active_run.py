@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sysid.islands.state import RunState
+from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD
 from tests.runs import spec
@@ -14,7 +15,9 @@ from workers.protocol import IslandProgress
 def island(index: int, generation: int) -> Island:
     search = np.zeros((), SEARCH_RECORD)
     search["generation"] = generation
-    return Island(index, 1, np.zeros((0, 1), np.uint64), np.zeros(0), search, np.zeros(1))
+    return Island(
+        index, 1, np.zeros((0, 1), np.uint64), np.zeros(0), search, np.zeros(1), make_archive(1)
+    )
 
 
 def state(*generations: int, seconds: float = 0.0) -> RunState:

@@ -9,14 +9,23 @@ from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, l
 from sysid.core.settings import SearchMethod
 from sysid.core.types import FloatArray
 from sysid.identification.conclude import conclude_run
-from sysid.identification.minima import FoundMinima, collect_minima, mark_ambiguous, scan_parameters
+from sysid.identification.minima import (
+    Fit,
+    FoundMinima,
+    collect_minima,
+    mark_ambiguous,
+    scan_parameters,
+)
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.search.archive import archive_end, make_archive
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.search.state import Improvement
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.linear_model import LinearOutputModel
 from tests import searching
 
 STEP, GAIN, TIME, LAG, PERIOD = 0.2, 2.0, 1.5, 1.33, 5.0
@@ -186,22 +195,22 @@ def test_a_search_is_settled_by_starts_that_agree_or_by_residuals_that_are_noise
     assert {one.status for one in quick.estimates} == {"identified"}
 
 
-def test_starts_count_only_if_they_agree_on_the_minimum_of_the_result() -> None:
-    """The best champion of the search lies beside a false minimum. Its starts show nothing."""
+def test_starts_count_only_if_they_ended_in_the_minimum_of_the_result() -> None:
     problem, truth = regenerate()
     search = GeneticAlgorithm(generations=20, islands=2)
     state = advance_run(problem, search, begin_run(problem, search, 1))
     (false,) = refine_candidates(problem, [np.array([6.0, 8.0, 2.95])])
     assert false is not None
     (rms,) = problem.evaluate_fitness(truth[None])
-    for first, agreeing in ((truth, 3), (false.theta, 0)):
+    for first, agreeing in ((truth, 6), (false.theta, 3)):
         islands = []
         champions = ((first, 0.99 * rms), (truth, rms))
         for island, (place, rms) in zip(state.islands, champions, strict=True):
-            counters = island.search.copy()
-            counters["random_starts"] = counters["confirmed_starts"] = 3
+            archive = make_archive(place.size)
+            for _ in range(3):
+                archive_end(archive, to_unit(problem.evaluator, place[None])[0], rms)
             champion = Improvement(20, 100, rms, "sequence", tuple(place.tolist()))
-            islands.append(replace(island, search=counters, history=(champion,)))
+            islands.append(replace(island, archive=archive, history=(champion,)))
         found = conclude_run(problem, search, replace(state, islands=tuple(islands)))
         assert found.search.agreeing_starts == agreeing
         assert {one.name: one.value for one in found.estimates}["tau"] == pytest.approx(
@@ -222,16 +231,40 @@ def _duffing_record() -> Record:
 def test_equal_ends_are_one_minimum_and_ratios_are_of_likelihoods() -> None:
     problem = Problem.build(lag_model(), [record(steps(), 0)])
     ends = [
-        (np.array([2.0, 1.5, 1.33, 0.0]), 0.02),
-        (np.array([2.001, 1.501, 1.331, 0.001]), 0.02),
-        (np.array([2.0, 1.5, 6.33, 0.0]), 0.021),
+        Fit(np.array([2.0, 1.5, 1.33, 0.0]), 0.02),
+        Fit(np.array([2.001, 1.501, 1.331, 0.001]), 0.02, 4, 3),
+        Fit(np.array([2.0, 1.5, 6.33, 0.0]), 0.021),
     ]
     first, second = collect_minima(problem, ends)
-    assert (first.count, second.count) == (2, 1)
+    assert (first.count, first.independent, second.count) == (5, 3, 1)
     assert first.likelihood_ratio == 0.0
     assert second.likelihood_ratio == pytest.approx(2 * 300 * np.log(1.05))
     assert not second.is_compatible
-    assert collect_minima(problem, ends, variance_ratio=0.1)[1].is_compatible
+    sharp = LinearOutputModel(
+        np.eye(4), 1e3 * np.eye(4), np.zeros(4), 300 * 0.02**2, np.full(4, 0.1)
+    )
+    assert collect_minima(problem, ends, sharp)[1].is_compatible
+
+
+def test_ends_in_one_flat_valley_are_one_minimum() -> None:
+    """Least squares ends anywhere along what the data leave open, here K and T together."""
+    problem = Problem.build(lag_model(), [record(steps(), 0)])
+    best = np.array([2.0, 1.5, 1.33, 0.0])
+    along, across = best.copy(), best.copy()
+    along[:2] += 0.5
+    across[:2] += 0.5, -0.5
+    fits = [Fit(best, 0.02), Fit(along, 0.02001, 3, 3), Fit(across, 0.02001)]
+    root = 20.0 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+
+    def collected(ratio: float) -> list[tuple[int, int]]:
+        flat = LinearOutputModel(
+            np.eye(4), root, np.zeros(4), 300 * 0.02**2, np.array([1.0, ratio, 1.0, 1.0])
+        )
+        return [(one.count, one.independent) for one in collect_minima(problem, fits, flat)]
+
+    assert collected(1.0) == [(4, 3), (1, 0)]
+    assert collected(np.nan) == [(1, 0), (3, 3), (1, 0)]  # T is not in the linear model
+    assert len(collect_minima(problem, fits)) == 3
 
 
 def test_an_estimate_that_a_noise_model_moved_is_not_ambiguous_for_it() -> None:
@@ -246,8 +279,8 @@ def test_an_estimate_that_a_noise_model_moved_is_not_ambiguous_for_it() -> None:
         Estimate(name, "1", value, -10.0, 20.0, 0.01, (value - 0.02, value + 0.02), "identified")
         for name, value in zip(names, moved.tolist(), strict=True)
     )
-    minima = collect_minima(problem, [(white, 0.02), (far, 0.0200001)])
-    marked = mark_ambiguous(problem, estimates, FoundMinima(minima, False))
+    minima = collect_minima(problem, [Fit(white, 0.02), Fit(far, 0.0200001)])
+    marked = mark_ambiguous(problem, estimates, FoundMinima(minima, 0))
     assert [one.status for one in marked] == [
         "identified",
         "identified",
