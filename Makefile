@@ -5,6 +5,8 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 FAST   := not slow and not ray and not postgres and not browser and not data
 TEST_PROCESSES ?= 3
+# One cache for all checkouts of a user: mypy looks at the content of files, not at their place.
+export MYPY_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/lagid/mypy
 
 .DEFAULT_GOAL := help
 .PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format bench bench-full mutants night real-data clean
@@ -102,4 +104,4 @@ real-data: $(READY)
 	$(BIN)/python -m benchmarks.real_data.all --json benchmarks/results/real_data.json
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build ./*.egg-info
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache build ./*.egg-info
