@@ -42,12 +42,16 @@ from sysid.identification.minima import (
     compute_distance,
     continue_from_archive,
     is_same_place,
+    scan_by_projection,
     scan_parameters,
 )
 from sysid.identification.noise_model_choice import confirm_noise_model, is_ar1_indicated
+from sysid.identification.search_evidence import is_noise
 from sysid.identification.unrecorded_input import compare_where_recorded
 from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
+from sysid.islands.stopping import count_restarts
+from sysid.residuals.residual_tests import run_residual_tests
 from sysid.residuals.whitening import Whitening
 from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
@@ -56,6 +60,8 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 
+_MOST_PROJECTED = 6000  # simulations of a scan by projection
+_ENOUGH_SHARE = 1 / 3  # of the random starts: if more agree, nothing is in doubt
 _SCAN_SHARES = 4  # a scan takes at most one such share of the simulations that are left
 
 
@@ -180,6 +186,7 @@ class _EstimateSearch:
         self._reserved = compute_analysis_budget(len(state.islands[0].point))
         self._work = compute_work_limit(problem, state.evaluations)
         self._scanned: FloatArray | None = None
+        self._projected = 0
         champions = [_get_champion(problem, island) for island in state.islands]
         self.ends = [
             IslandEnd(champion, island.champion_rms)
@@ -318,7 +325,8 @@ class _EstimateSearch:
             self._deadline.is_past_grace,
         )
         self._budget.spend(recorded.evaluations)
-        return FoundMinima((*minima, *recorded.minima), own.independent, recorded.warnings)
+        all_minima = (*minima, *recorded.minima)
+        return FoundMinima(all_minima, own.independent, self._projected, recorded.warnings)
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
@@ -338,28 +346,47 @@ class _EstimateSearch:
 
         Beside the estimate of a longer integration step its minima are fitted again instead.
         """
-        end, most = self.ends[self._best], self._count_scan_simulations()
-        is_late = self._deadline.is_past_grace
+        end = self.ends[self._best]
         ends = [Fit(one.theta, one.rms) for one in self.ends if one.is_refined or one is end]
         if self._scanned is None or not is_same_place(self.problem, self._scanned, end.theta):
-            start = RefinedCandidate(end.theta, end.rms, 0)
-            delays = self._list_delays()
-            scanned = scan_parameters(self.problem, start, delays, most, is_late)
-            ends += [Fit(one.theta, one.rms) for one in scanned.ends[1:]]
-            archived = [
-                one for island in self._state.islands for one in read_archive(island.archive)
-            ]
-            most -= scanned.evaluations
-            found, spent = continue_from_archive(self.problem, archived, ends, most, is_late)
-            spent += scanned.evaluations
+            found, spent = self._scan_from(end, ends)
         else:
-            found, spent = self._repeat_fits(ends, most)
+            found, spent = self._repeat_fits(ends, self._count_scan_simulations())
         self._budget.spend(spent)
         fits = [*ends, *found]
         best = min(fits, key=lambda fit: fit.rms)
         reached = end if best.rms >= end.rms else IslandEnd(best.theta, best.rms, True)
         self._move_best(reached, spent)
         return fits
+
+    def _scan_from(self, end: IslandEnd, ends: list[Fit]) -> tuple[list[Fit], int]:
+        """Scan from an end, and continue from the ends of the search; count the simulations."""
+        problem, is_late = self.problem, self._deadline.is_past_grace
+        start = RefinedCandidate(end.theta, end.rms, 0)
+        most = self._count_scan_simulations()
+        scanned = scan_parameters(problem, start, self._list_delays(), most, is_late)
+        found, spent = [Fit(one.theta, one.rms) for one in scanned.ends[1:]], scanned.evaluations
+        archived = [one for island in self._state.islands for one in read_archive(island.archive)]
+        known = [*ends, *found]
+        continued, count = continue_from_archive(problem, archived, known, most - spent, is_late)
+        found, spent = found + continued, spent + count
+        if self._is_doubtful(end):
+            most = count_affordable_simulations(problem, self._deadline.is_over(), _MOST_PROJECTED)
+            most = self._budget.cap(most, spent, _SCAN_SHARES)
+            projected = scan_by_projection(problem, start, self._state.seed, most, is_late)
+            found += [Fit(one.theta, one.rms, 1, 1) for one in projected.ends[1:]]
+            spent += projected.evaluations
+            self._projected = projected.starts
+        return found, spent
+
+    def _is_doubtful(self, end: IslandEnd) -> bool:
+        """Whether the search may have missed the best minimum, a time lag's above all."""
+        restarts = count_restarts(*self._state.champions_and_counters)
+        share = _ENOUGH_SHARE * restarts.independent
+        if not self._list_delays() or restarts.confirmed > share:
+            return False
+        simulated = self.problem.predict(end.theta[None])[0]
+        return not is_noise(run_residual_tests(self.problem, simulated, "estimation"))
 
     def _repeat_fits(self, ends: list[Fit], most: int) -> tuple[list[Fit], int]:
         """Fit the minima of a longer integration step again, unless they are among the ends."""

@@ -72,15 +72,17 @@ class LocalMinima:
     evaluations: int
 
 
-def count_affordable_simulations(problem: Problem, is_late: bool) -> int:
-    """Count the simulations affordable near an estimate: fewer, the longer one takes.
+def count_affordable_simulations(
+    problem: Problem, is_late: bool, most: int = _MAX_SIMULATIONS
+) -> int:
+    """Count the simulations affordable after a search: fewer, the longer one takes.
 
     The cost is measured in integration steps, not by the clock, so equal runs give equal results.
     """
     steps = sum(
         experiment.grid.points * experiment.grid.substeps for experiment in problem.experiments
     )
-    limit = min(_MAX_SIMULATIONS, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
+    limit = min(most, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
     return limit if limit >= _ROUGHNESS_PLACES else 0
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
+from sysid.identification.projection import draw_projected_places
 from sysid.identification.result import CHI_SQUARE_95, Minimum
 from sysid.search.archive import SAME_PLACE, ArchivedMinimum
 from sysid.search.refine import RefinedCandidate, refine_candidate
@@ -54,19 +55,28 @@ class Fit:
 
 
 class FoundMinima(NamedTuple):
-    """All minima, the lowest first; `agreeing`: independent fits that ended in the best one."""
+    """All minima, the lowest first.
+
+    `agreeing` fits from random points ended in the minimum of the estimate. `projected` fits after
+    the search began at random points with the linear parameters solved for.
+    """
 
     minima: tuple[Minimum, ...]
     agreeing: int
+    projected: int = 0
     warnings: tuple[str, ...] = ()
 
 
 class ScanResult(NamedTuple):
-    """Best candidate after a scan, with all ends of least squares and the simulations spent."""
+    """Best candidate after a scan, with all ends of least squares and the simulations spent.
+
+    `starts`: the places from which least squares continued.
+    """
 
     best: RefinedCandidate
     ends: tuple[RefinedCandidate, ...]
     evaluations: int
+    starts: int = 0
 
 
 def scan_parameters(
@@ -94,27 +104,59 @@ def scan_parameters(
     for _ in range(_MAX_ROUNDS):
         scanned = _scan_around(problem, best, delays, others, budget - spent)
         spent += sum(series.values.size - 1 for series in scanned)
-        reached = best
-        for place, rms in _find_dips(scanned, problem.output_scale):
-            if is_late is not None and is_late():
-                break
-            trial = refine_candidate(problem, place, rms, budget - spent, _TRIAL_STEPS)
-            if trial is None:
-                break
-            spent += trial.evaluations
-            if not trial.rms < _PROMISING * best.rms:
-                continue
-            end = refine_candidate(problem, trial.theta, trial.rms, budget - spent, _MAX_STEPS)
-            if end is None:
-                break
-            spent += end.evaluations
-            ends.append(end)
-            reached = min(reached, end, key=lambda candidate: candidate.rms)
+        dips = _find_dips(scanned, problem.output_scale)
+        found, count = _refine_dips(problem, dips, best.rms, budget - spent, is_late)
+        spent += count
+        ends += found
+        reached = min(best, *found, key=lambda candidate: candidate.rms) if found else best
         gains = reached.rms < best.rms * (1.0 - SAME_OPTIMUM)
         best = reached
         if not gains:
             break
     return ScanResult(best, tuple(ends), spent)
+
+
+def scan_by_projection(
+    problem: Problem,
+    start: RefinedCandidate,
+    seed: int,
+    budget: int,
+    is_late: Callable[[], bool] | None = None,
+) -> ScanResult:
+    """Scan the whole range with the linear parameters solved for (`projection`)."""
+    places, fitness, spent = draw_projected_places(problem, start.theta, seed, budget)
+    order = np.argsort(fitness, kind="stable")
+    dips = [(places[i], float(fitness[i])) for i in order if fitness[i] < problem.output_scale]
+    found, count = _refine_dips(problem, dips[:_STARTS], start.rms, budget - spent, is_late)
+    best = min(start, *found, key=lambda candidate: candidate.rms) if found else start
+    return ScanResult(best, (start, *found), spent + count, len(dips[:_STARTS]))
+
+
+def _refine_dips(
+    problem: Problem,
+    dips: Sequence[tuple[FloatArray, float]],
+    best: float,
+    budget: int,
+    is_late: Callable[[], bool] | None,
+) -> tuple[list[RefinedCandidate], int]:
+    """Refine dips, and further only those that come near the best RMS; count the simulations."""
+    ends: list[RefinedCandidate] = []
+    spent = 0
+    for place, rms in dips:
+        if is_late is not None and is_late():
+            break
+        trial = refine_candidate(problem, place, rms, budget - spent, _TRIAL_STEPS)
+        if trial is None:
+            break
+        spent += trial.evaluations
+        if not trial.rms < _PROMISING * best:
+            continue
+        end = refine_candidate(problem, trial.theta, trial.rms, budget - spent, _MAX_STEPS)
+        if end is None:
+            break
+        spent += end.evaluations
+        ends.append(end)
+    return ends, spent
 
 
 def continue_from_archive(

@@ -2,8 +2,8 @@
 
 Either at least two searches from random points ended in the best minimum, or nothing but noise is
 left in the residuals, or they are negligible. A false minimum leaves a part of the response in
-them. Searches that start
-near the best individual show nothing: they return to a false minimum as well.
+them. Searches that start near the best individual show nothing: they return to a false minimum as
+well.
 """
 
 from dataclasses import replace
@@ -35,19 +35,19 @@ def assess_search(
     because: Literal["starts", "residuals"] | None = None
     if found.agreeing >= _ENOUGH_STARTS:
         because = "starts"
-    elif is_negligible or _is_noise(tests):
+    elif is_negligible or is_noise(tests):
         because = "residuals"
     return SearchEvidence(
         because is not None,
         because,
-        restarts.independent,
+        restarts.independent + found.projected,
         found.agreeing,
         problem.free_names,
         found.minima,
     )
 
 
-def _is_noise(tests: ResidualTests | None) -> bool:
+def is_noise(tests: ResidualTests | None) -> bool:
     """Whether no test of the residuals finds anything but noise; False if none was possible."""
     known = [] if tests is None else [test.p for test in tests.tests if test.p is not None]
     return bool(known) and min(known) > _UNLIKELY
