@@ -350,6 +350,7 @@ HOSTILE = (
     'end\\"""',
     "'''",
     "// \\\nint x;",
+    "*\\\n/ int x; /\\\n*",
     "??/\n#error",
     "\u202e\u2028\u0085#error",
     "%s {x} @PAIRS@ @ORDER@",
@@ -370,14 +371,21 @@ def test_no_text_of_a_model_gets_out_of_comments(text: str, tmp_path: Path) -> N
     provenance = {text: text, "list": [text, {"a": text}]}
     for format in ("python", "control"):
         found = sysid.export_model(model, values, format, provenance=provenance)
+        assert is_visible(found)
         # As a tree, the program is that of the model without these texts.
         told, expected = (
             without_docstrings(one) for one in (found, sysid.export_model(plain, values, format))
         )
         assert told == expected
     found = sysid.export_model(model, values, "c", provenance=provenance)
+    assert is_visible(found)
     assert without_comments(found) == without_comments(sysid.export_model(plain, values, "c"))
     assert json.loads(sysid.export_model(model, values, "json"))["model"]["title"] == model.title
+
+
+def is_visible(source: str) -> bool:
+    """No character is hidden or changes the direction of writing: what one reads is what runs."""
+    return all(character.isprintable() or character == "\n" for character in source)
 
 
 def without_docstrings(source: str) -> str:

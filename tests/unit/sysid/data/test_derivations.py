@@ -255,6 +255,16 @@ def test_a_pooled_input_is_the_median_of_each_bin() -> None:
     assert made.channel("y").times[-1] == 0.6
 
 
+def test_one_wrong_repeat_does_not_move_a_pooled_input() -> None:
+    times = np.concatenate([i + np.array([0.0, 0.1, 0.2]) for i in range(5)])
+    u = np.tile([1.0, 2.0, 3.0], 5)
+    u[6:9] = 50.0  # the third repeat
+    segments = tuple(Segment(float(i), i + 0.2, 0.0, {"n": i}) for i in range(5))
+    repeated = Recording((Channel("u", times, u), Channel("y", times, u)), segments)
+    made = derive_recording(repeated, [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
+    np.testing.assert_array_equal(values(made, "u"), [1.0, 2.0, 3.0])
+
+
 def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some() -> None:
     pooling = {"input": "u", "outputs": ["y"], "bin": 0.3, "start": 0}
     some = {"n": {"modulus": 2, "remainder": 0}}

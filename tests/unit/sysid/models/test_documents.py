@@ -79,7 +79,19 @@ def test_the_rate_of_a_measured_state_may_start_measured() -> None:
     assert parse_model(both).initial == (MeasuredInitial(), MeasuredInitial())
 
 
-@pytest.mark.parametrize("document", [CONTINUOUS, DISCRETE])
+RICH = CONTINUOUS | {
+    "parameters": {
+        "c": {"lower": 0.1, "upper": 1, "unit": "N·s/m", "scale": "log", "bounds": "gain"},
+        "L": {"lower": 0, "upper": 1, "unit": "s", "fixed": 0.5, "description": "a  pure delay"},
+        "k": {"lower": 0, "upper": 2, "tied": "2*c"},
+    },
+    "equations": {"x": "v", "v": "(q(t) - c*v(t - L) - k*x)/m"},
+    "initial": {"x": {"lower": 0, "upper": 1, "bounds": "state"}, "v": "c"},
+}
+"""With all that a parameter or an initial state may say."""
+
+
+@pytest.mark.parametrize("document", [CONTINUOUS, DISCRETE, RICH])
 def test_the_normal_form_gives_the_same_model_and_is_its_own(document: dict[str, Any]) -> None:
     model = parse_model(document)
     assert parse_model(model.document) == model

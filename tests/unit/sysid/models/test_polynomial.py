@@ -146,6 +146,7 @@ def _depth(tree: object) -> int:
         ({"terms": []}, "/terms", "the list is empty"),
         ({"terms": ["y(k-1)", "y(k-1)"]}, "/terms/1", "listed twice"),
         ({"terms": ["u(k-1)*y(k-1)", "y(k-1)*u(k-1)"]}, "/terms/1", "listed twice"),
+        ({"terms": ["y(k-1)", "u(k-1)", "y(k-1)"]}, "/terms/2", "listed twice"),
         ({"terms": ["2*y(k-1)"]}, "/terms/0", "a product of past values"),
         ({"terms": ["sin(y(k-1))"]}, "/terms/0", "a product of past values"),
         ({"terms": ["y(k-1) + u"]}, "/terms/0", "a product of past values"),

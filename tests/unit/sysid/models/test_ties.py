@@ -105,6 +105,11 @@ def test_a_tie_is_identified_and_validated_with_the_rest() -> None:
     [
         ({"b": {"tied": "2*b"}}, "/parameters/b/tied", "circular, b → b"),
         ({"b": {"tied": "c"}, "c": {"tied": "b+1"}}, "/parameters/c/tied", "circular, c → b → c"),
+        (
+            {"c": {"tied": "L"}, "L": {"tied": "b"}, "b": {"tied": "L+1"}},
+            "/parameters/L/tied",
+            "circular, L → b → L",
+        ),
         ({"b": {"tied": "2*d"}}, "/parameters/b/tied", "'d' is not declared"),
         ({"b": {"tied": "2*"}}, "/parameters/b/tied", "column 3"),
         ({"b": {"tied": "x"}}, "/parameters/b/tied", "'x' is not declared"),
