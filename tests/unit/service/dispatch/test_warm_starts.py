@@ -81,6 +81,15 @@ def test_a_run_begins_with_the_last_before_it_that_succeeded_in_its_own_chain(
     assert chains.find_previous_values(third, nothing) == {"a": float(chain.list_runs(1)[0])}
 
 
+def test_an_earlier_run_that_ends_late_does_not_replace_the_values_of_a_later_one() -> None:
+    chains = OpenChains(ChainLayout(1, 3), 3, {2}.__contains__)  # the second waits for nobody
+    assert [chains.take_ready(9, 3), chains.take_ready(9, 3)] == [[0], [1]]
+    chains.end_run(1, {"a": 1.0})
+    chains.end_run(0, {"a": 0.0})
+    assert chains.take_ready(9, 3) == [2]
+    assert chains.find_previous_values(2, nothing) == {"a": 1.0}
+
+
 def nothing(_numbers: range) -> None:
     raise AssertionError("every run that ended was told of")
 

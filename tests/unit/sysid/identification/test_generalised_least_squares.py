@@ -100,6 +100,20 @@ def test_the_correlation_time_is_found_with_and_without_missing_samples() -> Non
         assert np.mean(found) == pytest.approx(true, rel=0.15)
 
 
+def test_the_correlation_time_counts_the_noise_that_parameters_absorb() -> None:
+    n, pole = 200, 0.9
+    times = STEP * np.arange(n)
+    u = np.sin(2 * np.pi * np.arange(n) / n)  # as slow as the noise
+    found = []
+    for seed in draw_seeds(gate=40, night=200):
+        y = 2.0 * u + 1.0 + 0.2 * coloured(n, pole, seed)
+        problem = posed(Record((Channel("u", times, u),), (Channel("y", times, y),)))
+        end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
+        found.append(end.correlation_times["y"])
+    true = -STEP / np.log(pole)
+    assert np.mean(found) == pytest.approx(true, abs=bound_mean(found, 0.15 * true))
+
+
 def test_a_long_record_says_more_of_the_correlation_time_than_a_short_one() -> None:
     short = (np.arange(N) < 60).astype(np.float64)
     records = record(1), record(2, 0.5, short)
