@@ -155,6 +155,7 @@ def test_lineage_is_that_of_its_project(shared):
         for project, parent in zip(PROJECTS, ("ds_mine", "ds_theirs"), strict=True):
             LineageRepository(session, project).add_links("job_1", [parent], "estimation")
         LineageRepository(session, OTHER).add_links("ds_mine", ["ds_raw"], "derived")
+        LineageRepository(session).add_links("ds_raw", ["ds_far"], "derived")  # behind theirs
     with shared.read_session() as session:
         lineage = LineageRepository(session)
         assert [link.parent for link in lineage.list_ancestors("job_1")] == ["ds_mine"]
