@@ -70,9 +70,9 @@ def test_a_parameter_that_depends_on_the_run_is_told_with_the_two_furthest_apart
     place: Place,
 ) -> None:
     runs = [
-        identified(place, 0.1, L=(1.0, 0.01), T=(2.0, 0.1)),
-        identified(place, 0.2, L=(1.5, 0.01), T=(2.1, 0.1)),
-        identified(place, 0.3, L=(1.2, 0.01), T=(2.0, None)),
+        identified(place, 0.1, L=(1.2, 0.01), T=(2.0, 0.1)),
+        identified(place, 0.2, L=(1.0, 0.01), T=(2.1, 0.1)),
+        identified(place, 0.3, L=(1.5, 0.01), T=(2.0, None)),
     ]
     found = compare(place, *runs)
     told = {one.name: (one.differs, one.note) for one in found.parameters}
