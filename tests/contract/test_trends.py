@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from service.core.states import JobState
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.trends.schemas import TrendOut
 from service.trends.trend import compute_trend
 from sysid.trends.trend import compute_drift_limit
@@ -86,7 +88,10 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
         trend={"x": "x", "parameters": ["L"]},
     )
     lease = claim_job(place.database, job)
-    first = place.runs(job)[0].id
+    first, failed, _ = (run.id for run in place.runs(job))
     write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
+    with place.database.write_session() as session:
+        outcome = RunOutcome(run_id=failed, state=JobState.FAILED, error="diverged")
+        RunWriter(session, lease).record_outcomes([outcome])
     found = trend(place, job)
     assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])
