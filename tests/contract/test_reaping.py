@@ -19,6 +19,7 @@ from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
 from service.queue.orphaned_jobs import Reaper, reap_jobs
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.storage import columns
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
 from tests.dispatching import until
@@ -312,7 +313,7 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
     postgres_database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = utc_now() - timedelta(seconds=1000)
-    monkeypatch.setattr("service.storage.columns.utc_now", lambda: wrong)
+    monkeypatch.setattr(columns, "utc_now", lambda: wrong)
     job = submit(postgres_database)
     with postgres_database.write_session() as session:
         assert choose_database_clock(session)() > wrong + timedelta(seconds=500)

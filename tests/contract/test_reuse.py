@@ -5,11 +5,13 @@ from datetime import timedelta
 import pytest
 
 from service.core.states import JobState
+from service.dispatch import job_runs
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.garbage import delete_orphans
 from sysid.identification.fit_problems import FitRecords
 from tests.dispatching import Place, carry_out
+from workers import tasks
 from workers.inline_executor import InlineExecutor
 from workers.tasks import process_pack
 
@@ -132,10 +134,11 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr(
-            "service.dispatch.job_runs.prepare_run_records",
+            job_runs,
+            "prepare_run_records",
             lambda *_: FitRecords((), None, None, None),
         )
-        patched.setattr("workers.tasks.conclude_run", broken)
+        patched.setattr(tasks, "conclude_run", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
     assert run.state is JobState.FAILED
     _, (again,), computed = carried_out(place, **sweep(1))
@@ -145,7 +148,7 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
 
 def test_a_run_without_its_signals_is_computed_again(place, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("service.dispatch.job_runs.add_fitted_signals", lambda *_: None)
+        patched.setattr(job_runs, "add_fitted_signals", lambda *_: None)
         _, (first,), _ = carried_out(place, **sweep(1))
     assert first.signals_sha256 is None
     _, (again,), computed = carried_out(place, **sweep(1))

@@ -7,7 +7,10 @@ from sqlalchemy import event
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
+from service.dispatch import job_runs
 from service.dispatch.job_runs import JobRuns
+from service.dispatch.warm_starts import WarmStarts
+from service.jobs import submit
 from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
 from service.jobs.to_core import to_algorithm
@@ -91,7 +94,7 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("service.dispatch.job_runs.to_algorithm", broken_second_time())
+        patched.setattr(job_runs, "to_algorithm", broken_second_time())
         runs, warm = carried_out(place, **chained(NOISE))
     assert [one.state for one in runs] == [JobState.SUCCEEDED, JobState.FAILED, JobState.SUCCEEDED]
     assert warm[2] == (values(runs[0]),)
@@ -183,8 +186,8 @@ def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, fir
 
 
 def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeypatch):
-    monkeypatch.setattr("service.jobs.submit.CELLS_AT_SUBMISSION", 2)
-    monkeypatch.setattr("service.dispatch.job_runs.CHUNK_ROWS", 2)
+    monkeypatch.setattr(submit, "CELLS_AT_SUBMISSION", 2)
+    monkeypatch.setattr(job_runs, "CHUNK_ROWS", 2)
     runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
     assert [one == () for one in warm] == [True, False, False] * 2
     assert {run.state for run in runs} == {JobState.SUCCEEDED}
@@ -258,7 +261,7 @@ def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, mon
     def broken(body):
         raise InvalidSettings("/algorithm", "as told")
 
-    monkeypatch.setattr("service.dispatch.warm_starts.WarmStarts._read_last_success", refused)
-    monkeypatch.setattr("service.dispatch.job_runs.to_algorithm", broken)
+    monkeypatch.setattr(WarmStarts, "_read_last_success", refused)
+    monkeypatch.setattr(job_runs, "to_algorithm", broken)
     runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
     assert {one.state for one in runs} == {JobState.FAILED}

@@ -45,6 +45,13 @@ def test_no_function_is_named_by_a_participle() -> None:
     assert named == []
 
 
+def test_no_test_replaces_a_name_by_its_dotted_text() -> None:
+    """The object that has the name: its absence is an error of types, not of the run."""
+    dotted = re.compile(r"setattr\(\s*[\"']")
+    found = [str(p.relative_to(ROOT)) for p in list_modules(CODE) if dotted.search(p.read_text())]
+    assert found == []
+
+
 def test_no_class_name_is_used_twice() -> None:
     places: dict[str, list[str]] = {}
     for path in list_modules(PRODUCT):

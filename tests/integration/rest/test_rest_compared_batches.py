@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from service.cli import reidentify
 from service.cli.main import app as lagid
+from service.trends import trend as trends
 from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch, serve_batch
 from tests.integration.rest.test_rest_reidentify import quantity, run_at, trend
 from tests.rest import refused
@@ -164,7 +166,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     def connected(*_: object) -> None:
         raise AssertionError("sent before it was checked")
 
-    monkeypatch.setattr("service.cli.reidentify.connect_client", connected)
+    monkeypatch.setattr(reidentify, "connect_client", connected)
     told = CliRunner().invoke(
         lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
     )
@@ -206,7 +208,7 @@ def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
     reference = run_at(served, served.job, 2.0)
     job = identify_batch(served.server, batch=batch, reference=reference)
-    monkeypatch.setattr("service.trends.trend.MAX_RUNS", 3)
+    monkeypatch.setattr(trends, "MAX_RUNS", 3)
     found = trend(served, job)
     (note,) = found["notes"]
     assert "has 4 runs" in note

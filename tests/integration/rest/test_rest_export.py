@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.api.app import create_app
+from service.cli import runs as run_commands
 from service.cli.main import app as commands
 from service.client.async_client import AsyncClient
 from service.client.calls import ProblemError
@@ -159,7 +160,7 @@ def test_the_command_writes_a_file_or_to_stdout(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr("service.cli.runs.connect_client", lambda *_: nullcontext(client))
+    monkeypatch.setattr(run_commands, "connect_client", lambda *_: nullcontext(client))
     told = export(served, served.run, format="python").text
     run = CliRunner().invoke
     shown = run(commands, ["export", served.run, "--format", "python"])

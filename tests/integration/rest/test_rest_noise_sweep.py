@@ -9,6 +9,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.datasets.recordings import load_recording
+from service.sweeps import output_spread
 from tests.identified import carried_out
 from tests.rest import parts_of, recording, refused, settings_of, store_csv
 
@@ -139,8 +140,8 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     # 300 samples of two channels
-    monkeypatch.setattr("service.sweeps.output_spread.MAX_READ_VALUES", 599)
-    monkeypatch.setattr("service.sweeps.output_spread.load_recording", None)
+    monkeypatch.setattr(output_spread, "MAX_READ_VALUES", 599)
+    monkeypatch.setattr(output_spread, "load_recording", None)
     (fault,) = refused(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"
     assert "the datasets have 600 values; at most 599" in fault["detail"]
@@ -156,7 +157,7 @@ def test_recordings_are_read_while_no_session_is_open(
         seen.append(pool.checkedout())
         return load_recording(*given)
 
-    monkeypatch.setattr("service.sweeps.output_spread.load_recording", noted)
+    monkeypatch.setattr(output_spread, "load_recording", noted)
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     assert seen == [0]

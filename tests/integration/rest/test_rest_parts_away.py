@@ -32,7 +32,7 @@ def test_a_full_disk_is_a_part_that_is_down(
     def full(*_args: Any, **_options: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("service.api.content._save_body", full)
+    monkeypatch.setattr(content, "_save_body", full)
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
     assert "a disk of the server is full" in answer.json()["detail"]

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 import service.runs.profiles
 from service.api.app import create_app
+from service.cli import runs as run_commands
 from service.cli.runs import app as runs_app
 from service.client.client import Client
 from tests.identified import identified
@@ -140,7 +141,8 @@ def test_a_profile_that_cannot_be_had_is_refused(
 
 def test_the_command_tells_intervals(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "service.cli.runs.connect_client",
+        run_commands,
+        "connect_client",
         lambda *_: Client("http://testserver", transport=Through(served.server)),
     )
     told = CliRunner().invoke(runs_app, ["profile", served.run, "L", "--points", "7"])

@@ -15,9 +15,11 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
+from service.cli import runs as run_commands
 from service.cli.runs import app as runs_app
 from service.client.async_client import AsyncClient
 from service.client.client import Client
+from service.datasets import recordings
 from service.storage.errors import ObjectMissing
 from service.storage.objects import ObjectStore
 from sysid.data.records import Recording
@@ -213,7 +215,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
-    monkeypatch.setattr("service.datasets.recordings.load_recording", lost)
+    monkeypatch.setattr(recordings, "load_recording", lost)
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "cannot be read any more" in asked["note"]
@@ -222,7 +224,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
 def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
     """What a command under ``lagid runs`` prints."""
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr("service.cli.runs.connect_client", lambda url, key: nullcontext(client))
+    monkeypatch.setattr(run_commands, "connect_client", lambda url, key: nullcontext(client))
     done = CliRunner().invoke(runs_app, list(words))
     assert done.exit_code == ends, done.output
     return done.output

@@ -16,6 +16,7 @@ from service.storage.objects import open_store
 from service.storage.sessions import Database
 from tests.dispatching import LIMIT_SECONDS, Place
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from workers import packing
 from workers.inline_executor import InlineExecutor
 from workers.protocol import EvolveIsland, QueuedRun
 from workers.scheduler import Scheduler
@@ -110,8 +111,8 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
 def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     ray_executor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
-    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
+    monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr(packing, "FIRST_SLICE_SECONDS", 0.001)
     one = spec(3, "long", generations=120, islands=8, population=64)
     plain = carry_out(InlineExecutor(), {"r": one})
     flying: set[Any] = set()

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from workers import packing
 from workers.inline_executor import InlineExecutor
 from workers.protocol import QueuedRun
 from workers.scheduler import Scheduler
@@ -26,14 +27,14 @@ def test_many_small_runs_on_ray_give_the_bits_of_the_plain_loop(ray_executor) ->
 def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
     ray_executor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
-    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
+    monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr(packing, "FIRST_SLICE_SECONDS", 0.001)
     specs = {"r": spec(2, "long", generations=120, islands=4, migration=every(20))}
     spread = carry_out(ray_executor, specs)
     assert spread.failures == {}
     assert len(spread.states["r"]) >= 4
-    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 1000.0)
-    monkeypatch.setattr("workers.packing.PACK_SECONDS", 1000.0)
+    monkeypatch.setattr(packing, "FIRST_SLICE_SECONDS", 1000.0)
+    monkeypatch.setattr(packing, "PACK_SECONDS", 1000.0)
     plain = carry_out(InlineExecutor(), specs)
     assert len(plain.states.get("r", [])) == 0  # one call, from the start to the end
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])

@@ -9,6 +9,7 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.identification import deadline
 from sysid.identification.conclude import conclude_run
 from sysid.identification.generalised_least_squares import (
     fit_generalised_least_squares,
@@ -236,7 +237,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
     state = advance_run(problem, timed, begin_run(problem, timed, 1))
     whole = conclude_run(problem, timed, replace(state, seconds=1.0))
-    monkeypatch.setattr("sysid.identification.deadline._STEPS_AFTER_DEADLINE", 30 * problem.n_steps)
+    monkeypatch.setattr(deadline, "_STEPS_AFTER_DEADLINE", 30 * problem.n_steps)
     late = conclude_run(problem, timed, replace(state, seconds=100.0))
     soon = conclude_run(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
     said = "not estimated completely"

@@ -11,6 +11,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
+from sysid.plants import actuator
 from sysid.plants.actuator import MAX_SAMPLES, Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
 
@@ -90,7 +91,7 @@ def test_the_work_of_a_record_grows_with_its_time_and_is_bounded(last: float) ->
 
 
 def test_an_arm_that_stops_too_often_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sysid.plants.actuator.MAX_WORK", 8_000)
+    monkeypatch.setattr(actuator, "MAX_WORK", 8_000)
     simulate_actuator(ARM, Channel("P_a", TIMES, np.zeros(400), "Pa"))  # at rest: no event
     with pytest.raises(InvalidSettings, match="so often"):
         simulate_actuator(ARM, Channel("P_a", TIMES, 12e3 * np.sin(40 * TIMES), "Pa"))

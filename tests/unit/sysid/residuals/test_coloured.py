@@ -10,6 +10,7 @@ from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
+from sysid.residuals import coloured as coloured_module
 from sysid.residuals.autocorrelation import space_residuals
 from sysid.residuals.coloured import (
     ColouredCovariance,
@@ -205,8 +206,6 @@ def test_a_drift_has_a_recursion_of_first_order(monkeypatch: pytest.MonkeyPatch)
         for pole in (0.999, 0.9)
     )
     before = estimate_spectrum_root(wander)[0], estimate_spectrum_root(slow)[0]
-    monkeypatch.setattr(
-        "sysid.residuals.coloured._fit_recursion", lambda values: np.array([0.5, 0.2])
-    )
+    monkeypatch.setattr(coloured_module, "_fit_recursion", lambda values: np.array([0.5, 0.2]))
     np.testing.assert_array_equal(estimate_spectrum_root(wander)[0], before[0])
     assert np.max(np.abs(estimate_spectrum_root(slow)[0] - before[1])) > 0
