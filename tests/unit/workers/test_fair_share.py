@@ -139,6 +139,14 @@ def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
     assert len(shares._projects) == MAX_ABSENT_PROJECTS + 1
 
 
+def test_packs_in_flight_count_for_their_project_as_if_they_had_been_charged() -> None:
+    shares: FairShare[str] = FairShare()
+    for job, project in (("a1", "a"), ("a2", "a"), ("b1", "b")):
+        shares.open_account(job, project=project)
+    assert shares.order_jobs({"a1": 4, "a2": 0, "b1": 1}) == ["b1", "a2", "a1"]
+    assert shares.order_jobs({"a1": 1, "a2": 0, "b1": 4}) == ["a2", "a1", "b1"]
+
+
 def test_unused_time_is_saved_for_later_up_to_a_limit() -> None:
     shares: FairShare[str] = FairShare()
     for project in ("greedy", "modest"):

@@ -332,6 +332,24 @@ def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedExecutor,
     return work, executor, notebook
 
 
+@pytest.mark.parametrize(("others", "is_spread"), [(1, True), (20, False)])
+def test_the_islands_of_one_run_take_no_cores_for_which_runs_of_others_wait(
+    others: int, is_spread: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packing, "WORTH_SPREADING_SECONDS", 0.0)
+    one = spec(islands=4)
+    kept = begin_run(build_pack_problems(one.problem, RECORDS)[0], one.algorithm, 1)
+    executor = ScriptedExecutor(fails, slots=4)
+    executor.is_slow = True
+    feeder: Scheduler[str] = Scheduler(executor)
+    jobs(feeder, b=others)
+    feeder.add_job("a", ListedRuns([QueuedRun("a0", one, kept)]), Notebook())
+    feeder.run_step(0.0)
+    items = [item for pack in executor.packs.values() for item in pack if item.run == "a0"]
+    assert any(isinstance(item, EvolveIsland) for item in items) == is_spread
+    assert len(items) == (4 if is_spread else 1)
+
+
 def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
