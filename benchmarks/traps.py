@@ -123,6 +123,23 @@ def periodic_input(random: np.random.Generator) -> Draw:
     )
 
 
+CHATTER = {
+    "name": "chatter",
+    "form": "differential",
+    "inputs": {"u": "N"},
+    "states": {"x": "m", "v": "m/s"},
+    "parameters": {
+        "ze": {"lower": 0, "upper": 2, "unit": "1"},
+        "om": {"lower": 1, "upper": 120, "unit": "rad/s"},
+        "kc": {"lower": 0, "upper": 120, "unit": "1/s^2"},
+        "tau": {"lower": 0, "upper": 13, "unit": "s"},
+    },
+    "equations": {"x": "v", "v": "u - 2*ze*om*v - om**2*x - kc*(x - x(t - tau))"},
+    "outputs": {"y": "x"},
+    "initial": {"x": 0, "v": 0},
+}
+
+
 def chatter(random: np.random.Generator) -> Draw:
     """Regenerative chatter: a comb of false minima in the delay."""
     period, count = 0.05, 600
@@ -140,25 +157,8 @@ def chatter(random: np.random.Generator) -> Draw:
         v = half + 0.5 * step * (pull - 2 * damping * w * half - (w**2 + k) * x[i + 1])
     y = x[: count * FINE : FINE]
     y = y + random.normal(0.0, 0.015 * np.std(y), count)
-    model = parse_model(
-        {
-            "name": "chatter",
-            "form": "differential",
-            "inputs": {"u": "N"},
-            "states": {"x": "m", "v": "m/s"},
-            "parameters": {
-                "ze": {"lower": 0, "upper": 2, "unit": "1"},
-                "om": {"lower": 1, "upper": 120, "unit": "rad/s"},
-                "kc": {"lower": 0, "upper": 120, "unit": "1/s^2"},
-                "tau": {"lower": 0, "upper": 13, "unit": "s"},
-            },
-            "equations": {"x": "v", "v": "u - 2*ze*om*v - om**2*x - kc*(x - x(t - tau))"},
-            "outputs": {"y": "x"},
-            "initial": {"x": 0, "v": 0},
-        }
-    )
     record = make_record(period, force, y, ("N", "m"))
-    return Draw(record, model, "tau", back * step)
+    return Draw(record, parse_model(CHATTER), "tau", back * step)
 
 
 def find_estimate(found: Identification, name: str) -> Estimate:

@@ -80,6 +80,8 @@ NARX = dict.fromkeys((one.name for one in load_model("narx").parameters), 0.0) |
     "dk": 7.6,
 }
 ACTUATOR = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3}
+ARM = {**ACTUATOR, "A_m": 5.0e-6, "B": 1.0e-3}
+"""The actuator with what is fixed in the catalogue."""
 REST = {"y(0)": 0.0, "v(0)": 0.0}
 CASES = {
     "duffing-delay": Case(

@@ -15,6 +15,30 @@ PARAMETERS = {
     "b": {"lower": 0, "upper": 10},
 }
 
+LINE: dict[str, Any] = {
+    "name": "line",
+    "form": "differential",
+    "inputs": {"u": "1"},
+    "states": {"x": "1"},
+    "parameters": {"a": {"lower": 0.1, "upper": 10}, "b": {"lower": -5, "upper": 5}},
+    "equations": {"x": "-x"},
+    "outputs": {"y": "a*u(t) + b + x"},
+    "initial": {"x": 0},
+}
+"""A straight line in the input: what is known of linear regression holds for it."""
+
+ARX: dict[str, Any] = {
+    "name": "arx",
+    "form": "polynomial",
+    "output": "y",
+    "inputs": {"u": "V"},
+    "degree": 1,
+    "lags": {"y": [1], "u": [1]},
+    "coefficients": {"lower": -2, "upper": 2},
+    "initial": {"y": 0},
+}
+"""The polynomial of first degree in one past output and one past input."""
+
 
 def difference(equations: dict[str, str], output: str, **fields: Any) -> Model:
     """A recursion with input u and the parameters c, L, b."""

@@ -2,11 +2,11 @@
 
 from service.dispatch.results import to_run_outcome
 from service.queue.leases import Lease, LeaseQueue
-from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
 from sysid.identification.result import Identification, SearchEvidence
 from sysid.search.state import Improvement, Migrant
 from sysid.uncertainty.estimates import Criteria, Estimate
+from tests.stored import record_outcomes
 from workers.protocol import RunConclusion
 
 
@@ -65,10 +65,8 @@ def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
 
 def write_results(database: Database, lease: Lease, results: dict[str, RunConclusion]) -> None:
     """End runs of a leased job with these results."""
-    with database.write_session() as session:
-        RunWriter(session, lease).record_outcomes(
-            [to_run_outcome(run, concluded, 1.0) for run, concluded in results.items()]
-        )
+    outcomes = [to_run_outcome(run, concluded, 1.0) for run, concluded in results.items()]
+    record_outcomes(database, lease, *outcomes)
 
 
 def claim_job(database: Database, job: str) -> Lease:

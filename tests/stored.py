@@ -3,8 +3,8 @@
 from datetime import UTC, datetime, timedelta
 
 from service.core.states import JobState
-from service.queue.leases import Claim, LeaseQueue
-from service.queue.run_writes import NewRun, RunWriter
+from service.queue.leases import Claim, Lease, LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.datasets import NewDataset
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
@@ -44,6 +44,20 @@ def claimed(database: Database, n_runs: int = 1, **values) -> tuple[Claim, list[
         ledger = RunWriter(session, got.lease)
         ledger.create_runs(NewRun(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
         return got, [run.id for run in ledger.list_pending(limit=10_000)]
+
+
+def record_outcomes(
+    database: Database, lease: Lease, *outcomes: RunOutcome, **evidence
+) -> tuple[str, ...]:
+    """End runs of a leased job; gives the identifiers of those that this ended."""
+    with database.write_session() as session:
+        return RunWriter(session, lease).record_outcomes(outcomes, **evidence)
+
+
+def record_success(database: Database, lease: Lease, run_id: str, rms: float | None = None) -> None:
+    """End a run of a leased job with success."""
+    outcome = RunOutcome(run_id=run_id, state=JobState.SUCCEEDED, best_rms=rms)
+    record_outcomes(database, lease, outcome)
 
 
 def job_of(database: Database, job_id: str) -> Job:

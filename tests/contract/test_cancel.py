@@ -10,7 +10,7 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import RowConflict, RowNotFound
-from tests.stored import claim, claimed, job_of, runs_of, state_of, submit
+from tests.stored import claim, claimed, job_of, record_success, runs_of, state_of, submit
 
 
 def finish(database, lease, state):
@@ -119,10 +119,7 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
 
 def test_a_resumed_job_begins_with_a_clean_slate_and_leaves_other_jobs_alone(database):
     other, (foreign,) = claimed(database)
-    with database.write_session() as session:
-        RunWriter(session, other.lease).record_outcomes(
-            [RunOutcome(run_id=foreign, state=JobState.SUCCEEDED, best_rms=0.1)]
-        )
+    record_success(database, other.lease, foreign, 0.1)
     running, (runs_on,) = claimed(database)
     with database.write_session() as session:
         RunWriter(session, running.lease).start_runs([runs_on])

@@ -7,12 +7,13 @@ import pytest
 
 from service.core.states import JobState
 from service.queue.leases import Lease, LeaseQueue
-from service.queue.run_writes import RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome
 from service.repositories.jobs import JobRepository
 from service.sweeps.schemas import SummaryOut
 from service.sweeps.summary import summarise_job
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
+from tests.stored import record_outcomes
 
 AXES = [{"path": "/noise/sigma", "values": [0.1, 0.2]}, {"path": "/seed", "range": [0, 4]}]
 FLOORS = {
@@ -52,9 +53,8 @@ def summarise(place: Place, job: str, by: list[str] | None = None) -> SummaryOut
 
 
 def fail(place: Place, lease: Lease, run: str) -> None:
-    with place.database.write_session() as session:
-        outcome = RunOutcome(run_id=run, state=JobState.FAILED, error="as told")
-        RunWriter(session, lease).record_outcomes([outcome])
+    outcome = RunOutcome(run_id=run, state=JobState.FAILED, error="as told")
+    record_outcomes(place.database, lease, outcome)
 
 
 def test_the_rate_of_success_is_that_of_the_runs_that_have_ended(place: Place) -> None:

@@ -123,6 +123,14 @@ class Stand:
             self.dispatcher.run_round()
         raise AssertionError(f"{len(self.executor.sent)} packs were sent")
 
+    def lose_job(self) -> str:
+        """Begin a job whose heartbeat is late, so that another dispatcher reaps it."""
+        job = self.place.submit()
+        self.turn_until_sent(1)
+        self.clock.advance(31)
+        leases_of(self.place.database, self.clock).renew_leases()
+        return job
+
 
 @pytest.fixture
 def stand(tmp_path: Path, clock: Clock) -> Iterator[Stand]:
@@ -153,10 +161,7 @@ def test_a_job_whose_heartbeat_was_late_goes_on_and_meanwhile_nothing_is_written
 def test_a_job_that_was_lost_while_its_heartbeat_was_late_is_taken_up_again(
     stand: Stand,
 ) -> None:
-    job = stand.place.submit()
-    stand.turn_until_sent(1)
-    stand.clock.advance(31)
-    leases_of(stand.place.database, stand.clock).renew_leases()  # another reaps it
+    job = stand.lose_job()
     stand.leases.renew_leases()
     for _ in range(200_000):
         stand.dispatcher.run_round()
@@ -281,10 +286,7 @@ def test_of_two_dispatchers_the_one_that_stops_is_removed(database, clock: Clock
 def test_a_job_claimed_back_while_its_old_packs_fly_ends_once_under_its_new_attempt(
     stand: Stand,
 ) -> None:
-    job = stand.place.submit()
-    stand.turn_until_sent(1)
-    stand.clock.advance(31)
-    leases_of(stand.place.database, stand.clock).renew_leases()  # another reaps it
+    job = stand.lose_job()
     stand.turn_until_sent(2)
     assert len(stand.executor.packs) == 2
     stand.executor.is_slow = False

@@ -13,7 +13,7 @@ from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
-from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
+from tests.stored import Clock, claim, claimed, job_of, record_success, runs_of, state_of, submit
 
 LEASE = timedelta(seconds=10)
 IMPATIENT_SECONDS = 0.5
@@ -406,17 +406,11 @@ def test_a_job_cannot_succeed_while_a_run_is_unfinished(database):
 
 def test_results_of_another_job_neither_end_this_one_nor_are_its_best(database):
     other, (done,) = claimed(database)
-    with database.write_session() as session:
-        RunWriter(session, other.lease).record_outcomes(
-            [RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1)]
-        )
+    record_success(database, other.lease, done, 0.1)
     got, (run_id,) = claimed(database)
     with pytest.raises(RowConflict, match="1 of its runs"):
         finish(database, got.lease)
-    with database.write_session() as session:
-        RunWriter(session, got.lease).record_outcomes(
-            [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED, best_rms=0.7)]
-        )
+    record_success(database, got.lease, run_id, 0.7)
     finish(database, got.lease)
     assert job_of(database, got.job.id).best_rms == 0.7
     finish(database, other.lease)

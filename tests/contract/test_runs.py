@@ -9,7 +9,7 @@ from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
-from tests.stored import claimed, job_of, runs_of, submit
+from tests.stored import claimed, job_of, record_outcomes, runs_of, submit
 
 RESULT = {
     "parameters": [
@@ -18,11 +18,6 @@ RESULT = {
     ],
     "rms": 0.01,
 }
-
-
-def record(database, lease, *outcomes, **evidence):
-    with database.write_session() as session:
-        return RunWriter(session, lease).record_outcomes(outcomes, **evidence)
 
 
 def good(run_id, rms=0.01):
@@ -103,7 +98,7 @@ def test_started_runs_carry_the_attempt_that_started_them(database):
 @pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED])
 def test_a_run_that_has_ended_is_not_started_again(database, end):
     got, (run_id, other) = claimed(database, n_runs=2)
-    record(database, got.lease, RunOutcome(run_id=run_id, state=end))
+    record_outcomes(database, got.lease, RunOutcome(run_id=run_id, state=end))
     with database.write_session() as session:
         RunWriter(session, got.lease).start_runs([run_id, other])
     assert [run.state for run in runs_of(database, got.job.id)] == [end, JobState.RUNNING]
@@ -136,7 +131,7 @@ def test_checkpoints_are_read_for_one_job(database):
 
 def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
     got, (run_id,) = claimed(database)
-    assert record(database, got.lease, good(run_id)) == (run_id,)
+    assert record_outcomes(database, got.lease, good(run_id)) == (run_id,)
     with database.read_session() as session:
         run = RunRepository(session).get(run_id)
         (row,) = RunRepository(session).read_table(got.job.id)
@@ -152,8 +147,8 @@ def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
 
 def test_a_result_is_written_exactly_once(database):
     got, (run_id,) = claimed(database)
-    record(database, got.lease, good(run_id, 0.01))
-    assert record(database, got.lease, good(run_id, 0.005)) == ()
+    record_outcomes(database, got.lease, good(run_id, 0.01))
+    assert record_outcomes(database, got.lease, good(run_id, 0.005)) == ()
     (run,) = runs_of(database, got.job.id)
     assert run.best_rms == 0.01
     job = job_of(database, got.job.id)
@@ -162,8 +157,10 @@ def test_a_result_is_written_exactly_once(database):
 
 def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(database):
     got, ids = claimed(database, n_runs=4)
-    record(database, got.lease, good(ids[0], 0.3), good(ids[1], 0.2))
-    record(database, got.lease, RunOutcome(run_id=ids[2], state=JobState.FAILED, error="diverged"))
+    record_outcomes(database, got.lease, good(ids[0], 0.3), good(ids[1], 0.2))
+    record_outcomes(
+        database, got.lease, RunOutcome(run_id=ids[2], state=JobState.FAILED, error="diverged")
+    )
     job = job_of(database, got.job.id)
     assert (job.n_done, job.n_failed, job.best_rms) == (3, 1, 0.2)
     with database.read_session() as session:
@@ -180,14 +177,14 @@ def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(datab
 def test_a_run_of_another_job_is_not_written(database):
     _, (foreign,) = claimed(database)
     got, _ = claimed(database)
-    assert record(database, got.lease, good(foreign)) == ()
+    assert record_outcomes(database, got.lease, good(foreign)) == ()
 
 
 def test_results_and_history_stand_or_fall_together(database):
     got, ids = claimed(database, n_runs=2)
     bad = HistoryPoint("run_none", 0, 0, 0, 0, 1.0, "start", [])
     with pytest.raises(Exception, match=r"(?i)foreign key"):
-        record(database, got.lease, good(ids[0]), history=[bad])
+        record_outcomes(database, got.lease, good(ids[0]), history=[bad])
     assert {run.state for run in runs_of(database, got.job.id)} == {JobState.QUEUED}
     assert job_of(database, got.job.id).n_done == 0
 
@@ -202,7 +199,7 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
     migrants = [MigrantPoint(run_id, 0, 1, 0, 1, 0.5)]
     with database.write_session() as session:
         RunWriter(session, got.lease).append_history(points[:4], migrants)
-    record(database, got.lease, good(run_id), history=points, migrants=migrants)
+    record_outcomes(database, got.lease, good(run_id), history=points, migrants=migrants)
     with database.read_session() as session:
         history = RunRepository(session).read_history(run_id)
         log = RunRepository(session).read_migrations(run_id)
@@ -220,7 +217,7 @@ def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
         RunWriter(session, got.lease).save_checkpoints([(a, 10, b"\x00old"), (b, 10, b"b")])
         RunWriter(session, got.lease).save_checkpoints([(a, 20, b"\x00new")])
         assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new", b: b"b"}
-    record(database, got.lease, good(b))
+    record_outcomes(database, got.lease, good(b))
     with database.write_session() as session:
         assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new"}
 
@@ -253,7 +250,9 @@ def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_
 ):
     got, ids = claimed(database, n_runs=7)
     values = [0.3, 0.1, 0.3, None, 0.2, None, 0.3]
-    record(database, got.lease, *(good(i, rms) for i, rms in zip(ids, values, strict=True)))
+    record_outcomes(
+        database, got.lease, *(good(i, rms) for i, rms in zip(ids, values, strict=True))
+    )
     seen, cursor = [], None
     while True:
         with database.read_session() as session:
@@ -315,13 +314,13 @@ def test_a_document_that_not_every_database_can_keep_is_refused(database, value)
         run_id=run_id, state=JobState.SUCCEEDED, result={"parameters": [], "note": [value]}
     )
     with pytest.raises(UnstorableValue):
-        record(database, got.lease, bad)
+        record_outcomes(database, got.lease, bad)
 
 
 def test_text_that_only_looks_like_an_escape_is_kept(database):
     got, (run_id,) = claimed(database)
     text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
-    record(
+    record_outcomes(
         database,
         got.lease,
         RunOutcome(

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 from service.core.states import JobState
-from service.queue.run_writes import RunOutcome, RunWriter
+from service.queue.run_writes import RunOutcome
 from service.trends.schemas import TrendOut
 from service.trends.trend import compute_trend
 from sysid.trends.trend import compute_drift_limit
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
+from tests.stored import record_outcomes
 
 LENGTHS = (1.0, 2.0, 4.0)
 
@@ -90,8 +91,7 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
     lease = claim_job(place.database, job)
     first, failed, _ = (run.id for run in place.runs(job))
     write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
-    with place.database.write_session() as session:
-        outcome = RunOutcome(run_id=failed, state=JobState.FAILED, error="diverged")
-        RunWriter(session, lease).record_outcomes([outcome])
+    outcome = RunOutcome(run_id=failed, state=JobState.FAILED, error="diverged")
+    record_outcomes(place.database, lease, outcome)
     found = trend(place, job)
     assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])

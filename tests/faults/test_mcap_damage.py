@@ -27,6 +27,7 @@ from service.formats.mcap_messages import build_schema
 from service.formats.mcap_writer import MCAP_MAGIC
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
+from tests.profiles import scale_examples
 
 TIMES = np.arange(50) * 0.1
 OURS = recorded(Recording((Channel("u", TIMES, np.sin(TIMES)), Channel("y", TIMES, TIMES**2))))
@@ -353,7 +354,7 @@ def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> N
 
 @pytest.mark.parametrize("content", FILES)
 @given(data=st.data())
-@settings(max_examples=150)
+@settings(max_examples=scale_examples(150))
 def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
     whole, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
     damaged = bytearray(content)
@@ -380,7 +381,7 @@ def is_read_whole_or_refused(content: bytes) -> bool:
 
 
 @given(st.binary(max_size=400), st.sampled_from(FILES), st.data())
-@settings(max_examples=150)
+@settings(max_examples=scale_examples(150))
 def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
     junk: bytes, content: bytes, data: st.DataObject
 ) -> None:
@@ -390,7 +391,7 @@ def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=80)), max_size=8))
-@settings(max_examples=200)
+@settings(max_examples=scale_examples(200))
 def test_records_of_any_content_are_read_or_refused(records: list[tuple[int, bytes]]) -> None:
     raw = [struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records]
     for content in (

@@ -15,13 +15,13 @@ from service.api.app import create_app
 from service.cli import runs
 from service.client.client import Client
 from service.formats.mcap import read_recording
+from tests.catalogue_cases import ACTUATOR
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import recording, refused, settings_of, store_csv
 
 SMALL = {"population": 16, "generations": 25, "islands": 1}
-ARM = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3}
-NEAR = {name: {"lower": 0.9 * value, "upper": 1.1 * value} for name, value in ARM.items()}
+NEAR = {name: {"lower": 0.9 * value, "upper": 1.1 * value} for name, value in ACTUATOR.items()}
 STEP = {"kind": "step", "amplitude": pi / 2}
 TUBE = {"time_constant": 0.35, "delay": 0.127}
 CONTROL = {
@@ -55,7 +55,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "/v1/datasets:simulate",
             json={
                 "model": "actuator",
-                "parameters": ARM,
+                "parameters": ACTUATOR,
                 "samples": 600,
                 "sample_time": 0.01,
                 "inputs": {"P_a": {"kind": "expression", "expression": pressure}},

@@ -18,18 +18,10 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
+from tests.catalogue_cases import ARM
+from tests.models import ARX
 
-ACTUATOR = {
-    "J": 3.6e-4,
-    "F_c": 1.2317e-2,
-    "F_max": 3.3333e-2,
-    "k_a": 83.089,
-    "k_c": 456.99e3,
-    "A_m": 5.0e-6,
-    "B": 1.0e-3,
-    "theta_s": 0.75 * pi,
-    "theta(0)": 0.0,
-}
+ACTUATOR = ARM | {"theta_s": 0.75 * pi, "theta(0)": 0.0}
 TUBE = Transport(1.0, 0.35, 0.127)
 TIMES: FloatArray = 0.01 * np.arange(601.0)
 
@@ -213,20 +205,9 @@ def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:
 
 
 def test_a_polynomial_can_be_controlled() -> None:
-    narx = parse_model(
-        {
-            "name": "n",
-            "form": "polynomial",
-            "output": "y",
-            "inputs": {"u": "V"},
-            "degree": 1,
-            "lags": {"y": [1], "u": [1]},
-            "coefficients": {"lower": -2, "upper": 2},
-            "initial": {"y": 0},
-        }
-    )
-    loop = close_loop(narx, PidControl("u", "y", 2.0))
-    names = [parameter.name for parameter in narx.parameters]
+    arx = parse_model(ARX)
+    loop = close_loop(arx, PidControl("u", "y", 2.0))
+    names = [parameter.name for parameter in arx.parameters]
     values = loop.rename_values(dict(zip(names, (0.8, 0.1), strict=True)))
     found = simulate(loop.model, [stepped(1.0, "1")], values, times=TIMES).channel("y").values
     assert found[-1] == pytest.approx(0.2 / (1 - 0.8 + 0.2), rel=1e-9)

@@ -13,6 +13,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
+from tests import catalogue_cases
 
 STEP = 0.05
 
@@ -217,16 +218,7 @@ def test_a_fixed_parameter_is_no_part_of_a_scaling() -> None:
     assert find_scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
 
 
-ACTUATOR = {
-    "J": 3.6e-4,
-    "F_c": 1.2317e-2,
-    "F_max": 3.3333e-2,
-    "k_a": 83.089,
-    "k_b": 83.089,
-    "k_c": 456.99e3,
-    "A_m": 5.0e-6,
-    "B": 1.0e-3,
-}
+ACTUATOR = catalogue_cases.ARM | {"k_b": catalogue_cases.ARM["k_a"]}
 FREE = {
     "k_b": {"lower": 5, "upper": 500},
     "A_m": {"lower": 1e-7, "upper": 1e-3},

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.traps import CHATTER
 from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
 from sysid.core.settings import SearchMethod
 from sysid.core.types import FloatArray
@@ -31,21 +32,6 @@ from tests import searching
 STEP, GAIN, TIME, LAG, PERIOD = 0.2, 2.0, 1.5, 1.33, 5.0
 FINE = 40
 NOISE = 0.02
-
-REGENERATIVE = {
-    "name": "regenerative",
-    "form": "differential",
-    "inputs": {"f": "N"},
-    "states": {"x": "m", "v": "m/s"},
-    "parameters": {
-        "w": {"lower": 1, "upper": 60, "unit": "rad/s"},
-        "k": {"lower": 0, "upper": 60, "unit": "1/s^2"},
-        "tau": {"lower": 0, "upper": 9, "unit": "s"},
-    },
-    "equations": {"x": "v", "v": "f - 0.1*w*v - w**2*x - k*(x - x(t - tau))"},
-    "outputs": {"y": "x"},
-    "initial": {"x": 0, "v": 0},
-}
 
 
 def lag_model() -> Model:
@@ -105,16 +91,17 @@ def reason(found: Identification, name: str) -> str:
 
 
 def regenerate() -> tuple[Problem, FloatArray]:
-    """A noisy record of the regenerative model, and the truth."""
-    model = parse_model(REGENERATIVE)
+    """A noisy record of the model of chatter, and the truth."""
+    model = parse_model(CHATTER)
+    near = {"ze": {"fixed": 0.05}, "om": {"upper": 60}, "kc": {"upper": 60}, "tau": {"upper": 9}}
     times = np.arange(400) * 0.05
     force = np.where((times % 7 < 0.5), 20.0, 0.0)
-    clean = Record((Channel("f", times, force, "N"),), (Channel("y", times, 0 * times, "m"),))
+    clean = Record((Channel("u", times, force, "N"),), (Channel("y", times, 0 * times, "m"),))
     truth = np.array([6.0, 8.0, 1.9])
-    blank = Problem.build(model, [clean])
-    y = blank.predict(truth[None])[0]
+    y = Problem.build(model, [clean], parameters=near).predict(truth[None])[0]
     y = y + 0.02 * np.std(y) * np.random.default_rng(2).standard_normal(y.size)
-    return Problem.build(model, [Record(clean.inputs, (Channel("y", times, y, "m"),))]), truth
+    measured = Record(clean.inputs, (Channel("y", times, y, "m"),))
+    return Problem.build(model, [measured], parameters=near), truth
 
 
 def test_a_scan_of_the_lag_leads_out_of_a_false_minimum() -> None:

@@ -16,6 +16,7 @@ from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from tests import reference
+from tests.models import ARX
 
 TIMES = 0.1 * np.arange(120)
 NAMES = ("K", "T", "L", "a", "b", "g")
@@ -165,18 +166,7 @@ def test_what_has_no_rest_and_what_is_no_start_is_refused(
 
 
 def test_a_polynomial_of_first_degree_may_start_steady() -> None:
-    model = parse_model(
-        {
-            "name": "arx",
-            "form": "polynomial",
-            "output": "y",
-            "inputs": {"u": "V"},
-            "degree": 1,
-            "lags": {"y": [1], "u": [1]},
-            "coefficients": {"lower": -2, "upper": 2},
-            "initial": "steady",
-        }
-    )
+    model = parse_model(ARX | {"initial": "steady"})
     values = {"a[y(k-1)]": 0.8, "a[u(k-1)]": 0.5}
     y = simulate(model, channels(1.0, 0.0), values, times=TIMES).channels[0].values
     np.testing.assert_allclose(y, 2.5, rtol=1e-12)

@@ -12,17 +12,9 @@ from sysid.models.catalogue.load import copy_catalogue_document, load_model
 from sysid.models.parse import parse_model
 from sysid.plants.actuator import Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
+from tests.catalogue_cases import ARM
 
-PUBLISHED = {
-    "J": 3.6e-4,
-    "F_c": 1.2317e-2,
-    "F_max": 3.3333e-2,
-    "k_a": 83.089,
-    "k_c": 456.99e3,
-    "A_m": 5.0e-6,
-    "B": 1.0e-3,
-    "theta_s": 0.75 * pi,
-}
+PUBLISHED = ARM | {"theta_s": 0.75 * pi}
 KNOWN_SPREAD = {"J": 3e-3, "F_c": 1.5e-3, "F_max": 1.5e-3, "k_a": 5e-3, "k_c": 6e-3}
 TIMES = 0.01 * np.arange(800)
 

@@ -16,21 +16,12 @@ from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.intervals import LocalStatistics, make_estimates
 from sysid.uncertainty.profile_likelihood import compute_profile
+from tests.models import LINE
 from tests.searching import example
 
 N = 14
 TIMES = 0.1 * np.arange(N)
 INPUT = np.sin(1.3 * np.arange(N)) + 0.1 * np.arange(N)
-LINE = {
-    "name": "line",
-    "form": "differential",
-    "inputs": {"u": "1"},
-    "states": {"x": "1"},
-    "parameters": {"a": {"lower": 0.1, "upper": 10}, "b": {"lower": -5, "upper": 5}},
-    "equations": {"x": "-x"},
-    "outputs": {"y": "a*u(t) + b + x"},
-    "initial": {"x": 0},
-}
 COLUMNS = np.column_stack([INPUT, np.ones(N)])
 
 
@@ -176,7 +167,7 @@ def test_the_correlation_of_sensitivities_is_that_of_white_residuals() -> None:
 def test_a_tied_parameter_has_the_widest_quantile_of_what_it_is_tied_to(
     tie: str, quantile: float
 ) -> None:
-    parameters = {**LINE["parameters"], "c": {"lower": -20, "upper": 20}}  # type: ignore[dict-item]
+    parameters = {**LINE["parameters"], "c": {"lower": -20, "upper": 20}}
     model = parse_model({**LINE, "parameters": parameters, "outputs": {"y": "a*u(t) + b + x + c"}})
     record = Record((Channel("u", TIMES, INPUT),), (Channel("y", TIMES, measured()),))
     problem = Problem.build(model, [record], parameters={"c": {"tied": tie}})

@@ -9,20 +9,11 @@ from sysid.data.records import Channel, Record
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.cramer_rao import cramer_rao_bound
+from tests.models import LINE
 from tests.profiles import draw_seeds
 
 TIMES = np.arange(200) * 0.1
 INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES
-LINE = {
-    "name": "line",
-    "form": "differential",
-    "inputs": {"u": "1"},
-    "states": {"x": "1"},
-    "parameters": {"a": {"lower": 0.1, "upper": 10}, "b": {"lower": -5, "upper": 5}},
-    "equations": {"x": "-x"},
-    "outputs": {"y": "a*u(t) + b + x"},
-    "initial": {"x": 0},
-}
 
 
 def problem(document=LINE, skip=0, **options):
