@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO, StringIO, TextIOWrapper
 from itertools import chain, islice
-from math import floor, isfinite, log10
+from math import floor, isfinite, log10, nan
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -303,7 +303,7 @@ def generate_csv(recording: Recording) -> Iterator[str]:
     """Generate CSV text in blocks: time in s, label columns of segments, one column per channel.
 
     Within a segment the times are those of the segment. So an upload with ``?segments=`` and the
-    label columns gives the same recording. Channels with different times have separate rows.
+    label columns gives the same recording. A cell is empty where its channel has no sample.
     """
     labels = sorted({name for segment in recording.segments for name in segment.labels})
     buffer = StringIO()
@@ -328,7 +328,10 @@ def _iterate_rows(recording: Recording, labels: list[str]) -> Iterator[list[str]
 
 
 def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
-    """Yield times in order, with the values of all channels; a missing value is empty."""
+    """Yield times in order, with the values of all channels; a missing value is empty.
+
+    A time has one row, or as many as one channel has values at it.
+    """
     groups: list[list[int]] = []
     channels = recording.channels
     for index, channel in enumerate(channels):
@@ -343,20 +346,18 @@ def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
         [np.full(channels[group[0]].times.size, number) for number, group in enumerate(groups)]
     )
     index_in_group = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
+    time, row, written = nan, [""] * len(channels), set[int]()
     for index in np.argsort(times, kind="stable").tolist():
-        yield (
-            float(times[index]),
-            _format_values(
-                channels, groups[int(group_of_sample[index])], int(index_in_group[index])
-            ),
-        )
-
-
-def _format_values(channels: tuple[Channel, ...], members: list[int], sample: int) -> list[str]:
-    row = [""] * len(channels)
-    for index in members:
-        row[index] = _format_value(float(channels[index].values[sample]))
-    return row
+        number = int(group_of_sample[index])
+        if written and (time != times[index] or number in written):
+            yield time, row
+            row, written = [""] * len(channels), set()
+        time = float(times[index])
+        written.add(number)
+        for member in groups[number]:
+            row[member] = _format_value(float(channels[member].values[index_in_group[index]]))
+    if written:
+        yield time, row
 
 
 def _format_value(value: float | str) -> str:

@@ -246,5 +246,29 @@ def test_channels_with_other_times_are_written_in_rows_of_their_own() -> None:
     ]
 
 
+def test_a_time_of_several_channels_has_one_row_and_is_read_back() -> None:
+    slow = Channel("u", np.array([0.0, 0.2, 0.4]), np.array([1.0, 2.0, 3.0]), "V")
+    fast = Channel("y", np.array([0.0, 0.1, 0.2]), np.array([0.1, 0.2, 0.3]))
+    text = "".join(generate_csv(Recording((slow, fast))))
+    assert text.splitlines() == [
+        "t,u [V],y",
+        "0.0,1.0,0.1",
+        "0.1,,0.2",
+        "0.2,2.0,0.3",
+        "0.4,3.0,",
+    ]
+    back, _ = read_csv(text.encode())
+    values = [back.channel(name).values for name in ("u", "y")]
+    np.testing.assert_array_equal(values[0], [1.0, np.nan, 2.0, 3.0])
+    np.testing.assert_array_equal(values[1], [0.1, 0.2, 0.3, np.nan])
+
+
+def test_a_channel_with_several_values_at_a_time_has_a_row_for_each() -> None:
+    once = Channel("u", np.array([0.0, 0.1]), np.array([1.0, 2.0]))
+    pooled = Channel("y", np.array([0.0, 0.1, 0.1]), np.array([5.0, 6.0, 7.0]))
+    text = "".join(generate_csv(Recording((once, pooled))))
+    assert text.splitlines() == ["t,u,y", "0.0,1.0,5.0", "0.1,2.0,6.0", "0.1,,7.0"]
+
+
 def test_a_stray_quote_is_told_with_its_row() -> None:
     assert refused('t,u\n0,1\n1,2\n2,"3"x\n').row == 4
