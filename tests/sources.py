@@ -22,9 +22,13 @@ class NamedLine(NamedTuple):
 
 
 class ModuleFacts(NamedTuple):
-    """Functions and classes of a module, and its texts that a person may read."""
+    """Functions and classes of a module, and its texts that a person may read.
+
+    Properties are values, and no functions.
+    """
 
     functions: tuple[NamedLine, ...]
+    properties: tuple[NamedLine, ...]
     classes: tuple[NamedLine, ...]
     messages: tuple[NamedLine, ...]
 
@@ -38,13 +42,22 @@ def list_modules(parts: Iterable[str]) -> list[Path]:
 def read_facts(path: Path) -> ModuleFacts:
     """Parse a module, once for all rules."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
-    functions = (ast.FunctionDef, ast.AsyncFunctionDef)
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    functions = [node for node in nodes if isinstance(node, kinds)]
     return ModuleFacts(
-        tuple(NamedLine(node.name, node.lineno) for node in nodes if isinstance(node, functions)),
+        tuple(NamedLine(node.name, node.lineno) for node in functions if not _is_property(node)),
+        tuple(NamedLine(node.name, node.lineno) for node in functions if _is_property(node)),
         tuple(
             NamedLine(node.name, node.lineno) for node in nodes if isinstance(node, ast.ClassDef)
         ),
         tuple(_find_messages(nodes)),
+    )
+
+
+def _is_property(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(
+        isinstance(mark, ast.Name) and mark.id in ("property", "cached_property")
+        for mark in node.decorator_list
     )
 
 

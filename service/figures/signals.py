@@ -133,7 +133,7 @@ def _output_traces(
             "name": "measured",
             "x": to_json_numbers(times[shown]),
             "y": to_json_numbers(values[shown]),
-            **_measured_style(times, shown.size),
+            **_choose_measured_style(times, shown.size),
             "hovertemplate": "%{y:.6g}<extra>measured</extra>",
         },
         {
@@ -148,7 +148,7 @@ def _output_traces(
     ]
 
 
-def _measured_style(times: Floats, drawn: int) -> dict[str, Any]:
+def _choose_measured_style(times: Floats, drawn: int) -> dict[str, Any]:
     """Choose points if single samples are distinguishable or share a time, else a line."""
     pooled = bool(np.any(np.diff(times) <= 0))
     if pooled or drawn <= 400:

@@ -75,10 +75,10 @@ def loop_body(parameters: Mapping[str, float]) -> dict[str, Any]:
 def build_sections(bench: StudyBench) -> list[Section]:
     """Build the corrected reading with its closed loop, then the equations as printed."""
     record = bench.client.simulate_dataset(record_body())["id"]
-    return [_corrected_section(bench, record), _printed_section(bench, record)]
+    return [_build_corrected_section(bench, record), _build_printed_section(bench, record)]
 
 
-def _corrected_section(bench: StudyBench, record: str) -> Section:
+def _build_corrected_section(bench: StudyBench, record: str) -> Section:
     runs = bench.compare_methods(job_body(record, {}, "k_b = k_a"))
     steps = {
         method: bench.client.simulate_run(run.run["id"], loop_body({}))
@@ -99,7 +99,7 @@ def _corrected_section(bench: StudyBench, record: str) -> Section:
     )
 
 
-def _printed_section(bench: StudyBench, record: str) -> Section:
+def _build_printed_section(bench: StudyBench, record: str) -> Section:
     runs = bench.compare_methods(job_body(record, SEPARATE_K_B, "as printed, k_b by itself"))
     groups = runs["improved"].run["identifiability"]["groups"]
     combinations = "; ".join(

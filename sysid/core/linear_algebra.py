@@ -19,7 +19,7 @@ class TruncatedSvd(NamedTuple):
     retained: BoolArray
 
 
-def truncated_svd(columns: FloatArray) -> TruncatedSvd:
+def compute_truncated_svd(columns: FloatArray) -> TruncatedSvd:
     """Decompose columns (N, D) and mark the singular values above rounding."""
     left, singular, rows = np.linalg.svd(columns, full_matrices=False)
     return TruncatedSvd(

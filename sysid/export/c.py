@@ -18,7 +18,7 @@ from sysid.export.program import (
     LoopScope,
     equation,
     indent_lines,
-    needed_helpers,
+    list_needed_helpers,
     time_loop,
     write_delay_steps,
 )
@@ -131,7 +131,9 @@ def write_c_source(identified: IdentifiedModel) -> str:
         "free(work);",
         "return 0;",
     ]
-    helpers = needed_helpers(HELPERS, program.helper_names | language.called_functions, identified)
+    helpers = list_needed_helpers(
+        HELPERS, program.helper_names | language.called_functions, identified
+    )
     parts = [
         _write_header(identified, stem),
         "#include <math.h>\n#include <stdlib.h>\n",

@@ -386,7 +386,7 @@ def indent_lines(lines: Sequence[str], levels: int = 1) -> list[str]:
     return [textwrap.indent(line, "    " * levels) for line in lines]
 
 
-def needed_helpers(
+def list_needed_helpers(
     helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
 ) -> list[str]:
     """List the texts of used helpers and those they call, each before its caller."""
@@ -395,11 +395,11 @@ def needed_helpers(
         wanted.add("past")
     if "past" in wanted:
         wanted.add("sample")
-    variants = _variants_of(identified)
+    variants = _find_variants(identified)
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 
 
-def _variants_of(identified: IdentifiedModel) -> Mapping[str, str]:
+def _find_variants(identified: IdentifiedModel) -> Mapping[str, str]:
     """Find the helpers with a variant for the solver of the model."""
     solver = identified.model.solver
     variants = {"past": "past cubic"} if solver.interpolation == "cubic" else {}

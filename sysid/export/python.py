@@ -17,7 +17,7 @@ from sysid.export.program import (
     LoopScope,
     equation,
     indent_lines,
-    needed_helpers,
+    list_needed_helpers,
     time_loop,
     write_delay_steps,
 )
@@ -116,7 +116,7 @@ def write_python_source(identified: IdentifiedModel) -> str:
         *_write_delays(program),
         *_write_starts(program),
     ]
-    helpers = needed_helpers(HELPERS, program.helper_names, identified)
+    helpers = list_needed_helpers(HELPERS, program.helper_names, identified)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indent_lines(loop)
     parts = [

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from sysid.core.errors import InvalidModel
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.models.model import EstimatedInitial, FixedInitial, Model, name_initial_state
@@ -101,7 +101,7 @@ def _predict_starts(
         error, columns = sensitivities.residuals, sensitivities.columns
     else:
         error, columns = analysis.residuals_and_sensitivities
-    left, _, _, retained = truncated_svd(columns)
+    left, _, _, retained = compute_truncated_svd(columns)
     basis = left[:, retained]
     rest = error - basis @ (basis.T @ error)
     loss = float(rest @ rest)

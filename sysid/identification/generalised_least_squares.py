@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import irfft, rfft
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import space_residuals
 from sysid.residuals.coloured import ResidualPart, is_coloured, iterate_parts
@@ -206,7 +206,7 @@ def _factor_output_covariance(
 ) -> FloatArray:
     """Compute L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
     whitened, residuals = whitening.whiten(columns.T).T, whitening.whiten(error)
-    _, singular, rows, retained = truncated_svd(whitened)
+    _, singular, rows, retained = compute_truncated_svd(whitened)
     deviation = np.sqrt(float(residuals @ residuals) / max(error.size - columns.shape[1], 1))
     return np.asarray(deviation * columns @ (rows[retained].T / singular[retained]))
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from sysid.core.errors import InvalidRecord
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray, Interval
 from sysid.data.records import Channel, Record
 from sysid.identification.minima import Fit, collect_minima, scan_parameters
@@ -298,7 +298,7 @@ def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> li
 def compute_variances(columns: FloatArray) -> FloatArray:
     """Compute the diagonal of (SᵀS)⁻¹, (D,); inf for parameters that these rows leave open."""
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
-    _, singular, rows, retained = truncated_svd(triangle)
+    _, singular, rows, retained = compute_truncated_svd(triangle)
     variances: FloatArray = np.sum((rows[retained].T / singular[retained]) ** 2, axis=1)
     is_open = np.max(np.abs(rows[~retained]), axis=0, initial=0.0) > RANK_TOLERANCE
     return np.where(is_open, np.inf, variances)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, expit
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
 
@@ -83,7 +83,7 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
     from scipy.optimize import minimize  # imported late, as below: slow to load, rarely needed
 
     values = spaced.values[spaced.present]
-    left_vectors, _, _, is_independent = truncated_svd(columns)
+    left_vectors, _, _, is_independent = compute_truncated_svd(columns)
     basis = left_vectors[:, is_independent]
     series = _ObservedSeries(values, basis, np.diff(np.flatnonzero(spaced.present)))
     if values.size <= basis.shape[1] + 2:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
 from sysid.identifiability.bound_limits import find_widest_bounds
@@ -172,7 +172,7 @@ def _analyse_sensitivities(
     shifts, spent = find_translations(problem, theta, columns, scale, left)
     count += spent
     columns, n_symmetries = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
-    _, singular, rows, retained = truncated_svd(columns)
+    _, singular, rows, retained = compute_truncated_svd(columns)
     retained[d - n_symmetries :] = False
     inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
     colour = estimate_joint_covariance(problem, influence, columns)
@@ -332,7 +332,7 @@ def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: Fl
     is_held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
     if total == 0.0 or is_held.all():
         return 0.0
-    left, _, _, retained = truncated_svd(columns[:, ~is_held])
+    left, _, _, retained = compute_truncated_svd(columns[:, ~is_held])
     return float(np.sum((left[:, retained].T @ influence) ** 2)) / total
 
 

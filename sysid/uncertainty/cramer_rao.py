@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import NULL_SHARE
 from sysid.identifiability.scaling import find_scalings
@@ -74,7 +74,7 @@ def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
     n, d = columns.shape
     # Rows of zeros make the directions complete where there are fewer samples than parameters.
     square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
-    _, singular, rows, retained = truncated_svd(square)
+    _, singular, rows, retained = compute_truncated_svd(square)
     retained[d - n_symmetries :] = False
     variance = np.sum((rows[retained] / singular[retained, None]) ** 2, axis=0)
     is_undetermined = np.any(rows[~retained] ** 2 > NULL_SHARE, axis=0) | sensitivities.one_sided

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray
 from sysid.simulation.scaling import is_at_bounds
 
@@ -119,5 +119,5 @@ def linearise_outputs(
 def _remove_parameters(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Remove the parameters held from (SᵀS)⁻¹ and its root."""
     root = np.where(held, 0.0, root)
-    _, singular, rows, retained = truncated_svd(root)
+    _, singular, rows, retained = compute_truncated_svd(root)
     return (rows[retained].T / singular[retained] ** 2) @ rows[retained], root
