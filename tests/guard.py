@@ -60,7 +60,11 @@ class Guard:
         self._send_line(str(folder))
 
     def end_session(self) -> None:
-        """End every process of the session but this one, and remove its folder."""
+        """End every process of the session but this one.
+
+        Its folder is removed when this one has ended. Finalizers of `multiprocessing` run until
+        then, and remove what they have there.
+        """
         self._send_line("")
         assert self._process.stdout is not None
         self._process.stdout.readline()
@@ -81,16 +85,19 @@ def _make_folder() -> Path:
 
 
 def guard_session(pytest: int, session: str) -> None:
-    """Clear a session when pytest asks for it, and again when pytest has ended."""
+    """End the processes of a session when pytest asks for it; clear it when pytest has ended."""
     folders = [session]
     for line in read_until_death(pytest):
         if line:
             folders.append(line)
             continue
         folders = [session]  # pytest keeps its own after an orderly end
-        clear_session(session, folders, spared=pytest)
-        os.write(1, b"\n")
-    clear_session(session, folders, spared=pytest)
+        end_processes(session, spared=pytest)
+        with contextlib.suppress(BrokenPipeError):  # pytest has been killed while it waited
+            os.write(1, b"\n")
+    end_processes(session, spared=pytest)
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def read_until_death(pytest: int) -> Iterator[str]:
@@ -107,18 +114,11 @@ def read_until_death(pytest: int) -> Iterator[str]:
             return  # a forked child holds the other end
 
 
-def clear_session(session: str, folders: list[str], spared: int) -> None:
-    """End the processes of a session but one, and remove folders."""
-    end_processes(session, spared)
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def end_processes(session: str, spared: int) -> None:
-    """Kill the processes of a session until none is found."""
+    """Kill the processes of a session until none is found but one, and its tracker."""
     begun = time.monotonic()
     while (elapsed := time.monotonic() - begun) < END_SECONDS:
-        found = [one for one in find_processes(session) if one.pid != spared]
+        found = [one for one in find_processes(session) if not _ends_with(one, spared)]
         if not found:
             return
         for process in found:
@@ -128,21 +128,31 @@ def end_processes(session: str, spared: int) -> None:
         time.sleep(0.05)
 
 
+def _ends_with(process: psutil.Process, spared: int) -> bool:
+    """Whether it is the spared process, or its tracker of semaphores, which ends behind it."""
+    with contextlib.suppress(psutil.Error):
+        return process.pid == spared or (process.ppid() == spared and _is_tracker(process))
+    return False
+
+
 def choose_signal(process: psutil.Process) -> int:
     """Choose the signal that ends a process; 0 if it ends by itself after others.
 
     PostgreSQL and Python's tracker of semaphores remove shared memory when they end in order.
     """
     try:
-        command = process.cmdline()
         parent = process.parent()
-        if _is_postmaster(command):
+        if _is_postmaster(process.cmdline()):
             return signal.SIGQUIT
-        if _is_postmaster(parent.cmdline() if parent else []):
+        if _is_tracker(process) or _is_postmaster(parent.cmdline() if parent else []):
             return 0
     except psutil.Error:
         return 0
-    return 0 if any("resource_tracker" in word for word in command) else signal.SIGKILL
+    return signal.SIGKILL
+
+
+def _is_tracker(process: psutil.Process) -> bool:
+    return any("resource_tracker" in word for word in process.cmdline())
 
 
 def _is_postmaster(command: list[str]) -> bool:
