@@ -116,7 +116,7 @@ class BestEstimate:
     analysis: Analysis
 
     @property
-    def fitted(self) -> IslandEnd:
+    def lowest_end(self) -> IslandEnd:
         """The best end of least squares, before a noise model."""
         return min(self.ends, key=lambda end: end.rms)
 

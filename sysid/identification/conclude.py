@@ -104,7 +104,7 @@ def _build_identification(
     holds = list_input_holds(problem)
     if is_refining(algorithm, len(best.ends)):
         left, late = budget.count_left(), deadline.is_past_grace
-        holds, spent = refit_other_holds(problem, holds, theta, best.fitted.theta, left, late)
+        holds, spent = refit_other_holds(problem, holds, theta, best.lowest_end.theta, left, late)
         budget.spend(spent)
     return Identification(
         estimates=analysis.estimates,
@@ -128,7 +128,7 @@ def _build_identification(
             *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
             *found.warnings,
             *warn_unsettled(evidence),
-            *describe_input_holds(problem, holds, analysis.estimates, best.fitted.rms),
+            *describe_input_holds(problem, holds, analysis.estimates, best.lowest_end.rms),
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
