@@ -33,6 +33,7 @@ from sysid.uncertainty.likelihood import Likelihood, LikelihoodModel
 _RANDOM_STREAM = 2**63 + 1
 _MIN_WALKERS, _WALKERS_PER_PARAMETER, _LANES = 32, 4, 16  # half of the lanes move at once
 _MOVE_SHARES = (0.8, 0.1, 0.1)  # differences, differences of full length, stretches
+_SHARES_OF_MINIMA = (0.5, 0.4, 0.1)  # the same if several minima are known
 _MAX_SPREAD = 0.3  # of the range: standard deviation of the starts, nearly that of a uniform law
 _MAX_DROP = 10.0  # and one for each parameter: logarithm by which a start may be less likely
 _MAX_SHRINKS = 20  # halvings of the distance of a start that is much too unlikely
@@ -147,11 +148,12 @@ class _Sampler:
         from emcee.moves import DEMove, StretchMove
 
         moves = (DEMove(), DEMove(gamma0=1.0), StretchMove())
+        shares = _MOVE_SHARES if len(self._centres) == 1 else _SHARES_OF_MINIMA
         self._ensemble = EnsembleSampler(
             self._walkers,
             self._centres.shape[1],
             self._compute_logarithms,
-            moves=list(zip(moves, _MOVE_SHARES, strict=True)),
+            moves=list(zip(moves, shares, strict=True)),
             vectorize=True,
         )
         places, logarithms = self._make_starts()
