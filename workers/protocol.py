@@ -85,6 +85,8 @@ class RunSpec:
     algorithm: GeneticAlgorithm
     seed: int = 1
     warm_starts: WarmStartValues = ()
+    posterior: bool = False
+    """Whether the posterior is sampled."""
 
     @property
     def reuse_key(self) -> str | None:
@@ -96,6 +98,7 @@ class RunSpec:
             repr(self.algorithm),
             self.seed,
             [*map(dict, self.warm_starts)],
+            self.posterior,
         )
         fingerprint = compute_fingerprint(
             Path(__file__).parent

@@ -103,7 +103,9 @@ def _advance_item(
         return RunProgress(state)
     noise_free = _load_noise_free_records(item.spec.problem, records)
     try:
-        identification = conclude_run(problem, algorithm, state, validation)
+        identification = conclude_run(
+            problem, algorithm, state, validation, posterior=item.spec.posterior
+        )
     except SysidError as error:
         return RunFailure(str(error), type(error).__name__, state.evaluations)
     rms_noise_free = (

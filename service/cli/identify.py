@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from sysid.identification.result import Identification
     from sysid.models.model import Model
     from sysid.residuals.residual_tests import ResidualTests
+    from sysid.uncertainty.estimates import Posterior
 
 
 # Fields of a job body that need a server, and what to use instead.
@@ -94,6 +95,10 @@ def identify(
             "auto (default): ar1 if residuals are autocorrelated and the model integrates.",
         ),
     ] = None,
+    posterior: Annotated[
+        bool,
+        typer.Option("--posterior", help="Sample the posterior distribution; takes seconds."),
+    ] = False,
     segments: Segments = None,
     sample_time: SampleTime = None,
     json_file: Annotated[
@@ -104,6 +109,8 @@ def identify(
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
+    if posterior:
+        changes.append("posterior=true")
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = CsvOptions(sample_time, tuple(split_names(segments)))
@@ -278,8 +285,28 @@ def print_result(
         )
     if result.residual_tests is not None and result.residual_tests.passed is not None:
         out.print(_residual_verdict(result.residual_tests), markup=False, soft_wrap=True)
+    _print_posterior(result.posterior)
     for warning in result.warnings:
         err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
+
+
+def _print_posterior(posterior: "Posterior | None") -> None:
+    if posterior is None or not posterior.parameters:
+        return
+    print_table(
+        ("posterior", ">median", ">95 % interval", "unit", ">effective samples"),
+        (
+            (
+                parameter.name,
+                f"{parameter.median:.6g}",
+                " … ".join(f"{end:.6g}" for end in parameter.interval95),
+                parameter.unit,
+                f"{parameter.effective_samples:.0f}",
+            )
+            for parameter in posterior.parameters
+        ),
+        empty="no parameters",
+    )
 
 
 def _residual_verdict(tests: "ResidualTests") -> str:
@@ -355,6 +382,7 @@ def _run_identification(
             loss=to_loss(document["loss"]),
             weights=body.weights,
             skip=body.skip,
+            posterior=body.posterior,
             validation=validation_records or None,
             validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,

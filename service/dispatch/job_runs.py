@@ -166,7 +166,13 @@ class JobRuns:
             settings=fit_settings_of(body),
             noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
         )
-        return RunSpec(problem, to_algorithm(body["algorithm"]), int(body["seed"]), warm)
+        return RunSpec(
+            problem,
+            to_algorithm(body["algorithm"]),
+            int(body["seed"]),
+            warm,
+            posterior=body.get("posterior", False),  # older jobs do not have it
+        )
 
     def load_records(self, key: str) -> Records:
         """Load the records of that key from the object store, or from the cache.

@@ -39,6 +39,24 @@ class FreeParameter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CornerParameter:
+    """A free parameter with its estimate, and samples (n,) of its posterior.
+
+    `interval95` is that of the estimate, `posterior95` has the quantiles of the samples.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    value: float
+    stderr: float | None
+    interval95: Sequence[float] | None
+    posterior95: Sequence[float]
+    samples: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SignalTrace:
     """One signal on its own times (s); `is_held` if it keeps its value until the next sample.
 

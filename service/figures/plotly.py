@@ -195,12 +195,16 @@ def plot_waterfall(run: RunFigureData) -> Figure:
 
 
 def to_csv(figure: Figure) -> str:
-    """Write the drawn numbers as CSV, one per row: series, x, y (and z of a matrix)."""
+    """Write the drawn numbers as CSV, one per row: series, x, y (and z of a matrix).
+
+    Contours are left out: they are drawn from numbers of other series.
+    """
     sink = io.StringIO()
     rows = csv.writer(sink, lineterminator="\n")
-    matrix = any("z" in trace for trace in figure["data"])
+    traces = [trace for trace in figure["data"] if trace["type"] != "contour"]
+    matrix = any("z" in trace for trace in traces)
     rows.writerow(["series", "x", "y", *(["z"] if matrix else [])])
-    for trace in figure["data"]:
+    for trace in traces:
         name = trace.get("name", "")
         if "z" in trace:
             for y, line in zip(trace["y"], trace["z"], strict=True):

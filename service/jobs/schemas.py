@@ -276,6 +276,9 @@ class JobIn(IdentificationIn):
         None
     )
     trend: TrendIn | None = None
+    posterior: bool = Field(
+        default=False, description="sample the posterior distribution of the free parameters"
+    )
 
     def to_normal_form(self) -> dict[str, Any]:
         """Return the body with every default written out, as it is stored and sent to workers."""

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from service.datasets.recordings import load_recording
 from service.figures.data import (
+    CornerParameter,
     ExperimentTraces,
     Floats,
     FreeParameter,
@@ -77,6 +78,29 @@ def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
         ],
         correlation=_to_correlation(stored.result.get("correlation")),
     )
+
+
+def read_corner_parameters(stored: StoredRun) -> tuple[list[CornerParameter], Floats]:
+    """Read the samples of a run's posterior, and the correlation of its estimates (D, D).
+
+    There are none if no posterior was requested, or none could be sampled.
+    """
+    posterior = stored.result.get("posterior") or {}
+    estimates = {estimate["name"]: estimate for estimate in stored.estimates}
+    samples = np.array(posterior.get("samples", ()), dtype=np.float64)
+    parameters = [
+        CornerParameter(
+            **{
+                name: estimates[parameter["name"]][name]
+                for name in ("name", "unit", "lower", "upper", "value", "stderr", "interval95")
+            },
+            posterior95=parameter["interval95"],
+            samples=samples[:, column],
+        )
+        for column, parameter in enumerate(posterior.get("parameters", ()))
+    ]
+    correlation = _to_correlation(stored.result.get("correlation"))
+    return parameters, np.array([] if correlation is None else correlation["matrix"])
 
 
 def _to_correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:

@@ -10,11 +10,13 @@ from service.datasets.rms_unit import find_rms_unit
 from service.figures import plotly, signals
 from service.figures.noise import noise_group_keys, plot_noise_sweep
 from service.figures.plotly import Abscissa, Figure
+from service.figures.posterior import plot_posterior
 from service.figures.theme import Theme
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import load_run
 from service.pages.diagnostics import plot_residual_tests
 from service.pages.figure_data import (
+    read_corner_parameters,
     read_dataset_traces,
     read_run_experiments,
     read_run_figure_data,
@@ -26,7 +28,9 @@ from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.sweeps.summary import summarise_job
 
-FigureName = Literal["history", "convergence", "response", "residuals", "correlation", "waterfall"]
+FigureName = Literal[
+    "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
+]
 
 
 class FigureChoice(BaseModel):
@@ -70,6 +74,8 @@ def load_run_figure(
             return plotly.empty_figure()
         _check_experiment(choice.experiment, len(tested.experiments))
         return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
+    if name == "posterior":
+        return plot_posterior(*read_corner_parameters(stored))
     data = read_run_figure_data(session, stored)
     if name == "history":
         return plotly.plot_history(data, choice.abscissa)

@@ -15,6 +15,7 @@ from service.datasets.rms_unit import find_rms_unit
 from service.figures import signals
 from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
+from service.figures.posterior import posterior_height
 from service.figures.residuals import residuals_height
 from service.jobs.stored_run import StoredRun
 from service.models import models
@@ -225,6 +226,7 @@ def load_full_run(session: Session, stored: StoredRun) -> RunView:
         "correlation": correlation_height(len(names)) if result.get("correlation") else 0,
         "residuals": _residuals_height(result) if run.signals_sha256 else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
+        "posterior": posterior_height(len((result.get("posterior") or {}).get("parameters", ()))),
     }
     return to_run_view(run, stored.rms_unit(session), heights)
 

@@ -20,6 +20,7 @@ from service.datasets.rms_unit import find_rms_unit
 from service.figures import plotly, signals
 from service.figures.embed import strip_template, templates_json, to_script_json
 from service.figures.plotly import Figure
+from service.figures.posterior import plot_posterior
 from service.figures.svg import is_drawable, to_svg
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
@@ -27,7 +28,11 @@ from service.pages import render
 from service.pages.cell_grid import MAX_LISTED_RUNS, GridView, build_cell_grid
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
 from service.pages.diagnostics import plot_residual_tests
-from service.pages.figure_data import read_run_experiments, read_run_figure_data
+from service.pages.figure_data import (
+    read_corner_parameters,
+    read_run_experiments,
+    read_run_figure_data,
+)
 from service.pages.figures import FigureChoice, load_noise_figure
 from service.pages.pages import load_full_run, load_run_row
 from service.pages.render import load_stylesheet, render_template
@@ -251,6 +256,7 @@ def _run_figures(
     titled += [
         ("Convergence of the parameters", plotly.plot_convergence(data)),
         ("Correlation of the estimates", plotly.plot_correlation(data)),
+        ("Posterior", plot_posterior(*read_corner_parameters(stored))),
         ("What each island found", plotly.plot_waterfall(data)),
     ]
     return [

@@ -32,6 +32,17 @@ class EstimateView:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class PosteriorView:
+    """One row of the table of the posterior."""
+
+    name: str
+    unit: str
+    median_text: str
+    interval_text: str
+    effective_samples: float
+
+
 class RunView(Answer):
     """View of a run: its result or its progress."""
 
@@ -55,6 +66,7 @@ class RunView(Answer):
     has_signals: bool
     heights: Mapping[str, int]
     diagnostics: Diagnostics
+    posterior: Sequence[PosteriorView]
 
 
 class JobView(JobOut):
@@ -155,6 +167,22 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         has_signals=run.signals_sha256 is not None,
         heights=heights,
         diagnostics=to_diagnostics(result),
+        posterior=[
+            _to_posterior_view(parameter)
+            for parameter in (result.get("posterior") or {}).get("parameters", ())
+        ],
+    )
+
+
+def _to_posterior_view(parameter: Document) -> PosteriorView:
+    low, high = parameter["interval95"]
+    spread = (high - low) / 4.0  # about a standard deviation, which gives the digits
+    return PosteriorView(
+        name=parameter["name"],
+        unit=parameter["unit"],
+        median_text=format_estimate(parameter["median"], spread)[0],
+        interval_text=format_interval((low, high), spread),
+        effective_samples=parameter["effective_samples"],
     )
 
 

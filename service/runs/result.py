@@ -92,6 +92,7 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
             "validation": list(identification.known_before_validation),
         },
         "search": _to_search_document(identification),
+        "posterior": _to_posterior_document(identification),
         "warnings": list(identification.warnings),
         "substeps": identification.substeps,
         "selection": [step._asdict() for step in identification.selection],
@@ -142,6 +143,24 @@ def _to_search_document(identification: Identification) -> dict[str, Any]:
             }
             for minimum in evidence.minima
         ],
+    }
+
+
+def _to_posterior_document(identification: Identification) -> dict[str, Any] | None:
+    """Convert the samples of the posterior; None if they were not requested."""
+    posterior = identification.posterior
+    if posterior is None:
+        return None
+    names = [parameter.name for parameter in posterior.parameters]
+    return {
+        "converged": posterior.is_converged,
+        **_read(posterior, "reason", "walkers", "steps", "acceptance", "evaluations"),
+        "parameters": [
+            _read(parameter, "name", "unit", "median", "interval95", "effective_samples")
+            for parameter in posterior.parameters
+        ],
+        "correlation": {"names": names, "matrix": _to_json(posterior.correlation[: len(names)])},
+        "samples": [[float(f"{value:.8g}") for value in row] for row in posterior.samples],
     }
 
 

@@ -50,7 +50,7 @@ def list_runs(
         descending=choice.descending,
     )
     progress = read_written_progress(session, [run.id for run in page.items if run.result is None])
-    items = [to_run_out(run, job, progress.get(run.id)) for run in page.items]
+    items = [_leave_out_samples(to_run_out(run, job, progress.get(run.id))) for run in page.items]
     return Page(items=items, next=page.next)
 
 
@@ -97,6 +97,15 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
             "has_signals": run.signals_sha256 is not None,
         }
     )
+
+
+def _leave_out_samples(run: RunOut) -> RunOut:
+    """Leave out the samples of the posterior, which a list of runs would repeat for each."""
+    posterior = (run.model_extra or {}).get("posterior")
+    if not posterior:
+        return run
+    kept = {name: value for name, value in posterior.items() if name != "samples"}
+    return run.model_copy(update={"posterior": kept})
 
 
 def get_history(session: Session, run_id: str) -> HistoryOut:

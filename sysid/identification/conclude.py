@@ -39,6 +39,7 @@ from sysid.residuals.residual_tests import list_residual_series, run_residual_te
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.posterior import describe_posterior, sample_posterior
 
 
 def conclude_run(
@@ -47,13 +48,16 @@ def conclude_run(
     state: RunState,
     validation: Problem | None = None,
     clock: Clock = perf_counter,
+    *,
+    posterior: bool = False,
 ) -> Identification:
     """Conclude a run: refine, analyse and validate its estimate.
 
     With ``refine`` the champions of an ``improved`` search are refined by least squares. Those of
     the paper's two methods are reported unchanged, so that a comparison is one of the methods. If
     the time of the run is limited, refinement ends near the limit and warnings list what was left
-    out. Standard errors, tests and validation are always computed. `clock` returns seconds.
+    out. Standard errors, tests and validation are always computed. `clock` returns seconds. With
+    `posterior` samples of the posterior are taken, as far as budget and time are left.
 
     Raises
     ------
@@ -66,7 +70,9 @@ def conclude_run(
         raise DivergedEverywhere(state.evaluations)
     with use_one_thread():  # so that the last bit does not depend on the number of cores
         deadline = Deadline(algorithm.stop.seconds, state.seconds, clock)
-        return _build_identification(problem, algorithm, state, validation, deadline)
+        return _build_identification(
+            problem, algorithm, state, validation, deadline, has_posterior=posterior
+        )
 
 
 def _build_identification(
@@ -75,6 +81,8 @@ def _build_identification(
     state: RunState,
     validation: Problem | None,
     deadline: Deadline,
+    *,
+    has_posterior: bool,
 ) -> Identification:
     budget = Budget(algorithm.stop.evaluations, state.evaluations)
     best = find_best_estimate(problem, algorithm, state, budget, deadline)
@@ -106,6 +114,12 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         holds, spent = refit_other_holds(problem, holds, theta, best.lowest_end.theta, left, late)
         budget.spend(spent)
+    posterior = None
+    if has_posterior:
+        others = [minimum.values for minimum in found.minima if minimum.is_compatible]
+        left, late = budget.count_left(), deadline.is_past_grace
+        posterior = sample_posterior(problem, theta, analysis, others, state.seed, left, late)
+        budget.spend(posterior.evaluations)
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -141,6 +155,7 @@ def _build_identification(
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
             *explain_noise_model_choice(problem, noise),
+            *(() if posterior is None else describe_posterior(posterior)),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,
@@ -154,6 +169,7 @@ def _build_identification(
         substeps=problem.model.solver.substeps,
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),
+        posterior=posterior,
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from sysid.core.code_cache import digest_files
 from sysid.kernels.machine_code import describe_machine
 
-_LIBRARIES = ("numpy", "scipy", "numba")
+_LIBRARIES = ("numpy", "scipy", "numba", "emcee")
 
 
 @cache

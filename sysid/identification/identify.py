@@ -34,6 +34,7 @@ def identify(
     validation_fraction: float | None = None,
     noise: Noise | None = None,
     warm: Mapping[str, float] | None = None,
+    posterior: bool = False,
     progress: Callable[[RunState], None] | None = None,
 ) -> Identification:
     """Estimate the free parameters of a model, including its unknown time lags.
@@ -58,6 +59,8 @@ def identify(
         Added to the outputs of `records` before fitting.
     warm : mapping of str to float
         Values that a part of the population starts from.
+    posterior : bool
+        Whether to sample the posterior of the free parameters.
     progress : callable
         Receives the run's state several times a second.
 
@@ -83,6 +86,7 @@ def identify(
         algorithm,
         _run_search(problem, algorithm, seed, warm, progress),
         validation_problem,
+        posterior=posterior,
     )
 
 

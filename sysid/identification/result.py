@@ -11,7 +11,7 @@ from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.metrics import ChannelMetrics
-from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
+from sysid.uncertainty.estimates import Criteria, Estimate, Posterior, Uncertainty
 
 CHI_SQUARE_95 = 3.841
 """Quantile of χ² with one degree of freedom."""
@@ -135,6 +135,8 @@ class Identification:
     known_before, known_before_validation : tuple of float
         Time (s) before the start of each experiment for which the inputs are recorded. Before
         that, the first value is assumed.
+    posterior : Posterior or None
+        None if it was not requested.
     """
 
     estimates: tuple[Estimate, ...]
@@ -166,6 +168,7 @@ class Identification:
     substeps: int
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
+    posterior: Posterior | None = None
 
     @property
     def holds(self) -> dict[str, Hold]:

@@ -55,6 +55,7 @@ from sysid.uncertainty.estimates import (
     Uncertainty,
 )
 from sysid.uncertainty.intervals import LocalStatistics, make_estimates
+from sysid.uncertainty.likelihood import LikelihoodModel
 from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs
 from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, compute_sensitivities
 
@@ -90,6 +91,8 @@ class Analysis:
     """Whether the time limit prevented the search for minima near the estimate."""
     residuals_and_sensitivities: tuple[FloatArray, FloatArray] | None = None
     """Residuals (n,) and sensitivities (n, D), not whitened."""
+    likelihood: LikelihoodModel | None = None
+    """None if there is no uncertainty."""
 
 
 def analyse_estimate(
@@ -176,7 +179,9 @@ def _analyse_sensitivities(
     retained[d - n_symmetries :] = False
     inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
     colour = estimate_joint_covariance(problem, influence, columns)
-    covariance, noise = _estimate_covariance(error, columns, inverse, problem.loss_scale, colour)
+    covariance, noise, middle = _estimate_covariance(
+        error, columns, inverse, problem.loss_scale, colour
+    )
     # A scaling does not move a factor that is 0. It moves the others, without any effect.
     moved = _find_moved_parameters(powers * theta) | _find_moved_parameters(shifts)
     directions = classify_directions(singular, rows, ~retained, moved, covariance, noise)
@@ -202,11 +207,12 @@ def _analyse_sensitivities(
     statuses = _classify_parameters(
         place, blocks, is_pulled, np.array([name in combined for name in names])
     )
+    degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     statistics = LocalStatistics(
         theta,
         statuses,
         physical,
-        stdtrit(_compute_degrees_of_freedom(n, inverse, colour, whitening), 0.975),
+        stdtrit(degrees, 0.975),
         directions.is_null_member,
         uncertainty.groups,
         rows[~retained],
@@ -223,7 +229,16 @@ def _analyse_sensitivities(
     active_bounds = (
         _find_active_bounds(problem, influence, sloping, place) if is_pulled.any() else ()
     )
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, active_bounds, linear)
+    return Analysis(
+        estimates,
+        uncertainty,
+        min(gain, 1.0),
+        count,
+        criteria,
+        active_bounds,
+        linear,
+        likelihood=LikelihoodModel(error, columns, middle, float(np.min(degrees)), whitening),
+    )
 
 
 def _find_moved_parameters(directions: FloatArray) -> BoolArray:
@@ -342,22 +357,26 @@ def _estimate_covariance(
     inverse: FloatArray,
     scale: float,
     colour: ColouredCovariance | None,
-) -> tuple[FloatArray, float]:
-    """Estimate the covariance in unit coordinates, and the standard deviation of the noise."""
+) -> tuple[FloatArray, float, FloatArray | None]:
+    """Estimate the covariance in unit coordinates, and the standard deviation of the noise.
+
+    Also returned is the middle of a sandwich; None for white residuals of squares.
+    """
     n, d = columns.shape
     widening = n / (n - d) if colour is None else colour.equivalent_samples / colour.degrees
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
         if colour is not None:
-            return widening * inverse @ colour.middle @ inverse, float(np.sqrt(variance))
-        return variance * inverse, float(np.sqrt(variance))
+            covariance = widening * inverse @ colour.middle @ inverse
+            return covariance, float(np.sqrt(variance)), widening * colour.middle
+        return variance * inverse, float(np.sqrt(variance)), None
     influence, share = compute_influence(error, scale), compute_loss_weight(error, scale)
     bread = np.linalg.pinv(
         (columns.T * share**3) @ columns, rcond=RANK_TOLERANCE**2, hermitian=True
     )
     filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
     noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers
-    return widening * bread @ filling @ bread, noise
+    return widening * bread @ filling @ bread, noise, widening * filling
 
 
 def _compute_degrees_of_freedom(

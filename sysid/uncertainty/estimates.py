@@ -1,4 +1,4 @@
-"""Estimates with their standard errors, intervals, statuses and information criteria."""
+"""Estimates: standard errors, intervals, statuses, information criteria, posterior."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -87,3 +87,57 @@ class Uncertainty:
     noise_sd: float
     groups: tuple[IdentifiableCombination, ...] = ()
     noise_colour: NoiseColour = "white"
+
+
+@dataclass(frozen=True, slots=True)
+class PosteriorParameter:
+    """Posterior distribution of one parameter.
+
+    Attributes
+    ----------
+    interval95 : tuple of float
+        The 2.5 and 97.5 % quantiles.
+    effective_samples : float
+        Number of independent samples that would estimate the mean as well.
+    """
+
+    name: str
+    unit: str
+    median: float
+    interval95: tuple[float, float]
+    effective_samples: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Samples of the posterior, or the reason why there are none.
+
+    Attributes
+    ----------
+    parameters : tuple of PosteriorParameter
+        The free parameters; empty without samples.
+    samples : FloatArray, shape (m, D)
+        At most 1,000 of the samples, chosen at random.
+    correlation : FloatArray, shape (D, D)
+    walkers, steps : int
+        Steps include those that are left out.
+    acceptance : float
+        Share of the proposed moves that were accepted.
+    evaluations : int
+    is_converged : bool
+    reason : str
+        Why the chain has not converged, or why there is none; empty if it has.
+    gain : float
+        Likelihood ratio of the best sample to the estimate; 0 if none is better.
+    """
+
+    parameters: tuple[PosteriorParameter, ...]
+    samples: FloatArray
+    correlation: FloatArray
+    walkers: int
+    steps: int
+    acceptance: float
+    evaluations: int
+    is_converged: bool
+    reason: str
+    gain: float = 0.0

@@ -153,6 +153,7 @@ def _body(dataset: str, name: str, *, sweep: bool = False) -> JobIn:
             "datasets": [dataset],
             "channels": {"u": "P1", "p": "P2"},
             "validation": {"fraction": 0.3},
+            "posterior": not sweep,
             "sweep": {"axes": axes if sweep else []},
         }
     )
@@ -255,6 +256,7 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
             "names": ["K", "T", "L"],
             "matrix": [[1, 0.31, -0.05], [0.31, 1, -0.78], [-0.05, -0.78, 1]],
         },
+        "posterior": _posterior(stderr),
         "criteria": {
             "aic": 2336.4,
             "aicc": 2336.5,
@@ -292,6 +294,29 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
             }
         ],
         "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
+    }
+
+
+def _posterior(stderr: dict[str, float]) -> dict[str, Any]:
+    """Samples of a normal law around the true parameters."""
+    values = [
+        value + stderr[name] * np.random.default_rng(place).standard_normal(200)
+        for place, (name, value) in enumerate(TRUE.items())
+    ]
+    return {
+        "converged": True,
+        "reason": "",
+        "parameters": [
+            {
+                "name": name,
+                "unit": str(MODEL["parameters"][name]["unit"]),  # type: ignore[index]
+                "median": float(np.median(samples)),
+                "interval95": np.quantile(samples, [0.025, 0.975]).tolist(),
+                "effective_samples": 1712.4,
+            }
+            for name, samples in zip(TRUE, values, strict=True)
+        ],
+        "samples": np.column_stack(values).tolist(),
     }
 
 

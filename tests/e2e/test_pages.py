@@ -60,6 +60,10 @@ def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
     assert page.locator(f"{figure(page, 'residuals')} .barlayer .trace").count() == 2
     assert page.locator(f"{figure(page, 'correlation')} .hm").count() == 1
     assert page.locator(f"{figure(page, 'waterfall')} {LINES}").count() == 2
+    corner = figure(page, "posterior")
+    assert page.locator(f"{corner} .contourlayer .contour").count() == 3
+    assert page.locator(f"{corner} .barlayer .trace").count() == 3
+    expect(page.locator("table.posterior tbody tr").nth(1)).to_contain_text("1\u202f712")
     assert page.evaluate(height) == before  # plots take the room that was left for them
     expect(page.get_by_text("strongly correlated")).to_be_visible()
     assert_residual_tests(page)
@@ -260,7 +264,7 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     page.route("**/*", lambda route: route.abort())
     page.set_content(answer.text())
     page.wait_for_selector(".plot .main-svg")
-    assert page.locator(".js-plotly-plot").count() == 6
+    assert page.locator(".js-plotly-plot").count() == 7
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
 
 

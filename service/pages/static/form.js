@@ -48,6 +48,7 @@ async function fillFrom(job) {
   for (const key of ['seed', 'prediction']) set(key, request[key]);
   set('loss', request.loss?.kind);
   set('noise_model', request.loss?.noise_model);
+  if (request.posterior) set('posterior', 'sampled');
   const fraction = request.validation?.fraction;
   if (fraction) {
     const isListed = [...field('validation').options].some((option) => option.value === String(fraction));
@@ -236,6 +237,7 @@ function buildBody() {
     loss: { ...extra.loss, kind: field('loss').value, noise_model: field('noise_model').value },
     algorithm,
     seed: readNumber('seed') ?? 1,
+    posterior: field('posterior').value === 'sampled',
   };
 }
 

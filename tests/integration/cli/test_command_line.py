@@ -250,6 +250,25 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     assert f"residuals on validation data: {verdict}" in done.stdout
 
 
+@pytest.mark.slow
+def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
+    data: Path, tmp_path: Path
+) -> None:
+    settings = ("noise.sigma=0.05", "algorithm.generations=20", "algorithm.stop.evaluations=6000")
+    options = [word for setting in settings for word in ("--set", setting)]
+    result = tmp_path / "out.json"
+    words = ("identify", data, "--model", "fopdt", *options, "--posterior", "--json", result)
+    done = run_lagid(*words)
+    assert done.code == 0, done.stderr
+    (heading,) = [line for line in done.stdout.splitlines() if line.startswith("posterior ")]
+    assert heading.split("  ")[-1].strip() == "effective samples"
+    assert "the samples of the posterior have not converged" in " ".join(done.stderr.split())
+    document = json.loads(result.read_text())
+    assert document["evaluations"] <= 6000
+    for parameter in document["posterior"]["parameters"]:
+        assert f"{parameter['median']:.6g}" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

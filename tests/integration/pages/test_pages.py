@@ -100,7 +100,9 @@ def test_an_unchanged_file_is_not_sent_again(client: TestClient) -> None:
     assert (first.status_code, again.status_code, again.content) == (200, 304, b"")
 
 
-@pytest.mark.parametrize("name", ["history", "convergence", "response", "correlation", "waterfall"])
+@pytest.mark.parametrize(
+    "name", ["history", "convergence", "response", "correlation", "waterfall", "posterior"]
+)
 def test_every_figure_comes_as_plotly_json_and_as_csv(
     client: TestClient, filled: Filled, name: str
 ) -> None:

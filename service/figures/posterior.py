@@ -1,0 +1,262 @@
+"""Draw samples of a posterior: a corner plot of pairs of parameters, with 95 % regions."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from service.core.text import append_unit
+from service.figures import theme
+from service.figures.data import CornerParameter, Floats
+from service.figures.grid import add_axes
+from service.figures.plotly import Figure, base_layout, empty_figure, to_json_numbers
+from service.figures.theme import stride_indices
+
+MAX_SHOWN = 6
+"""Parameters that a corner plot shows."""
+_CELL_PX, _GAP = 176, 0.02
+_MARGIN = {"l": 84, "r": 16, "t": 30, "b": 54}
+_MAX_POINTS = 500  # of a pair: more would hide each other
+_CELLS = 40  # of a density in each direction
+_ROOM = 3.0  # bandwidths around the samples
+_BINS = 30
+_ELLIPSE_RADIUS, _ELLIPSE_POINTS = sqrt(5.991), 60  # 95 % of χ² with two degrees of freedom
+_DASHED = {"color": theme.VERMILLION, "width": 1.4, "dash": "dash"}
+
+
+def posterior_height(n_parameters: int) -> int:
+    """Compute the height (px) of the corner plot, so that a page can reserve its room."""
+    return min(n_parameters, MAX_SHOWN) * _CELL_PX + _MARGIN["t"] + _MARGIN["b"]
+
+
+def plot_posterior(parameters: Sequence[CornerParameter], correlation: Floats) -> Figure:
+    """Draw histograms on the diagonal, and pairs of samples with their 95 % regions below.
+
+    `correlation` (D, D) is that of the estimates. With their standard errors it gives the dashed
+    ellipses. Of many parameters only those that are most correlated are shown.
+    """
+    if not parameters:
+        return empty_figure()
+    chosen = choose_shown(parameters)
+    shown = [parameters[i] for i in chosen]
+    figure: Figure = {
+        "data": [],
+        "layout": base_layout(
+            posterior_height(len(shown)),
+            margin=_MARGIN,
+            shapes=[],
+            bargap=0,
+            legend={"x": 1, "xanchor": "right", "y": 1, "yanchor": "top"},
+        ),
+    }
+    for column, row in combinations(range(len(shown)), 2):
+        names = _add_cell(figure, shown, row, column)
+        pair = shown[column], shown[row]
+        figure["data"] += _draw_samples(*pair, names)
+        figure["data"] += _draw_ellipse(
+            *pair, float(correlation[chosen[column], chosen[row]]), names
+        )
+    for place, parameter in enumerate(shown):
+        names = _add_cell(figure, shown, place, place)
+        figure["data"].append(_draw_histogram(parameter, names))
+        figure["layout"]["shapes"] += _draw_interval(parameter, names)
+    _show_legend_once(figure)
+    if len(shown) < len(parameters):
+        title = f"the {len(shown)} most correlated of {len(parameters)} parameters"
+        figure["layout"]["title"] = {
+            "text": title,
+            "font": {"size": 12},
+            "x": 1,
+            "xanchor": "right",
+        }
+    return figure
+
+
+def choose_shown(parameters: Sequence[CornerParameter]) -> list[int]:
+    """Choose the parameters to show: all, or those whose samples are most correlated with another.
+
+    Returned are their indices in the original order.
+    """
+    if len(parameters) <= MAX_SHOWN:
+        return list(range(len(parameters)))
+    with np.errstate(invalid="ignore", divide="ignore"):  # samples that are all equal
+        correlation = np.corrcoef([parameter.samples for parameter in parameters])
+    strength = np.abs(np.nan_to_num(correlation - np.eye(len(parameters))))
+    return sorted(np.argsort(-np.max(strength, axis=0), kind="stable")[:MAX_SHOWN].tolist())
+
+
+def _add_cell(
+    figure: Figure, shown: Sequence[CornerParameter], row: int, column: int
+) -> dict[str, str]:
+    """Add the axes of a cell; titles and ticks only on the left and at the bottom."""
+    n = len(shown)
+    width = (1.0 - _GAP * (n - 1)) / n
+    left, top = column * (width + _GAP), 1.0 - row * (width + _GAP)
+    is_histogram = row == column
+    x: dict[str, Any] = {"nticks": 4, "showticklabels": row == n - 1}
+    y: dict[str, Any] = {"nticks": 4, "showticklabels": column == 0 and not is_histogram}
+    if row == n - 1:
+        x["title"] = {"text": append_unit(shown[column].name, shown[column].unit)}
+    if column == 0 and not is_histogram:
+        y["title"] = {"text": append_unit(shown[row].name, shown[row].unit)}
+    x["range"] = _find_range(shown[column])
+    y |= (
+        {"visible": False, "rangemode": "tozero"}
+        if is_histogram
+        else {"range": _find_range(shown[row])}
+    )
+    domain = (left, min(left + width, 1.0)), (max(top - width, 0.0), top)
+    return add_axes(figure, row * n + column, domain, x, y)
+
+
+def _find_range(parameter: CornerParameter) -> list[float]:
+    """Find the range of an axis: that of the samples and the estimate, with room."""
+    values = [*parameter.samples.tolist(), parameter.value]
+    low, high = min(values), max(values)
+    room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
+    return [low - room, high + room]
+
+
+def _draw_samples(
+    across: CornerParameter, upward: CornerParameter, names: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Draw samples of a pair, and the region of highest density that has 95 % of them."""
+    chosen = stride_indices(across.samples.size, _MAX_POINTS)
+    points = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "samples",
+        "x": to_json_numbers(across.samples[chosen]),
+        "y": to_json_numbers(upward.samples[chosen]),
+        **names,
+        "marker": {"color": theme.BLUE, "size": 3, "opacity": 0.45},
+        "hovertemplate": f"{across.name} = %{{x:.5g}}<br>{upward.name} = %{{y:.5g}}<extra></extra>",
+    }
+    estimate = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "estimate",
+        "x": to_json_numbers([across.value]),
+        "y": to_json_numbers([upward.value]),
+        **names,
+        "marker": {"color": theme.VERMILLION, "size": 8, "symbol": "cross"},
+        "hoverinfo": "skip",
+    }
+    if not (np.ptp(across.samples) > 0 and np.ptp(upward.samples) > 0):
+        return [points, estimate]
+    x, y, density, level = estimate_region(across, upward)
+    region = {
+        "type": "contour",
+        "name": "95 % region",
+        "x": to_json_numbers(x),
+        "y": to_json_numbers(y),
+        "z": [[round(value, 4) for value in row] for row in density.tolist()],
+        **names,
+        "contours": {"start": level, "end": level, "size": 1, "coloring": "none"},
+        "line": {"color": theme.BLUE, "width": 1.8},
+        "showscale": False,
+        "hoverinfo": "skip",
+    }
+    return [points, region, estimate]
+
+
+def estimate_region(
+    across: CornerParameter, upward: CornerParameter
+) -> tuple[Floats, Floats, Floats, float]:
+    """Estimate the density of a pair on a grid, and its level that 95 % of the samples exceed.
+
+    Returned are the grid between the bounds, the density (y, x), 1 at most, and the level. The
+    density is that of Gaussian kernels (Scott 1992).
+    """
+    x, y = _lay_grid(across), _lay_grid(upward)
+    density = _compute_kernels(upward, y) @ _compute_kernels(across, x).T
+    highest = float(np.max(density))
+    own = _compute_kernels(across, across.samples) * _compute_kernels(upward, upward.samples)
+    level = float(np.quantile(np.sum(own, axis=1), 0.05))
+    return x, y, density / highest, level / highest
+
+
+def _lay_grid(parameter: CornerParameter) -> Floats:
+    room = _ROOM * _find_bandwidth(parameter.samples)
+    low, high = float(np.min(parameter.samples)) - room, float(np.max(parameter.samples)) + room
+    return np.linspace(max(low, parameter.lower), min(high, parameter.upper), _CELLS)
+
+
+def _compute_kernels(parameter: CornerParameter, places: Floats) -> Floats:
+    """Compute the kernels (P, n) of all samples at places (P,)."""
+    distances = (places[:, None] - parameter.samples) / _find_bandwidth(parameter.samples)
+    return np.asarray(np.exp(-0.5 * distances**2))
+
+
+def _find_bandwidth(values: Floats) -> float:
+    """Find Scott's width for two dimensions; grid cells are never much wider."""
+    low, high = np.quantile(values, [0.25, 0.75])
+    spread = min(float(np.std(values)), float(high - low) / 1.349 or np.inf)
+    return float(max(spread * values.size ** (-1.0 / 6.0), np.ptp(values) / _CELLS))
+
+
+def _draw_ellipse(
+    across: CornerParameter, upward: CornerParameter, correlation: float, names: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Draw the 95 % ellipse of the standard errors, if both parameters have one."""
+    if across.stderr is None or upward.stderr is None:
+        return []
+    angle = np.linspace(0.0, 2.0 * pi, _ELLIPSE_POINTS)
+    first = _ELLIPSE_RADIUS * np.cos(angle)
+    second = correlation * first + sqrt(1.0 - correlation**2) * _ELLIPSE_RADIUS * np.sin(angle)
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": "95 % ellipse of the standard errors",
+            "x": to_json_numbers(across.value + across.stderr * first),
+            "y": to_json_numbers(upward.value + upward.stderr * second),
+            **names,
+            "line": _DASHED,
+            "hoverinfo": "skip",
+        }
+    ]
+
+
+def _draw_histogram(parameter: CornerParameter, names: dict[str, str]) -> dict[str, Any]:
+    counts, edges = np.histogram(parameter.samples, _BINS)
+    return {
+        "type": "bar",
+        "name": parameter.name,
+        "x": to_json_numbers(0.5 * (edges[1:] + edges[:-1])),
+        "y": counts.tolist(),
+        **names,
+        "marker": {"color": theme.BLUE, "opacity": 0.45},
+        "showlegend": False,
+        "hovertemplate": f"{parameter.name} = %{{x:.5g}}<extra></extra>",
+    }
+
+
+def _draw_interval(parameter: CornerParameter, names: dict[str, str]) -> list[dict[str, Any]]:
+    """Draw the estimate and the ends of both intervals."""
+    lines = [(end, {"color": theme.BLUE, "width": 1.4}) for end in parameter.posterior95]
+    lines += [(end, _DASHED) for end in parameter.interval95 or ()]
+    lines.append((parameter.value, {"color": theme.VERMILLION, "width": 1.4}))
+    return [
+        {
+            "type": "line",
+            "xref": names["xaxis"],
+            "x0": x,
+            "x1": x,
+            "yref": f"{names['yaxis']} domain",
+            "y0": 0,
+            "y1": 1,
+            "line": style,
+        }
+        for x, style in lines
+    ]
+
+
+def _show_legend_once(figure: Figure) -> None:
+    seen: set[str] = set()
+    for trace in figure["data"]:
+        trace.setdefault("showlegend", trace["name"] not in seen)
+        trace["legendgroup"] = trace["name"]
+        seen.add(trace["name"])

@@ -1,0 +1,53 @@
+"""The posterior of a measured record where the linear model of the standard errors fails."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.datasets.signal_channels import map_channels
+from service.formats.csv_recordings import read_csv
+from sysid.core.settings import Loss
+from sysid.data.derivations import derive_recording
+from sysid.data.records import Record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
+
+
+def read_tube(length: float, pressure: float) -> Record:
+    """The pooled filling of a pneumatic tube."""
+    source = Path(os.environ["LAGID_DATA"]) / "pneuact_tube" / "pneuact_tube.csv"
+    recording, _ = read_csv(source, segments=LABELS)
+    chosen = {"length_m": length, "p_nom_bar": pressure, "phase": "fill"}
+    pooling = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
+    pooled = derive_recording(recording, [{"select": chosen}, {"pool": pooling}])
+    channels = map_channels(load_model("tube"), {"u": "p_in_bar", "y": "p_out_bar"}, {})
+    (record,) = channels.cut_records(pooled, "tube")
+    return record
+
+
+def test_the_lag_of_a_tube_of_3_m_is_known_better_than_its_standard_error_says() -> None:
+    """L and T can hardly be separated, and neither can be negative."""
+    found = identify(
+        load_model("tube"),
+        read_tube(3.0, 4.0),
+        loss=Loss(noise_model="white"),
+        parameters={"L": {"upper": 0.15}},
+        posterior=True,
+    )
+    assert found.posterior is not None
+    assert found.posterior.is_converged
+    by_name = {parameter.name: parameter for parameter in found.posterior.parameters}
+    (lag,) = [estimate for estimate in found.estimates if estimate.name == "L"]
+    assert lag.interval95 is not None
+    assert lag.interval95[0] < -0.01  # seconds: impossible
+    low, high = by_name["L"].interval95
+    assert 0.0 <= low < lag.value < high < 0.03
+    assert np.ptp(lag.interval95) > 5.0 * (high - low)
+    samples = found.posterior.samples
+    assert np.all(samples[:, 1:] >= [0.001, 0.0])  # T and L inside their bounds
+    assert found.posterior.correlation[1, 2] < -0.5
