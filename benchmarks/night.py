@@ -54,6 +54,8 @@ def list_parts(seed: int) -> dict[str, Part]:
         "mutants": Part(["-m", "tests.mutants", "-j", "2", "--json", str(FOLDER / "mutants.json")]),
         "robustness": program("benchmarks.robustness", "--first-seed", str(1000 * seed)),
         "efficiency": program("benchmarks.efficiency"),
+        "traps": program("benchmarks.traps"),
+        "coverage": program("benchmarks.coverage", "--jobs", "2"),
         "torture": program("benchmarks.torture", "--seed", str(seed)),
         "measured data": program("benchmarks.real_data.all"),
     }

@@ -56,6 +56,7 @@ from sysid.residuals.whitening import Whitening
 from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
 from sysid.search.refine import RefinedCandidate, refine_candidates
+from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -325,8 +326,10 @@ class _EstimateSearch:
             self._deadline.is_past_grace,
         )
         self._budget.spend(recorded.evaluations)
+        equal = own.rms * (1.0 + SAME_OPTIMUM)  # anywhere on a group's surface, or a mirror image
+        agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)
-        return FoundMinima(all_minima, own.independent, self._projected, recorded.warnings)
+        return FoundMinima(all_minima, agreeing, self._projected, recorded.warnings)
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""

@@ -57,8 +57,8 @@ class Fit:
 class FoundMinima(NamedTuple):
     """All minima, the lowest first.
 
-    `agreeing` fits from random points ended in the minimum of the estimate. `projected` fits after
-    the search began at random points with the linear parameters solved for.
+    `agreeing` fits from random points ended in the minimum of the estimate, or in one as low.
+    `projected` fits after the search began at random points with the linear parameters solved for.
     """
 
     minima: tuple[Minimum, ...]

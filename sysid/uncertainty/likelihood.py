@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_loss, compute_loss_weight
@@ -74,7 +74,9 @@ class Likelihood:
         size = self._model.residuals.size
         weight = compute_loss_weight(self._model.residuals, self._problem.loss_scale) ** 1.5
         weight = weight * np.ones(size)
-        left, singular, rows, retained = truncated_svd(weight[:, None] * self._model.columns)
+        left, singular, rows, retained = compute_truncated_svd(
+            weight[:, None] * self._model.columns
+        )
         root = rows[retained] / singular[retained, None]
         variance, turn = np.linalg.eigh(root @ middle @ root.T)
         varies = variance > _ROUNDING * variance[-1]

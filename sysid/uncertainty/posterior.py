@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.core.linear_algebra import truncated_svd
+from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import ExchangeGroups, order_exchangeable
 from sysid.residuals.coloured import CHI_SQUARE_95
@@ -273,7 +273,7 @@ def _factor_start_covariance(likelihood: LikelihoodModel) -> FloatArray:
     """Factor the covariance of the starts, RᵀR with R (D, D): s²(SᵀS)⁻¹, but at most the range."""
     n, d = likelihood.columns.shape
     noise = np.sqrt(float(likelihood.residuals @ likelihood.residuals) / (n - d))
-    _, singular, rows, retained = truncated_svd(likelihood.columns)
+    _, singular, rows, retained = compute_truncated_svd(likelihood.columns)
     deviation = np.full(d, _MAX_SPREAD)
     deviation[retained] = np.minimum(noise / singular[retained], _MAX_SPREAD)
     return deviation[:, None] * rows
