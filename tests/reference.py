@@ -95,6 +95,7 @@ class Twin:
         self.names = [state.name for state in model.states]
         self.started = False
         self.past: dict[str, list[float]] = {}
+        self.slopes: list[tuple[dict[str, float], dict[str, float]]] = []
         self.given: dict[str, list[float]] = {}
         for i, start in enumerate(model.initial):
             name = self.names[i]
@@ -153,10 +154,11 @@ class Twin:
     def _integrated(self, m: int) -> dict[str, float]:
         h, now, method = self.step, self._now(), self.model.solver.method
         if method == "rk4":
-            a = self._slopes(m, 0.0, now)
+            a = self.present = self._slopes(m, 0.0, now)
             b = self._slopes(m, 0.5, self._moved(now, h / 2, a))
             c = self._slopes(m, 0.5, self._moved(now, h / 2, b))
             d = self._slopes(m, 1.0, self._moved(now, h, c))
+            self.slopes.append((a, d))
             return {n: now[n] + h / 6 * (a[n] + 2 * b[n] + 2 * c[n] + d[n]) for n in now}
         values = dict(now)
         updated = {}
@@ -229,9 +231,17 @@ class Twin:
         place = c - past.offset
         at = place - self._lag(past)
         now = self.past[past.name][m]
+        rise = values.get(past.name, now) - now
+        if at > 0 and self._has_slopes():
+            tangent = place * self.step * self.present[past.name]
+            return now + at / place * tangent + (at / place) ** 2 * (rise - tangent)
         if at > 0:
-            return now + at / place * (values.get(past.name, now) - now)
+            return now + at / place * rise
         return self._between(past.name, m, at)
+
+    def _has_slopes(self) -> bool:
+        solver = self.model.solver
+        return not self.difference and (solver.method, solver.interpolation) == ("rk4", "cubic")
 
     def _between(self, name: str, m: int, at: float) -> float:
         """A state `at` steps after step m (at ≤ 0), between its finished samples."""
@@ -242,7 +252,16 @@ class Twin:
             place = m + min(steps, 0)
             return self.past[name][place] if place >= 0 else self.before[name]
 
-        if self.model.solver.interpolation != "cubic":
+        if self._has_slopes() and f > 0:
+            slopes = self.slopes[m + i] if m + i >= 0 else 2 * (dict.fromkeys(self.names, 0.0),)
+            first, last = (self.step * slope[name] for slope in slopes)
+            return float(
+                (1 - f) ** 2 * (1 + 2 * f) * sample(i)
+                + f**2 * (3 - 2 * f) * sample(i + 1)
+                + f * (1 - f) ** 2 * first
+                - f**2 * (1 - f) * last
+            )
+        if f == 0 or self.model.solver.interpolation != "cubic":
             return sample(i) + f * (sample(i + 1) - sample(i))
         nodes = (-1, 0, 1, 2) if i <= -2 else (-1, 0, 1)
         weights = [np.prod([(f - o) / (n - o) for o in nodes if o != n]) for n in nodes]

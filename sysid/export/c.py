@@ -277,14 +277,16 @@ def _write_delays(program: GeneratedProgram) -> list[str]:
 
 def _write_state_arrays(program: GeneratedProgram) -> list[str]:
     states = program.identified.model.states
+    arrays = [program.array_names[state.name] for state in states]
+    arrays += [name for rises in program.rise_names.values() for name in rises]
     lines = [
-        f"double *const work = malloc({len(states)}*((size_t)steps + 1)*sizeof *work);",
+        f"double *const work = malloc({len(arrays)}*((size_t)steps + 1)*sizeof *work);",
         "if (work == NULL)",
         "    return 2;",
     ]
-    for i, state in enumerate(states):
+    for i, name in enumerate(arrays):
         offset = f" + {i}*(steps + 1)" if i else ""
-        lines.append(f"double *const {program.array_names[state.name]} = work{offset};")
+        lines.append(f"double *const {name} = work{offset};")
     for i, state in enumerate(states):
         every, start = program.array_names[state.name], program.write_start(i)
         size = _write_array_size(program, program.start_names[state.name])
@@ -314,7 +316,9 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         lines += indent_lines(
             _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2
         )
-    lines.append("    }")
+    if first_rises := program.assign_rises("first", "slope[0]"):
+        lines += ["        if (stage == 0) {", *indent_lines(first_rises, 3), "        }"]
+    lines += ["    }", *indent_lines(program.assign_rises("last", "slope[3]"))]
     for i, state in enumerate(states):
         every = program.array_names[state.name]
         mean = f"slope[0][{i}] + 2.0*slope[1][{i}] + 2.0*slope[2][{i}] + slope[3][{i}]"
@@ -463,6 +467,22 @@ static double past(const double *array, double before, long step, double delay)
     return value;
 }
 """
+_PAST_BY_SLOPES = """\
+/* Value `delay` >= 0 steps before a finished step, on a cubic; `before` the start.
+ * The cubic of a step has its values at both ends, and rises there at `first` and `last`. */
+static double past(const double *array, const double *first, const double *last, double before,
+                   long step, double delay)
+{
+    const double whole = floor(-delay), part = -delay - whole;
+    const long i = step + (long)whole;
+    const double older = sample(array, before, i);
+    if (part == 0.0)
+        return older;
+    const double rise = sample(array, before, i + 1) - older;
+    const double begin = sample(first, 0.0, i) - rise, end = sample(last, 0.0, i) - rise;
+    return older + part*(rise + (1.0 - part)*((1.0 - part)*begin - part*end));
+}
+"""
 _LATELY = """\
 /* Value `delay` steps before the place `part` of a step after it began, where it is `there`. */
 static double lately(const double *array, double before, long step, double part, double there,
@@ -471,6 +491,18 @@ static double lately(const double *array, double before, long step, double part,
     if (delay < part)
         return array[step] + (part - delay)/part*(there - array[step]);
     return past(array, before, step, delay - part);
+}
+"""
+_LATELY_BY_SLOPES = """\
+/* Value `delay` steps before the place `part` of a step after it began, where it is `there`. */
+static double lately(const double *array, const double *first, const double *last, double before,
+                     long step, double part, double there, double delay)
+{
+    if (delay < part) {
+        const double share = (part - delay)/part, tangent = part*first[step];
+        return array[step] + share*(tangent + share*(there - array[step] - tangent));
+    }
+    return past(array, first, last, before, step, delay - part);
 }
 """
 _SIGN = """\
@@ -502,5 +534,7 @@ HELPERS: Mapping[str, str] = {
     "sample": _SAMPLE,
     "past": _PAST,
     "past cubic": _PAST_CUBIC,
+    "past by slopes": _PAST_BY_SLOPES,
     "lately": _LATELY,
+    "lately by slopes": _LATELY_BY_SLOPES,
 }

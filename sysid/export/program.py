@@ -16,7 +16,12 @@ from sysid.core.errors import InvalidSettings
 from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
 from sysid.export.expressions import ExportScope, TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers
-from sysid.kernels.reads import find_averaged_inputs, is_difference
+from sysid.kernels.reads import (
+    find_averaged_inputs,
+    is_difference,
+    list_stored_histories,
+    reads_cubics,
+)
 from sysid.language.functions import Level
 from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import DerivedInitial, FixedInitial, MeasuredInitial, name_initial_state
@@ -39,6 +44,7 @@ class GeneratedProgram:
     array_names: dict[str, str] = field(default_factory=dict)
     next_names: dict[str, str] = field(default_factory=dict)
     start_names: dict[str, str] = field(default_factory=dict)
+    rise_names: dict[str, tuple[str, str]] = field(default_factory=dict)
     delay_names: dict[Expression, str] = field(default_factory=dict)
     helper_names: set[str] = field(default_factory=set)
 
@@ -59,6 +65,14 @@ class GeneratedProgram:
             item.name: make_identifier(f"{self.present_names[item.name]}_next")
             for item in model.states
         }
+        if reads_cubics(model):
+            self.rise_names = {
+                stored.state: (
+                    make_identifier(f"{self.present_names[stored.state]}_first"),
+                    make_identifier(f"{self.present_names[stored.state]}_last"),
+                )
+                for stored in list_stored_histories(model)
+            }
         states = set(self.present_names)
         self.output_names = {
             item.name: make_identifier(f"{item.name}_out" if item.name in states else item.name)
@@ -130,6 +144,22 @@ class GeneratedProgram:
         """Write the value of a state before the start."""
         zero = self.identified.model.solver.history == "zero"
         return "0.0" if zero else f"{self.array_names[state]}[0]"
+
+    def list_arrays(self, state: str) -> tuple[str, ...]:
+        """List the arrays that past values are read from: the state's, and those of its rises."""
+        return self.array_names[state], *self.rise_names.get(state, ())
+
+    def assign_rises(self, which: Literal["first", "last"], slopes: str) -> list[str]:
+        """Write the rises of a step by its first or last slopes, of the states that need them."""
+        states = [state.name for state in self.identified.model.states]
+        column = 0 if which == "first" else 1
+        return [
+            line
+            for name, rises in self.rise_names.items()
+            for line in self.language.assign(
+                f"{rises[column]}[step]", f"dt*{slopes}[{states.index(name)}]"
+            )
+        ]
 
     def write_helper_call(self, helper: str, *arguments: str) -> str:
         """Write a call of a helper, and include its text in the program."""
@@ -251,19 +281,19 @@ class LoopScope(ExportScope):
             return self._write_present_state(past.name)
         if self.stage == "recursion":
             return self._write_earlier_state(past)
-        every, before = program.array_names[past.name], program.write_history(past.name)
+        every, before = program.list_arrays(past.name), program.write_history(past.name)
         delay = self._write_state_delay(past)
         if self.stage == "slope":
             present = self._write_present_state(past.name)
             return program.write_helper_call(
-                "lately", every, before, "step", "part", present, delay
+                "lately", *every, before, "step", "part", present, delay
             )
         if self.stage == "update" and self._is_updated(past.name):
             following = program.next_names[past.name]
             return program.write_helper_call(
-                "lately", every, before, "step", "1.0", following, delay
+                "lately", *every, before, "step", "1.0", following, delay
             )
-        return program.write_helper_call("past", every, before, program.loop_variable, delay)
+        return program.write_helper_call("past", *every, before, program.loop_variable, delay)
 
     def _write_earlier_state(self, past: PastValue) -> str:
         program = self.program
@@ -403,6 +433,8 @@ def _find_variants(identified: IdentifiedModel) -> Mapping[str, str]:
     """Find the helpers with a variant for the solver of the model."""
     solver = identified.model.solver
     variants = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
+    if reads_cubics(identified.model):
+        variants = {"past": "past by slopes", "lately": "lately by slopes"}
     if identified.model.form == "differential" and solver.step is not None:
         variants["held"] = "held on grid"  # its points need not meet the jumps
     return variants

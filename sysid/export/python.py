@@ -247,6 +247,8 @@ def _write_starts(program: GeneratedProgram) -> list[str]:
             f"{every} = np.empty(steps + 1)",
             f"{every}[:{program.n_start_samples}] = {start}",
         ]
+    for rises in program.rise_names.values():
+        lines += [f"{name} = np.empty(steps)" for name in rises]
     return lines
 
 
@@ -270,9 +272,11 @@ def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
         "for step in range(steps):",
         f"    now = np.array([{now}])",
         "    slope_1 = rates(step, 0.0, *now)",
+        *indent_lines(program.assign_rises("first", "slope_1")),
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
         "    slope_3 = rates(step, 0.5, *(now + dt/2*slope_2))",
         "    slope_4 = rates(step, 1.0, *(now + dt*slope_3))",
+        *indent_lines(program.assign_rises("last", "slope_4")),
         *indent_lines(
             _wrap_statement(
                 f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
@@ -368,11 +372,32 @@ _PAST_CUBIC = '''def past(array, before, step, delay):
         value += weight*(array[j] if j >= 0 else before)
     return value
 '''
+_PAST_BY_SLOPES = '''def past(array, first, last, before, step, delay):
+    """Value `delay` >= 0 steps before a finished step, on a cubic; `before` the start.
+
+    The cubic of a step has its values at both ends, and rises there at `first` and `last`.
+    """
+    i = int(np.floor(-delay))
+    part, i = -delay - i, step + i
+    older, newer = (array[j] if j >= 0 else before for j in (i, min(i + 1, step)))
+    if part == 0.0:
+        return older
+    rise = newer - older
+    begin, end = (first[i] - rise, last[i] - rise) if i >= 0 else (-rise, -rise)
+    return older + part*(rise + (1.0 - part)*((1.0 - part)*begin - part*end))
+'''
 _LATELY = '''def lately(array, before, step, part, there, delay):
     """Value `delay` steps before the place `part` of a step after it began, where it is `there`."""
     if delay < part:
         return array[step] + (part - delay)/part*(there - array[step])
     return past(array, before, step, delay - part)
+'''
+_LATELY_BY_SLOPES = '''def lately(array, first, last, before, step, part, there, delay):
+    """Value `delay` steps before the place `part` of a step after it began, where it is `there`."""
+    if delay < part:
+        share, tangent = (part - delay)/part, part*first[step]
+        return array[step] + share*(tangent + share*(there - array[step] - tangent))
+    return past(array, first, last, before, step, delay - part)
 '''
 HELPERS: Mapping[str, str] = {
     "between": _BETWEEN,
@@ -381,5 +406,7 @@ HELPERS: Mapping[str, str] = {
     "averaged": _AVERAGED,
     "past": _PAST,
     "past cubic": _PAST_CUBIC,
+    "past by slopes": _PAST_BY_SLOPES,
     "lately": _LATELY,
+    "lately by slopes": _LATELY_BY_SLOPES,
 }

@@ -12,9 +12,10 @@ from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 
 @dataclass(frozen=True, slots=True)
 class StateHistory:
-    """History of one state in the work array: a row for each step, a double for each lane."""
+    """History in the work array: a row for each step, with `columns` doubles for each lane."""
 
     base: IrValue
+    columns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +158,8 @@ class DirectReader:
     """Interpolation of a state that is read again in every step.
 
     It serves one-step prediction, which changes samples after they were read, and cubic
-    interpolation. Cubic means Lagrange through four samples. Where later samples do not exist
-    yet, it uses three samples, or a line inside the present step.
+    interpolation where there are no slopes. Cubic then means Lagrange through four samples. Where
+    later samples do not exist yet, it uses three samples, or a line inside the present step.
     """
 
     def __init__(

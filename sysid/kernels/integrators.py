@@ -6,7 +6,8 @@ from typing import Protocol
 from sysid.kernels import reads
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.expressions import Environment, emit_expression
-from sysid.kernels.signals import ParameterEnvironment, SignalReaders, States
+from sysid.kernels.signal_readers import SignalReaders
+from sysid.kernels.signals import ParameterEnvironment, States
 from sysid.kernels.vectors import DOUBLE, IrValue, VectorBuilder
 from sysid.language.tree import PastValue, Symbol
 from sysid.models.model import Model
@@ -149,9 +150,11 @@ def _emit_runge_kutta(
         return {n: lanes.add(x, lanes.mul(width, slope[n])) for n, x in states.now.items()}
 
     first = emit_slopes(0, dict(states.now))
+    states.first_rises = {n: lanes.mul(step, first[n]) for n in states.with_rises}
     second = emit_slopes(1, shift_states(half, first))
     third = emit_slopes(1, shift_states(half, second))
     fourth = emit_slopes(2, shift_states(step, third))
+    states.last_rises = {n: lanes.mul(step, fourth[n]) for n in states.with_rises}
     two = lanes.make_number(2.0)
     mean = {
         n: lanes.add(lanes.add(first[n], fourth[n]), lanes.mul(two, lanes.add(second[n], third[n])))

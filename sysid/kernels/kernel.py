@@ -11,11 +11,11 @@ from sysid.kernels.expressions import emit_expression
 from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
 from sysid.kernels.layout import ExperimentLayout, KernelVariant
 from sysid.kernels.loss import LossAccumulator
+from sysid.kernels.signal_readers import SignalReaders
 from sysid.kernels.signals import (
     Delays,
     ExperimentHead,
     ParameterEnvironment,
-    SignalReaders,
     StartEnvironment,
     States,
 )

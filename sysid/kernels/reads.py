@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from sysid.core.memo import cache_by_identity
 from sysid.language.delays import collect_past_values, mentions_time
-from sysid.language.tree import PastValue
+from sysid.language.tree import Expression, PastValue
 from sysid.models.model import Model
 
 MAX_REGISTER_OFFSET = 8
@@ -81,8 +81,49 @@ def _has_unknown_delay(past: PastValue) -> bool:
     return past.delay is not None and mentions_time(past.delay, "parameter")
 
 
-def list_states_with_history(model: Model) -> list[str]:
-    """List the states whose history must be stored in memory, in the model's order."""
+def reads_cubics(model: Model) -> bool:
+    """Whether delayed states are read on the cubics of Runge-Kutta steps, with their slopes."""
+    solver = model.solver
+    is_runge_kutta = model.form == "differential" and solver.method == "rk4"
+    return is_runge_kutta and solver.interpolation == "cubic"
+
+
+class StoredHistory(NamedTuple):
+    """A history in memory: the samples of a state, or what a delayed read of it gives.
+
+    Attributes
+    ----------
+    state : str
+    delay : Expression or None
+        None: the samples.
+    columns : int
+        Values in a row for each individual.
+    """
+
+    state: str
+    delay: Expression | None
+    columns: int
+
+
+def list_stored_histories(model: Model) -> list[StoredHistory]:
+    """List the histories that must be stored in memory."""
+    if not reads_cubics(model):
+        return [StoredHistory(name, None, 1) for name in _list_states_with_history(model)]
+    places = group_delayed_reads(model, "state")
+    return [StoredHistory(*past, 2 if max(places[past]) > 0 else 1) for past in places]
+
+
+def group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
+    """Group the places of delayed reads of one kind by signal and delay."""
+    places: dict[tuple[str, Expression], set[int]] = {}
+    for read in collect_reads(model):
+        if read.past.kind == kind and read.past.delay is not None:
+            places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
+    return places
+
+
+def _list_states_with_history(model: Model) -> list[str]:
+    """List the states whose samples must be stored, in the model's order."""
     needed = {
         r.past.name
         for r in collect_reads(model)

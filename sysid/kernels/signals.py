@@ -1,16 +1,10 @@
-"""Signals of one block of individuals: experiment head, states, inputs and delays."""
+"""Signals of one block of individuals: experiment head, states and delays."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from sysid.kernels import reads
-from sysid.kernels.delayed_reads import (
-    DelayedReader,
-    DirectReader,
-    InputReader,
-    LinearReader,
-    StateHistory,
-    TimeStep,
-)
+from sysid.kernels.delayed_reads import StateHistory
 from sysid.kernels.expressions import Environment, emit_expression
 from sysid.kernels.layout import (
     FLOAT_FIELDS,
@@ -140,8 +134,20 @@ class Delays:
         return self._steps[delay]
 
 
+class FinishedStep(NamedTuple):
+    """Last finished step of a state: its value at the start, and first and last slope times h."""
+
+    start: IrValue
+    first_rise: IrValue
+    last_rise: IrValue
+
+
 class States:
-    """States: their last samples in registers, and the history if delays need it."""
+    """States: their last samples in registers, and the history if delays need it.
+
+    `first_rises` and `last_rises` are set in a Runge-Kutta step: its first and last slope, times
+    the step. They are kept of `with_rises`, the states that are read on cubics.
+    """
 
     def __init__(
         self,
@@ -160,19 +166,35 @@ class States:
         }
         self._reach, self._rows = experiment.get_head("reach"), experiment.get_head("rows")
         size = lanes.builder.mul(self._rows, lanes.make_integer(lanes.width))
-        self._histories = {
-            name: StateHistory(
-                lanes.builder.gep(
-                    work, [lanes.builder.mul(size, lanes.make_integer(i))], source_etype=DOUBLE
-                )
-            )
-            for i, name in enumerate(reads.list_states_with_history(model))
-        }
+        self._histories: dict[tuple[str, Expression | None], StateHistory] = {}
+        first_column = 0
+        for stored in reads.list_stored_histories(model):
+            place = lanes.builder.mul(size, lanes.make_integer(first_column))
+            base = lanes.builder.gep(work, [place], source_etype=DOUBLE)
+            self._histories[stored.state, stored.delay] = StateHistory(base, stored.columns)
+            first_column += stored.columns
         self.line: dict[str, list[IrValue]] = {}
+        self.with_rises = tuple(
+            dict.fromkeys(name for name, delay in self._histories if delay is not None)
+        )
+        self.first_rises: dict[str, IrValue] = {}
+        self.last_rises: dict[str, IrValue] = {}
+        level = lanes.splat(lanes.make_number(0.0))  # slope before the start
+        self._finished = {
+            name: FinishedStep(self._before[name], level, level) for name in self.with_rises
+        }
 
-    def get_history(self, name: str) -> StateHistory:
-        """Return the history of a state."""
-        return self._histories[name]
+    def get_history(self, name: str, delay: Expression | None = None) -> StateHistory:
+        """Return the history of a state, or of its reads at a delay."""
+        return self._histories[name, delay]
+
+    def get_value_before(self, name: str) -> IrValue:
+        """Return the value of a state before the start."""
+        return self._before[name]
+
+    def get_finished_step(self, name: str) -> FinishedStep:
+        """Return the last finished step of a state that is read on cubics."""
+        return self._finished[name]
 
     def fill_history(self) -> IrValue:
         """Store the history before the start and the start itself; return the start's row."""
@@ -180,10 +202,10 @@ class States:
         if self._histories:
             loop = KernelLoop(lanes)
             row = loop.carry(lanes.make_integer(0))
-            for name, history in self._histories.items():
-                lanes.store_row(
-                    self._before[name], history.base, b.mul(row, lanes.make_integer(lanes.width))
-                )
+            for (name, _), history in self._histories.items():
+                index = b.mul(row, lanes.make_integer(history.columns * lanes.width))
+                values = [self._before[name]] * history.columns
+                lanes.store_columns(values, history.base, index)
             following = b.add(row, lanes.make_integer(1))
             loop.update(row, following)
             loop.leave_if(b.icmp_signed(">=", following, self._reach))
@@ -192,10 +214,11 @@ class States:
         return self._reach
 
     def store_states(self, row: IrValue) -> None:
-        """Store the present states in a row of the history."""
+        """Store the present states in a row of their samples."""
         index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
-        for name, history in self._histories.items():
-            self._lanes.store_row(self.now[name], history.base, index)
+        for (name, delay), history in self._histories.items():
+            if delay is None:
+                self._lanes.store_row(self.now[name], history.base, index)
 
     def load_far_sample(self, name: str, back: int, row: IrValue) -> IrValue:
         """Load the sample a fixed number of steps before the last finished one."""
@@ -203,7 +226,7 @@ class States:
         index = b.mul(
             b.sub(row, self._lanes.make_integer(back)), self._lanes.make_integer(self._lanes.width)
         )
-        return self._lanes.load_row(self._histories[name].base, index)
+        return self._lanes.load_row(self.get_history(name).base, index)
 
     def open_loop(self, loop: KernelLoop) -> None:
         """Carry the states and their earlier samples through the time loop."""
@@ -215,6 +238,8 @@ class States:
             ]
             self.line[name] = [first, *rest]
             self.now[name] = first
+        for name, step in self._finished.items():
+            self._finished[name] = FinishedStep(*(loop.carry(value) for value in step))
 
     def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
         """Update the carried states; measurements may have replaced `now`."""
@@ -223,6 +248,10 @@ class States:
             values = [following[name], self.now[name], *carried[1:]]
             for phi, value in zip(carried, values, strict=False):
                 loop.update(phi, value)
+        for name, step in self._finished.items():
+            finished = (self.now[name], self.first_rises[name], self.last_rises[name])
+            for phi, value in zip(step, finished, strict=True):
+                loop.update(phi, self._lanes.splat(value))
         self.now = following
 
     def advance_row(self, row: IrValue) -> IrValue:
@@ -235,117 +264,12 @@ class States:
 
         def emit_slide() -> list[IrValue]:
             first = b.sub(following, self._reach)
-            size = b.mul(b.add(self._reach, lanes.make_integer(1)), lanes.make_integer(lanes.width))
-            source = b.mul(first, lanes.make_integer(lanes.width))
+            rows = b.add(self._reach, lanes.make_integer(1))
             for history in self._histories.values():
+                width = lanes.make_integer(history.columns * lanes.width)
+                source, size = b.mul(first, width), b.mul(rows, width)
                 lanes.copy_rows(history.base, lanes.make_integer(0), source, size)
             return [self._reach]
 
         is_last = b.icmp_signed("==", following, b.sub(self._rows, lanes.make_integer(1)))
         return lanes.branch(is_last, emit_slide, [following])[0]
-
-
-class SignalReaders:
-    """Readers of all delayed signals of a model, and the inputs without delay."""
-
-    def __init__(
-        self,
-        lanes: VectorBuilder,
-        model: Model,
-        experiment: ExperimentHead,
-        states: States,
-        delays: Delays,
-        one_step: bool,
-    ) -> None:
-        self._lanes, self._model, self._experiment = lanes, model, experiment
-        self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
-        self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
-        self._owners: list[tuple[str, DelayedReader]] = []
-        cubic = model.solver.interpolation == "cubic"
-        for past, places in _group_delayed_reads(model, "state").items():
-            delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
-            history = states.get_history(past[0])
-            if one_step or cubic:
-                self._add_reader(past, places, DirectReader(lanes, history, delay, cubic))
-                continue
-            for chain in _group_state_places(places):
-                reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
-                served = places if chain[0] > 0 else set()
-                self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
-        for past, places in _group_delayed_reads(model, "input").items():
-            for chain in reads.group_places(places):
-                self._add_reader(
-                    past,
-                    {*chain},
-                    self._build_input_reader(past[0], delays.to_steps(past[1]), chain),
-                )
-
-    def _add_reader(
-        self, past: tuple[str, Expression], places: set[int], reader: DelayedReader
-    ) -> None:
-        for place in places:
-            self._readers[*past, place] = reader
-        self._owners.append((past[0], reader))
-
-    def _build_input_reader(self, name: str, delay: IrValue, chain: list[int]) -> InputReader:
-        lanes, number, experiment = self._lanes, self._inputs[name], self._experiment
-        points = experiment.get_input_field(number, "points")
-        fine = lanes.mul(delay, lanes.builder.sitofp(points, DOUBLE))
-        cap = lanes.builder.sitofp(experiment.get_input_field(number, "cap"), DOUBLE)
-        zero = self._find_input_start(number)
-        return InputReader(lanes, experiment.floats, zero, points, lanes.clamp(fine, cap), chain)
-
-    def _find_input_start(self, number: int) -> IrValue:
-        """Find the place of an input at step 0; difference equations read just after a jump."""
-        zero = self._experiment.get_input_field(number, "zero")
-        if not reads.is_difference(self._model):
-            return zero
-        return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
-
-    def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
-        """Return the reader of a delayed signal at a place."""
-        if past.delay is None:
-            raise AssertionError(f"{past.name} is read without delay")
-        return self._readers[past.name, past.delay, halves]
-
-    def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
-        """Load an input without delay: the same for all individuals."""
-        b, lanes, number = self._lanes.builder, self._lanes, self._inputs[name]
-        points = self._experiment.get_input_field(number, "points")
-        start = b.add(self._find_input_start(number), b.mul(step, points))
-        if reads.is_difference(self._model):
-            shift = b.mul(points, lanes.make_integer(halves // 2))
-        elif halves == 1:
-            shift = b.ashr(points, lanes.make_integer(1))
-        else:
-            shift = self._experiment.get_input_field(number, "end" if halves == 2 else "begin")
-        return lanes.load_double(self._experiment.floats, b.add(start, shift))
-
-    def open_loop(self, loop: KernelLoop) -> None:
-        """Open the readers at the head of the time loop."""
-        for _, reader in self._owners:
-            reader.open_loop(loop)
-
-    def begin_step(self, time_step: TimeStep) -> None:
-        """Begin a step of all readers."""
-        for _, reader in self._owners:
-            reader.begin_step(time_step)
-
-    def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
-        """End a step of all readers."""
-        for name, reader in self._owners:
-            reader.end_step(loop, following.get(name, self._lanes.make_number(0.0)))
-
-
-def _group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
-    places: dict[tuple[str, Expression], set[int]] = {}
-    for read in reads.collect_reads(model):
-        if read.past.kind == kind and read.past.delay is not None:
-            places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
-    return places
-
-
-def _group_state_places(places: set[int]) -> list[list[int]]:
-    """Group whole steps into chains; one that reaches the present step has its start too."""
-    forward = {0, 2} if any(place > 0 for place in places) else set()
-    return reads.group_places({place for place in places if place % 2 == 0} | forward)

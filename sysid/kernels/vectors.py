@@ -160,6 +160,11 @@ class VectorBuilder:
         left, right = self.match_shapes(a, b)
         return self.builder.select(condition, left, right)
 
+    def test_any(self, conditions: IrValue) -> IrValue:
+        """Emit whether a condition holds in any lane."""
+        bits = self.builder.bitcast(conditions, ir.IntType(self.width))
+        return self.builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
     def interpolate(self, start: IrValue, fraction: IrValue, stop: IrValue) -> IrValue:
         """Emit start + fraction · (stop - start)."""
         return self.add(start, self.mul(fraction, self.sub(stop, start)))
@@ -185,9 +190,12 @@ class VectorBuilder:
             chosen = _make_shuffle_mask(range(first, first + width))
             pieces = [self.builder.shuffle_vector(value, nothing, chosen) for value in values]
             parts.append(self.builder.call(function, pieces))
-        while len(parts) > 1:  # neighbours join until one vector is left
-            width = parts[0].type.count
-            order = _make_shuffle_mask(range(2 * width))
+        return self._join_vectors(parts)
+
+    def _join_vectors(self, parts: list[IrValue]) -> IrValue:
+        """Join vectors; neighbours join until one is left."""
+        while len(parts) > 1:
+            order = _make_shuffle_mask(range(2 * parts[0].type.count))
             parts = [
                 self.builder.shuffle_vector(low, high, order)
                 for low, high in zip(parts[::2], parts[1::2], strict=True)
@@ -225,6 +233,14 @@ class VectorBuilder:
         """Store a vector of doubles at ``base[index]``."""
         self.builder.store(self.splat(value), self._compute_address(base, index), align=8)
 
+    def store_columns(self, values: list[IrValue], base: IrValue, index: IrValue) -> None:
+        """Store one vector of doubles, or two whose values alternate, at ``base[index]``."""
+        row = self.splat(values[0])
+        if len(values) == 2:
+            pairs = [lane + side for lane in range(self.width) for side in (0, self.width)]
+            row = self.builder.shuffle_vector(row, self.splat(values[1]), _make_shuffle_mask(pairs))
+        self.builder.store(row, self._compute_address(base, index), align=8)
+
     def compute_addresses(self, base: IrValue, index: IrValue) -> IrValue:
         """Compute the addresses of ``base[index]`` for a vector of indices."""
         start = self.splat(self.builder.ptrtoint(base, INT))
@@ -245,6 +261,23 @@ class VectorBuilder:
             place = b.gep(start, [step], source_etype=ir.IntType(8))
             gathered = b.insert_element(gathered, b.load(place, typ=DOUBLE, align=8), lane)
         return gathered
+
+    def gather_pairs(self, addresses: IrValue, shift: IrValue) -> list[IrValue]:
+        """Load two doubles in a row at each of the addresses, each shifted by `shift` doubles."""
+        b = self.builder
+        step = b.shl(shift, self.make_integer(3))
+        pair = ir.VectorType(DOUBLE, 2)
+        parts = []
+        for number in range(self.width):
+            start = b.inttoptr(
+                b.extract_element(addresses, ir.Constant(_INT32, number)), ir.PointerType()
+            )
+            place = b.gep(start, [step], source_etype=ir.IntType(8))
+            parts.append(b.load(place, typ=pair, align=8))
+        whole = self._join_vectors(parts)
+        nothing = ir.Constant(whole.type, ir.Undefined)
+        masks = [_make_shuffle_mask(range(side, 2 * self.width, 2)) for side in (0, 1)]
+        return [b.shuffle_vector(whole, nothing, mask) for mask in masks]
 
     def copy_rows(self, base: IrValue, target: IrValue, source: IrValue, doubles: IrValue) -> None:
         """Copy doubles inside one array; the two parts must not overlap."""

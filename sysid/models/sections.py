@@ -228,7 +228,9 @@ def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solve
         if name == "substeps":
             detail = "has no effect on a polynomial, whose terms are samples"
         reader.add_fault(join_pointer("solver", name), detail)
-    defaults = Solver()
+    method = fields.get("method", Solver().method)
+    is_runge_kutta = form == "differential" and method == "rk4"
+    defaults = Solver(interpolation="cubic" if is_runge_kutta else "linear")
     choices: dict[str, Any] = {
         name: reader.read_choice(
             fields.get(name, getattr(defaults, name)), options, "/solver/" + name

@@ -17,7 +17,7 @@ from sysid.kernels.reads import (
     find_furthest_offset,
     is_difference,
     list_delayed_values,
-    list_states_with_history,
+    list_stored_histories,
 )
 from sysid.language.intervals import bound_expression
 from sysid.models.delays import check_record_length
@@ -156,7 +156,8 @@ def pack_experiment(
             "output", i, first=first, grid=builder.add_floats(samples.grid_values)
         )
         first += samples.places.size
-    n_work = max(len(list_states_with_history(model)) * rows * LANES, 1)
+    columns = sum(history.columns for history in list_stored_histories(model))
+    n_work = max(columns * rows * LANES, 1)
     return PackedExperiment(*builder.build_arrays(), n_work)
 
 

@@ -179,15 +179,14 @@ outputs: {y: x}
 _RESTING = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
 WRITTEN: dict[str, tuple[Model, Case]] = {
     "rk4": (written(TWO), _TWO),
-    "rk4_substeps_cubic": (written(TWO, substeps=3, interpolation="cubic"), _TWO),
+    "rk4_substeps": (written(TWO, substeps=3), _TWO),
+    "rk4_linear": (written(TWO, interpolation="linear"), _TWO),
     "rk4_own_step": (written(TWO, step=0.017, history="zero"), _TWO),
     "euler_nearest": (written(TWO, method="euler", substeps=2, interpolation="nearest"), _TWO),
+    "euler_cubic": (written(TWO, method="euler", interpolation="cubic"), _TWO),
     "semi_implicit": (written(TWO, method="semi-implicit", history="zero", step=0.03), _TWO),
     "steady": (starting(RESTING, "steady"), _RESTING),
-    "steady_substeps_cubic": (
-        starting(RESTING, "steady", substeps=2, interpolation="cubic"),
-        _RESTING,
-    ),
+    "steady_substeps": (starting(RESTING, "steady", substeps=2), _RESTING),
     "start_of_recursion": (starting(RECURSION, {"x": "d*u0 - L", "w": "u0/d"}), _RECURSION),
     "selected": (selected(), Case({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
     "recursion": (written(RECURSION), _RECURSION),

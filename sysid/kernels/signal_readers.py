@@ -1,0 +1,116 @@
+"""Readers of all signals of a model, in one block of individuals."""
+
+from sysid.kernels import reads
+from sysid.kernels.cubic_reads import CubicReader
+from sysid.kernels.delayed_reads import (
+    DelayedReader,
+    DirectReader,
+    InputReader,
+    LinearReader,
+    TimeStep,
+)
+from sysid.kernels.signals import Delays, ExperimentHead, States
+from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
+from sysid.language.tree import Expression, PastValue
+from sysid.models.model import Model
+
+
+class SignalReaders:
+    """Readers of all delayed signals of a model, and the inputs without delay."""
+
+    def __init__(
+        self,
+        lanes: VectorBuilder,
+        model: Model,
+        experiment: ExperimentHead,
+        states: States,
+        delays: Delays,
+        one_step: bool,
+    ) -> None:
+        self._lanes, self._model, self._experiment = lanes, model, experiment
+        self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
+        self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
+        self._owners: list[tuple[str, DelayedReader]] = []
+        cubic = model.solver.interpolation == "cubic"
+        for past, places in reads.group_delayed_reads(model, "state").items():
+            delay = lanes.clamp(delays.to_steps(past[1]), experiment.get_number("cap"))
+            if reads.reads_cubics(model):
+                self._add_reader(past, places, CubicReader(lanes, states, past, delay))
+                continue
+            history = states.get_history(past[0])
+            if one_step or cubic:
+                self._add_reader(past, places, DirectReader(lanes, history, delay, cubic))
+                continue
+            for chain in _group_state_places(places):
+                reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
+                served = places if chain[0] > 0 else set()
+                self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
+        for past, places in reads.group_delayed_reads(model, "input").items():
+            for chain in reads.group_places(places):
+                self._add_reader(
+                    past,
+                    {*chain},
+                    self._build_input_reader(past[0], delays.to_steps(past[1]), chain),
+                )
+
+    def _add_reader(
+        self, past: tuple[str, Expression], places: set[int], reader: DelayedReader
+    ) -> None:
+        for place in places:
+            self._readers[*past, place] = reader
+        self._owners.append((past[0], reader))
+
+    def _build_input_reader(self, name: str, delay: IrValue, chain: list[int]) -> InputReader:
+        lanes, number, experiment = self._lanes, self._inputs[name], self._experiment
+        points = experiment.get_input_field(number, "points")
+        fine = lanes.mul(delay, lanes.builder.sitofp(points, DOUBLE))
+        cap = lanes.builder.sitofp(experiment.get_input_field(number, "cap"), DOUBLE)
+        zero = self._find_input_start(number)
+        return InputReader(lanes, experiment.floats, zero, points, lanes.clamp(fine, cap), chain)
+
+    def _find_input_start(self, number: int) -> IrValue:
+        """Find the place of an input at step 0; difference equations read just after a jump."""
+        zero = self._experiment.get_input_field(number, "zero")
+        if not reads.is_difference(self._model):
+            return zero
+        return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
+
+    def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
+        """Return the reader of a delayed signal at a place."""
+        if past.delay is None:
+            raise AssertionError(f"{past.name} is read without delay")
+        return self._readers[past.name, past.delay, halves]
+
+    def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
+        """Load an input without delay: the same for all individuals."""
+        b, lanes, number = self._lanes.builder, self._lanes, self._inputs[name]
+        points = self._experiment.get_input_field(number, "points")
+        start = b.add(self._find_input_start(number), b.mul(step, points))
+        if reads.is_difference(self._model):
+            shift = b.mul(points, lanes.make_integer(halves // 2))
+        elif halves == 1:
+            shift = b.ashr(points, lanes.make_integer(1))
+        else:
+            shift = self._experiment.get_input_field(number, "end" if halves == 2 else "begin")
+        return lanes.load_double(self._experiment.floats, b.add(start, shift))
+
+    def open_loop(self, loop: KernelLoop) -> None:
+        """Open the readers at the head of the time loop."""
+        for _, reader in self._owners:
+            reader.open_loop(loop)
+
+    def begin_step(self, time_step: TimeStep) -> None:
+        """Begin a step of all readers."""
+        for _, reader in self._owners:
+            reader.begin_step(time_step)
+
+    def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
+        """End a step of all readers."""
+        for name, reader in self._owners:
+            reader.end_step(loop, following.get(name, self._lanes.make_number(0.0)))
+
+
+def _group_state_places(places: set[int]) -> list[list[int]]:
+    """Group whole steps into chains; one that reaches the present step has its start too."""
+    forward = {0, 2} if any(place > 0 for place in places) else set()
+    return reads.group_places({place for place in places if place % 2 == 0} | forward)
