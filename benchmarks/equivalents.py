@@ -144,7 +144,7 @@ class Compiled:
         )
         rows = np.ascontiguousarray(theta.T)
         samples = evaluator.n_measured
-        work = np.zeros((samples + HISTORY) * LANES)
+        work = np.zeros(2 * (samples + HISTORY) * LANES)
         fitness = np.empty(theta.shape[0])
 
         def address(values: FloatArray) -> ctypes.c_void_p:

@@ -151,29 +151,38 @@ void narx(ARGUMENTS) {
   }
 }
 
-/* dx/dt = beta x(t - L)/(1 + x(t - L)^n) - gamma x, RK4; lags from one step up to the history's front; x(0) measured. */
+/* dx/dt = beta x(t - L)/(1 + x(t - L)^n) - gamma x, RK4; lags from two steps up to the history's front; x(0) measured.
+ * Each step has a cubic through its values and slopes. The history has what the lag reads of it: whole and half steps. */
 void mackey(ARGUMENTS) {
   (void)u, (void)zero, (void)points;
   long pad = 128;
   for (long p0 = 0; p0 < P; p0 += W) {
-    double beta[W], gamma[W], n[W], part[W], sum[W], x[W], older[W], old[W], first[W];
-    long offset[W];
+    double beta[W], gamma[W], n[W], sum[W], x[W], older[W], rise[W], last[W], middle[W], first[W];
+    double line[2][W], begin[2][W], end[2][W];
+    long offset[W], late[W];
     LANES {
       double d = ROW(3) / h;
       long whole = (long)d;
       beta[j] = ROW(0), gamma[j] = ROW(1), n[j] = ROW(2);
-      part[j] = d - whole, offset[j] = (1 - whole) * W + j;
-      sum[j] = 0, x[j] = older[j] = old[j] = y[0];
+      offset[j] = (1 - whole) * 2 * W + j, late[j] = d - whole < 0.5;
+      for (int i = 0; i < 2; i++) {
+        double f = i == 0 ? d - whole : d - whole + (late[j] ? 0.5 : -0.5);
+        begin[i][j] = f * f * (1 - f), end[i][j] = -f * (1 - f) * (1 - f);
+        line[i][j] = f + begin[i][j] + end[i][j];
+      }
+      sum[j] = rise[j] = last[j] = 0, x[j] = older[j] = middle[j] = y[0];
       first[j] = beta[j] * y[0] / (1 + pow(y[0], n[j]));
     }
-    for (long k = 0; k <= pad; k++) LANES work[k * W + j] = y[0];
+    for (long k = 0; k < 2 * pad; k++) LANES work[k * W + j] = y[0];
     for (long k = 0; k < N - 1; k++) {
-      double *row = work + (k + pad) * W, half[W], whole[W], powers[2][W], ahead[W];
+      double *row = work + (k + pad) * 2 * W, half[W], whole[W], powers[2][W];
+      for (int i = 0; i < 2; i++)
+        LANES row[i * W + j] =
+            x[j] + line[i][j] * (older[j] - x[j]) + begin[i][j] * rise[j] + end[i][j] * last[j];
 #pragma GCC ivdep
       for (int j = 0; j < W; j++) {
-        double next = row[offset[j]], f = part[j];
-        double later = next + (f + 0.5) * (old[j] - next), earlier = old[j] + (f - 0.5) * (older[j] - old[j]);
-        half[j] = f < 0.5 ? later : earlier, whole[j] = next + f * (old[j] - next), ahead[j] = next;
+        double ahead = row[offset[j] + W];
+        whole[j] = row[offset[j]], half[j] = late[j] ? ahead : middle[j], middle[j] = ahead;
       }
       LANES powers[0][j] = pow(half[j], n[j]);
       LANES powers[1][j] = pow(whole[j], n[j]);
@@ -183,9 +192,8 @@ void mackey(ARGUMENTS) {
         double k2 = f1 - gamma[j] * (x[j] + 0.5 * h * k1);
         double k3 = f1 - gamma[j] * (x[j] + 0.5 * h * k2);
         double k4 = f2 - gamma[j] * (x[j] + h * k3);
+        older[j] = x[j], rise[j] = h * k1, last[j] = h * k4, first[j] = f2;
         x[j] += h / 6 * (k1 + k4 + 2 * (k2 + k3));
-        older[j] = old[j], old[j] = ahead[j], first[j] = f2;
-        row[W + j] = x[j];
         double e = y[k + 1] - x[j];
         sum[j] += e * e;
       }
