@@ -366,14 +366,15 @@ class _EstimateSearch:
         """Scan from an end, and continue from the ends of the search; count the simulations."""
         problem, is_late = self.problem, self._deadline.is_past_grace
         start = RefinedCandidate(end.theta, end.rms, 0)
-        most = self._count_scan_simulations()
-        scanned = scan_parameters(problem, start, self._list_delays(), most, is_late)
+        most, delays = self._count_scan_simulations(), self._list_delays()
+        is_doubtful = bool(delays) and self._is_doubtful(end)
+        scanned = scan_parameters(problem, start, delays, most, is_late, is_doubtful=is_doubtful)
         found, spent = [Fit(one.theta, one.rms) for one in scanned.ends[1:]], scanned.evaluations
         archived = [one for island in self._state.islands for one in read_archive(island.archive)]
         known = [*ends, *found]
         continued, count = continue_from_archive(problem, archived, known, most - spent, is_late)
         found, spent = found + continued, spent + count
-        if self._is_doubtful(end):
+        if is_doubtful:
             most = count_affordable_simulations(problem, self._deadline.is_over(), _MOST_PROJECTED)
             most = self._budget.cap(most, spent, _SCAN_SHARES)
             projected = scan_by_projection(problem, start, self._state.seed, most, is_late)
@@ -386,7 +387,7 @@ class _EstimateSearch:
         """Whether the search may have missed the best minimum, a time lag's above all."""
         restarts = count_restarts(*self._state.champions_and_counters)
         share = _ENOUGH_SHARE * restarts.independent
-        if not self._list_delays() or restarts.confirmed > share:
+        if restarts.confirmed > share:
             return False
         simulated = self.problem.predict(end.theta[None])[0]
         return not is_noise(run_residual_tests(self.problem, simulated, "estimation"))

@@ -32,7 +32,7 @@ from sysid.uncertainty.estimates import Estimate
 from sysid.uncertainty.linear_model import LinearOutputModel
 
 _DELAY_PLACES, _PLACES = 128, 16  # of a scan: over the range of a time lag, of another parameter
-_STARTS = 6  # dips from which least squares continues, in a round
+_STARTS, _STARTS_IN_DOUBT = 6, 12  # dips from which least squares continues, in a round
 _TRIAL_STEPS, _MAX_STEPS = 4, 20  # of least squares from each, and from a promising one
 _PROMISING = 1.5  # times the RMS of the best: least squares continues below it
 _MAX_ROUNDS = 4
@@ -87,6 +87,7 @@ def scan_parameters(
     is_late: Callable[[], bool] | None = None,
     *,
     only_delays: bool = False,
+    is_doubtful: bool = False,
 ) -> ScanResult:
     """Scan each parameter alone from a minimum, with at most `budget` simulations.
 
@@ -98,6 +99,8 @@ def scan_parameters(
         Numbers of the free parameters that time lags depend on. They are scanned first.
     only_delays : bool
         Whether no other parameter is scanned.
+    is_doubtful : bool
+        Whether least squares continues from twice as many dips.
     """
     others = () if only_delays else [d for d in range(start.theta.size) if d not in delays]
     best, ends, spent = start, [start], 0
@@ -105,6 +108,7 @@ def scan_parameters(
         scanned = _scan_around(problem, best, delays, others, budget - spent)
         spent += sum(series.values.size - 1 for series in scanned)
         dips = _find_dips(scanned, problem.output_scale)
+        dips = dips[: _STARTS_IN_DOUBT if is_doubtful else _STARTS]
         found, count = _refine_dips(problem, dips, best.rms, budget - spent, is_late)
         spent += count
         ends += found
@@ -260,7 +264,7 @@ def _find_dips(scanned: Sequence[_Series], limit: float) -> list[tuple[FloatArra
         is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:]) & (values < limit)
         is_dip[centre] = False
         dips += [(places[i], float(values[i])) for i in np.flatnonzero(is_dip)]
-    return sorted(dips, key=lambda dip: dip[1])[:_STARTS]
+    return sorted(dips, key=lambda dip: dip[1])
 
 
 def collect_minima(
