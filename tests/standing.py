@@ -17,6 +17,7 @@ from benchmarks.breaking.audit import is_over
 from benchmarks.breaking.stand import Stand, standing_service, until
 from benchmarks.breaking.work import DEADLY, GREEDY
 from service.storage.tables import Checkpoint, Job, Run
+from tests.foreign_modules import ForeignFolder
 
 LIMIT_SECONDS = 200.0
 LEASE_SECONDS = 2.0
@@ -30,10 +31,12 @@ class Service:
     ----------
     folder : Path
         Has files that break the service, its data and the recording of the dataset.
+    foreign : ForeignFolder
+        Where the service was started.
     """
 
-    def __init__(self, stand: Stand, folder: Path) -> None:
-        self.stand, self.folder = stand, folder
+    def __init__(self, stand: Stand, folder: Path, foreign: ForeignFolder) -> None:
+        self.stand, self.folder, self.foreign = stand, folder, foreign
         self.clock, self.ray_away = folder / "clock", folder / "ray-away"
         record = paper_example.write_csv(folder / "record.csv", seed=1)
         self._dataset = stand.client.add_dataset(record, name="example 1")["id"]
@@ -96,9 +99,15 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         "BREAK_MEMORY": ",".join(map(str, GREEDY)),
         "LAGID_WORKER_MEMORY_MB": "512",
     }
-    stand = Stand(folder / "data", lease_seconds=LEASE_SECONDS, environment=environment)
+    foreign = ForeignFolder(folder)
+    stand = Stand(
+        folder / "data",
+        lease_seconds=LEASE_SECONDS,
+        environment=environment,
+        working_folder=foreign.path,
+    )
     with standing_service(stand):
-        yield Service(stand, folder)
+        yield Service(stand, folder, foreign)
         stand.stop()
         assert stand.leftovers() == []
 

@@ -9,13 +9,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
+from sysid.core.child_processes import build_import_path
 from workers.cluster_address import explain_failure
 from workers.errors import ClusterUnavailable
-from workers.ray_folders import clear_dead_dispatchers, get_ray_folder
+from workers.ray_folders import clear_dead_dispatchers, get_inner_folder, get_ray_folder
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; Ray's default is 30 % of the memory."""
@@ -56,6 +57,7 @@ class LocalRay:
     module
         `ray`. It reads its environment at import, so it is imported here.
     folder : Path
+        Private folder around Ray's own, which Ray opens to everybody.
 
     Raises
     ------
@@ -69,7 +71,8 @@ class LocalRay:
         self.folder = make_folder()
         os.environ.update(RAY_ENVIRONMENT)
         os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
-        os.environ.update(ONE_THREAD_ENVIRONMENT)  # inherited by the workers
+        # Inherited by the workers.
+        os.environ.update(ONE_THREAD_ENVIRONMENT, PYTHONPATH=build_import_path())
         import ray
 
         self.module: Any = ray
@@ -92,7 +95,7 @@ class LocalRay:
 
 
 def make_folder() -> Path:
-    """Make Ray's folder for this process, and clear the remains of dead dispatchers.
+    """Make the private folder for Ray of this process, and clear the remains of dead dispatchers.
 
     Raises
     ------
@@ -113,13 +116,14 @@ def make_folder() -> Path:
 
 
 def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:
-    with _skip_unused_programs():
+    # Ray's workers import from the working folder first, so it is one without anybody's modules.
+    with _skip_unused_programs(), chdir(folder):
         ray.init(
             address="local",  # never a cluster that happens to run on this host
             num_cpus=cpus,
             include_dashboard=False,
             object_store_memory=OBJECT_STORE_BYTES,
-            _temp_dir=str(folder),
+            _temp_dir=str(get_inner_folder(folder)),
             **INIT_ARGUMENTS,
         )
 

@@ -10,7 +10,7 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import chdir, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -274,9 +274,11 @@ def _is_running(process: psutil.Process) -> bool:
 
 def _join_cluster(ray: Any, address: str) -> None:
     try:
-        ray.init(
-            address=address, runtime_env={"env_vars": ONE_THREAD_ENVIRONMENT}, **INIT_ARGUMENTS
-        )
+        # The workers import from this working folder first: on their machines only root writes it.
+        with chdir("/"):
+            ray.init(
+                address=address, runtime_env={"env_vars": ONE_THREAD_ENVIRONMENT}, **INIT_ARGUMENTS
+            )
     except INIT_ERRORS as error:
         raise ClusterUnavailable(explain_failure(address, error)) from error
 

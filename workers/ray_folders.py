@@ -14,15 +14,20 @@ import psutil
 
 from sysid.core.machine import make_machine_tag
 
-_MAX_BASE_LENGTH = 22  # rest of a socket's path, after Ray's names and numbers of seven digits
+_MAX_BASE_LENGTH = 20  # rest of a socket's path, after all names and numbers of seven digits
 
 
 def get_ray_folder(pid: int) -> Path:
-    """Return Ray's folder for the dispatcher of this process number.
+    """Return the private folder around Ray's folder, for the dispatcher of this process number.
 
     Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
     """
     return _choose_base_folder() / f"{_make_folder_prefix()}{pid}"
+
+
+def get_inner_folder(folder: Path) -> Path:
+    """Return Ray's own folder inside the private one. Ray opens all its folders to everybody."""
+    return folder / "r"
 
 
 def find_folder_processes(pid: int) -> tuple[int, ...]:

@@ -6,7 +6,6 @@ import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -21,6 +20,7 @@ from service.client.client import Client
 from service.client.embedded import find_free_port
 from service.core.settings import make_sqlite_url
 from service.storage.sessions import Database
+from sysid.core.child_processes import build_child_command
 
 SHIM = Path(__file__).with_name("shim")
 START_SECONDS = 180.0
@@ -41,6 +41,8 @@ class Stand:
         Length of the leases of its dispatchers.
     environment : mapping
         Further variables for all its processes.
+    working_folder : Path, optional
+        Where the service is started; by default here.
     """
 
     def __init__(
@@ -51,10 +53,12 @@ class Stand:
         cpus: int = 2,
         lease_seconds: float = 10.0,
         environment: Mapping[str, str] | None = None,
+        working_folder: Path | None = None,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.temporary = Path(tempfile.mkdtemp(prefix="lb"))  # short: Ray puts sockets there
+        self.temporary = Path(tempfile.mkdtemp(prefix=""))  # short: Ray puts sockets there
         self.folder, self.port = folder, find_free_port()
+        self._working_folder = working_folder
         self.lease_seconds = lease_seconds
         self.family = Family(mark := secrets.token_hex(8))
         address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
@@ -110,8 +114,9 @@ class Stand:
         """A second dispatcher for the length of the block, which ends in order."""
         with (self.folder / "second.log").open("ab") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "service.dispatch.process"],
+                build_child_command("service.dispatch.process"),
                 env=self.environment,
+                cwd=self._working_folder,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -166,8 +171,9 @@ class Stand:
     def _spawn(self) -> None:
         with (self.folder / "serve.log").open("ab") as log:
             self.web = subprocess.Popen(
-                [sys.executable, "-m", "service.cli.main", "serve"],
+                build_child_command("service.cli.main", "serve"),
                 env=self.environment,
+                cwd=self._working_folder,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

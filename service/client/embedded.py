@@ -4,7 +4,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from pathlib import Path
 import httpx
 
 from service.core.errors import ServiceDidNotStart
+from sysid.core.child_processes import build_child_command, build_import_path
 
 START_LIMIT_SECONDS = 240.0
 """A first start compiles the loops, which takes minutes on a busy machine."""
@@ -44,15 +44,21 @@ def run_embedded_service(
     ServiceDidNotStart
         If it ended or was not ready in time; the message quotes the end of its log.
     """
-    data_dir.mkdir(parents=True, exist_ok=True)
+    data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     chosen_port = port or find_free_port()
     url = f"http://127.0.0.1:{chosen_port}"
-    command = [sys.executable, "-m", "service.cli.main", "serve", "--data-dir", str(data_dir)]
+    command = build_child_command("service.cli.main", "serve", "--data-dir", str(data_dir))
     command += ["--host", "127.0.0.1", "--port", str(chosen_port)]
     command += ["--cpus", str(cpus)] if cpus else []
     log = data_dir / "serve.log"
     with log.open("ab") as sink:
-        child = subprocess.Popen(command, stdout=sink, stderr=sink, stdin=subprocess.DEVNULL)
+        child = subprocess.Popen(
+            command,
+            env={**os.environ, "PYTHONPATH": build_import_path()},
+            stdout=sink,
+            stderr=sink,
+            stdin=subprocess.DEVNULL,
+        )
     try:
         _wait_until_ready(url, child, log)
         yield url

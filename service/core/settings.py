@@ -4,7 +4,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.core.errors import Misconfigured
@@ -71,6 +71,15 @@ class Settings(BaseSettings):
     max_attempts: int = Field(default=3, ge=1)
     poll_seconds: float = Field(default=0.3, gt=0)
     data: Path | None = None
+
+    @field_validator("database_url")
+    @classmethod
+    def _resolve_sqlite_path(cls, url: str | None) -> str | None:
+        """Make the path of a SQLite file absolute, for processes that work in another folder."""
+        path = (url or "").removeprefix("sqlite:///")
+        if path == (url or "") or not path or path.startswith(("/", ":memory:", "file:")):
+            return url
+        return f"sqlite:///{Path(path).absolute()}"
 
     @property
     def resolved_database_url(self) -> str:

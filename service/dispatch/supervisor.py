@@ -5,7 +5,6 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +15,7 @@ import psutil
 
 from service.core.processes import is_stopped
 from service.core.settings import Settings
+from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 from workers.ray_folders import clear_ray_remains, kill_processes
 
 _log = logging.getLogger(__name__)
@@ -120,6 +120,7 @@ class Supervisor:
             self._child = subprocess.Popen(
                 self._command,
                 env={**os.environ, **self._environment, SUPERVISED_VARIABLE: "1"},
+                cwd=SAFE_FOLDER,
                 stdin=subprocess.PIPE,  # never written to: its end signals our death
                 stdout=sink,
                 stderr=sink,
@@ -132,8 +133,8 @@ class Supervisor:
 def supervise_dispatcher(settings: Settings) -> Iterator[Supervisor]:
     """Keep a dispatcher with these settings running during the block."""
     supervisor = Supervisor(
-        [sys.executable, "-m", "service.dispatch.process"],
-        to_environment(settings),
+        build_child_command("service.dispatch.process"),
+        {**to_environment(settings), **make_paths_absolute(os.environ)},
         settings.data_dir.absolute() / "logs" / "dispatcher.log",
     )
     supervisor.start()
@@ -141,6 +142,19 @@ def supervise_dispatcher(settings: Settings) -> Iterator[Supervisor]:
         yield supervisor
     finally:
         supervisor.stop()
+
+
+_PATH_VARIABLES = ("TMPDIR", "LAGID_CACHE_DIR", "NUMBA_CACHE_DIR", "RAY_AUTH_TOKEN_PATH")
+
+
+def make_paths_absolute(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables that name paths, for a child that works in another folder."""
+    paths = {
+        name: os.path.abspath(environment[name])
+        for name in _PATH_VARIABLES
+        if environment.get(name)
+    }
+    return {**paths, "PYTHONPATH": build_import_path()}
 
 
 def to_environment(settings: Settings) -> dict[str, str]:

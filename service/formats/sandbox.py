@@ -7,7 +7,6 @@ it and writes its content again with our writer. This process reads only that co
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import file_digest
@@ -19,6 +18,7 @@ from service.core import temporary_files
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
+from sysid.core.child_processes import build_child_command, build_import_path
 from sysid.data.records import Recording
 
 FileKind = Literal["csv", "mcap"]
@@ -77,21 +77,24 @@ def read_untrusted(
             "segments": list(segments),
             "limits": asdict(limits),
         }
-        notes = _parse_answer(_run_child(task, limits), limits)
+        notes = _parse_answer(_run_child(task, limits, folder), limits)
         return UploadedRecording(read_recording(clean, limits), notes, sha256)
 
 
-def _run_child(task: dict[str, Any], limits: UploadLimits) -> "subprocess.CompletedProcess[str]":
+def _run_child(
+    task: dict[str, Any], limits: UploadLimits, folder: str
+) -> "subprocess.CompletedProcess[str]":
     # The child gets no secret of this process's environment.
     environment = {
         "PATH": os.environ.get("PATH", ""),
-        "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry) or os.getcwd(),
+        "PYTHONPATH": build_import_path(),
         "OPENBLAS_NUM_THREADS": "1",  # its threads' stacks would count as memory
         "PYTHONUTF8": "1",
     }
     try:
         return subprocess.run(
-            [sys.executable, "-m", "service.formats.sandbox_child"],
+            build_child_command("service.formats.sandbox_child"),
+            cwd=folder,
             input=json.dumps(task),
             capture_output=True,
             text=True,

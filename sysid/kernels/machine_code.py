@@ -15,6 +15,7 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
+from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 from sysid.kernels.vectors import load_vector_functions
 
 _OPTIMIZATION_LEVEL = 3
@@ -95,15 +96,14 @@ def compile_bounded(assembly: str) -> bytes:
 
 
 def _compile_in_subprocess(assembly: str) -> bytes:
-    # Same import path as this process: `-m` alone would put the working folder first.
-    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     inherited = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
     return subprocess.run(
-        [sys.executable, "-P", "-m", "sysid.kernels.machine_code"],
+        build_child_command("sysid.kernels.machine_code"),
         input=assembly.encode(),
         stdout=subprocess.PIPE,
         timeout=_TIMEOUT_SECONDS,
-        env={**inherited, "PYTHONPATH": path},
+        env={**inherited, "PYTHONPATH": build_import_path()},
+        cwd=SAFE_FOLDER,
         check=True,
     ).stdout
 
