@@ -4,6 +4,7 @@
     - ClusterUnavailable   Ray could not be started or joined
     - ClusterLost          Ray does not answer any more: the process should end and be restarted
     - RecordsUnavailable   a run's records cannot be loaded
+    - InvalidCheckpoint    a run's checkpoint does not fit its model or its settings
     - PackLost             a pack of work was not finished
         - WorkerDied           its process was killed or ran out of memory
         - PackCancelled        it was cancelled on request
@@ -27,6 +28,13 @@ class ClusterLost(WorkersError):
 
 class RecordsUnavailable(WorkersError):
     """A run's records cannot be loaded; the message is a sentence for its user."""
+
+
+class InvalidCheckpoint(WorkersError):
+    """A run's checkpoint does not fit its model or its settings."""
+
+    def __init__(self) -> None:
+        super().__init__("its checkpoint is of another model or of other settings; clone the job")
 
 
 class PackLost(WorkersError):

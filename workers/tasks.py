@@ -21,8 +21,9 @@ from sysid.identification.run import CALL_SECONDS, advance_island, begin_run, is
 from sysid.identification.run import advance_run as advance_run
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.search.island import Island
+from sysid.search.island import Island, get_island_settings, split_population
 from sysid.simulation.problem import Problem, compute_reference_rms
+from workers.errors import InvalidCheckpoint
 from workers.protocol import (
     AdvanceRun,
     EvolveIsland,
@@ -79,16 +80,36 @@ def process_pack(
 def _process_item(item: WorkItem, records: Mapping[str, Records]) -> Outcome:
     try:
         problem, validation = _get_problem(item.spec.problem, records)
+        _check_islands(item, problem)
         if isinstance(item, EvolveIsland):
             return IslandProgress(_evolve_item(item, problem), item.target)
         return _advance_item(item, problem, validation, records)
-    except SysidError as error:
+    except (SysidError, InvalidCheckpoint) as error:
         return RunFailure(str(error), type(error).__name__)
     except MemoryError as error:
         return RunFailure(f"it needs more memory than a worker may use: {error}", "OutOfMemory")
     except Exception as error:  # noqa: BLE001 - the process border: its pack-mates go on
         _log.exception("run %s met a programming error", item.run)
         return RunFailure(f"internal error: {type(error).__name__}: {error}", "InternalError")
+
+
+def _check_islands(item: WorkItem, problem: Problem) -> None:
+    """Refuse islands of another problem, for which compiled code would leave its arrays.
+
+    A checkpoint comes from the database, and not only lagid can write there.
+    """
+    if isinstance(item, EvolveIsland):
+        islands: tuple[Island, ...] = (item.island,)
+    else:
+        islands = () if item.state is None else item.state.islands
+        if islands and len(islands) != item.spec.algorithm.n_islands:
+            raise InvalidCheckpoint
+    n, sizes = len(problem.free_parameters), split_population(item.spec.algorithm)
+    for island in islands:
+        bits = get_island_settings(item.spec.algorithm, island.index).bits
+        is_larger = island.chromosomes.max(initial=0) >= 1 << bits
+        if island.chromosomes.shape != (sizes[island.index], n) or is_larger:
+            raise InvalidCheckpoint
 
 
 def _advance_item(

@@ -11,7 +11,7 @@ from service.core.errors import ServiceError
 from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
 from service.datasets.signal_channels import SignalChannels, map_channels
-from service.dispatch.checkpoints import unpack_state
+from service.dispatch.checkpoints import UnreadableCheckpoint, unpack_state
 from service.dispatch.fitted_signals import (
     FittedPart,
     SignalsBatch,
@@ -23,7 +23,7 @@ from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import build_stored_cells, read_axis_groups
 from service.jobs.to_core import fit_settings_of, to_algorithm
 from service.models.models import load_stored_model
-from service.queue.leases import Claim
+from service.queue.leases import Claim, LeaseQueue
 from service.queue.previous_attempts import delete_progress
 from service.queue.reuse import find_computed_runs, write_hashes
 from service.queue.run_writes import RunWriter
@@ -103,9 +103,9 @@ class JobRuns:
                 if not rows:
                     yield RunNotReady()
                     continue
-                states = {row.id: unpack_state(checkpoints.pop(row.id, None)) for row in rows}
+                states, unreadable = _unpack_states(rows, checkpoints)
                 fresh = [run for run, state in states.items() if state is None]
-                retry_transient(partial(self._forget_progress, fresh))
+                retry_transient(partial(self._forget_progress, fresh, unreadable))
                 yield from self._to_coming_runs([(row, states.pop(row.id)) for row in rows])
         except LeaseLost as error:  # the recorder meets it too, and stops the job
             _log.warning("no more runs are read: %s", error)
@@ -274,10 +274,12 @@ class JobRuns:
         with self._database.write_session() as session:
             return RunWriter(session, self._lease).list_pending(READ_AHEAD, after)
 
-    def _forget_progress(self, runs: list[str]) -> None:
+    def _forget_progress(self, runs: list[str], messages: list[str]) -> None:
         if self._lease.attempt > 1 and runs:
             with self._database.write_session() as session:
                 delete_progress(session, self._lease, runs)
+                for message in messages:
+                    LeaseQueue(session).append_event(self._lease, "log", {"message": message})
 
     def _build_queued_run(self, row: Run, state: RunState | None) -> QueuedRun | InvalidRun:
         try:
@@ -307,3 +309,19 @@ class JobRuns:
         key = repr(data)
         self._data[key] = data
         return key
+
+
+def _unpack_states(
+    rows: Sequence[Run], checkpoints: dict[str, bytes]
+) -> tuple[dict[str, RunState | None], list[str]]:
+    """Take the checkpoints of these runs; return their states, and what cannot be read."""
+    states: dict[str, RunState | None] = {row.id: None for row in rows}
+    unreadable = []
+    for row in rows:
+        data = checkpoints.pop(row.id, None)
+        if data is not None:
+            try:
+                states[row.id] = unpack_state(data)
+            except UnreadableCheckpoint as error:
+                unreadable.append(f"{row.id} starts anew: its checkpoint cannot be read, {error}")
+    return states, unreadable

@@ -15,6 +15,7 @@ from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
 from tests.dispatching import Place
 from tests.runs import RECORDS, spec
+from tests.searching import bits
 from workers.protocol import QueuedRun, RunFailure
 from workers.tasks import build_pack_problems
 
@@ -131,6 +132,9 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     with place.database.read_session() as session:
         lengths = [len(RunRepository(session).read_history(run)) for run in runs]
         logs = [len(RunRepository(session).read_migrations(run)) for run in runs]
-        kept = [(one.run_id, unpack_state(one.state) is None) for one in session.query(Checkpoint)]
+        kept = [(one.run_id, bits(unpack_state(one.state))) for one in session.query(Checkpoint)]
+        told = [one.data for one in EventRepository(session).list_after(job) if one.kind == "log"]
     assert (lengths, logs) == ([2, 2, 0, 0], [1, 1, 0, 0])
-    assert kept == [(runs[1], False)]
+    assert kept == [(runs[1], bits(state))]
+    why = "its checkpoint cannot be read, another version of lagid wrote it"
+    assert told == [{"message": f"{runs[2]} starts anew: {why}"}]

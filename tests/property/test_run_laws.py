@@ -1,12 +1,11 @@
 """Laws of a run: it does not matter where it is cut, nor who evolves which island."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.dispatch.checkpoints import pack_state, unpack_state
 from sysid.core.settings import (
     SEARCH_METHODS,
     GeneticAlgorithm,
@@ -118,7 +117,7 @@ def test_a_run_cut_after_every_call_gives_the_same_bits(
     monkeypatch.setattr(run, "FIRST_CALL_STEPS", most * 8 * problem().n_steps)
     cut, calls = begin_run(problem(), algorithm, 3), 0
     while not is_finished(algorithm, cut):
-        cut = pickle.loads(pickle.dumps(advance_run(problem(), algorithm, cut, seconds)))
+        cut = unpack_state(pack_state(advance_run(problem(), algorithm, cut, seconds)))
         calls += 1
     assert bits(cut) == bits(whole)
     assert calls >= sum(island.generation for island in cut.islands) / most
