@@ -47,7 +47,7 @@ def serve(
     """Serve REST and pages, and run a dispatcher (defaults from LAGID_… variables)."""
     settings = load_settings(host=host, port=port, data_dir=data_dir, cpus=cpus)
     settings.check_exposure()
-    settings.prepare_data_folder()
+    _prepare_data_folder(settings)
     with open_listener(settings.host, settings.port) as listener:
         from service.dispatch.supervisor import supervise_dispatcher
 
@@ -71,10 +71,18 @@ def serve(
 def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and compute them until stopped (`serve` starts a dispatcher itself)."""
     settings = load_settings(data_dir=data_dir, cpus=cpus)
-    settings.prepare_data_folder()
+    _prepare_data_folder(settings)
     from service.dispatch.process import run_process
 
     raise typer.Exit(run_process(settings))
+
+
+def _prepare_data_folder(settings: "Settings") -> None:
+    """Create the data folder if needed, and tell if other users can read it."""
+    settings.prepare_data_folder()
+    warning = settings.describe_open_files()
+    if warning is not None:
+        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
 
 
 def load_settings(**options: Any) -> "Settings":
@@ -216,9 +224,9 @@ def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
         with database.read_session() as session:
             lost = garbage.find_lost_hashes(session, store)
             orphans = list(garbage.find_orphans(session, store))
-            if fix:
-                freed = garbage.delete_orphans(session, store)
-                out.print(f"deleted {len(orphans)} objects, {freed} bytes")
+        if fix:
+            n_deleted, freed = garbage.delete_orphans(database, store)
+            out.print(f"deleted {n_deleted} objects, {freed} bytes")
     out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
     for sha256 in sorted(lost):
         err.print(f"lost: {sha256}", markup=False)
@@ -300,7 +308,7 @@ def _check_folder(settings: "Settings") -> str:
     folder = settings.data_dir.absolute()
     if folder.is_dir():
         settings.prepare_data_folder()
-        return str(folder)
+        return "; ".join(filter(None, (str(folder), settings.describe_open_files())))
     above = next(parent for parent in folder.parents if parent.is_dir())
     _check_writable(above)
     return f"{folder} (will be created)"

@@ -1,5 +1,6 @@
 """Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
 
+import stat
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -97,7 +98,7 @@ class Settings(BaseSettings):
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
 
     def prepare_data_folder(self) -> None:
-        """Create the data folder if it does not exist.
+        """Create the data folder, for this user only, if it does not exist.
 
         Raises
         ------
@@ -106,7 +107,7 @@ class Settings(BaseSettings):
         """
         folder = self.data_dir.absolute()
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with TemporaryFile(dir=folder):
                 pass  # only an attempt shows it: permissions, a full disk, a read-only file system
         except OSError as error:
@@ -114,6 +115,24 @@ class Settings(BaseSettings):
                 f"the data folder {folder} is not writable ({error.strerror}); "
                 "choose another with --data-dir"
             ) from error
+
+    def describe_open_files(self) -> str | None:
+        """Describe in one line what other users of this machine can read; None if nothing.
+
+        Modes of existing files are never changed: their owner may share them on purpose.
+        """
+        folder = self.data_dir.absolute()
+        database = Path(self.resolved_database_url.removeprefix("sqlite:///"))
+        for path, closed in ((folder, 0o700), (database, 0o600)):
+            if path is database and folder in database.parents:
+                continue  # the folder decides
+            mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else 0
+            if mode & 0o077:
+                return (
+                    f"other users of this machine may reach {path} (mode {mode:o}); "
+                    f"`chmod {closed:o} {path}` closes it"
+                )
+        return None
 
     def check_exposure(self) -> None:
         """Refuse to serve other hosts without API keys.

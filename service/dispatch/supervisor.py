@@ -115,8 +115,8 @@ class Supervisor:
                 return None
             sink = None
             if self._log_path is not None:
-                self._log_path.parent.mkdir(parents=True, exist_ok=True)
-                sink = stack.enter_context(self._log_path.open("ab"))
+                self._log_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                sink = stack.enter_context(open(self._log_path, "ab", opener=_open_private))
             self._child = subprocess.Popen(
                 self._command,
                 env={**os.environ, **self._environment, SUPERVISED_VARIABLE: "1"},
@@ -162,6 +162,10 @@ def to_environment(settings: Settings) -> dict[str, str]:
     values = settings.model_dump(mode="json", exclude_none=True)
     values["data_dir"] = str(settings.data_dir.absolute())
     return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
+
+
+def _open_private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:

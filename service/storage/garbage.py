@@ -7,10 +7,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.storage.columns import utc_now
-from service.storage.objects import ObjectStore, StoredObject
+from service.storage.objects import RENEWAL_AGE, ObjectStore, StoredObject
+from service.storage.sessions import Database
 from service.storage.tables import Dataset, Job, Run
 
-MINIMUM_AGE = timedelta(hours=1)
+MINIMUM_AGE = 2 * RENEWAL_AGE
 """An object may be older by this time than the row that will refer to it."""
 
 
@@ -43,11 +44,28 @@ def find_lost_hashes(session: Session, store: ObjectStore) -> set[str]:
 
 
 def delete_orphans(
-    session: Session, store: ObjectStore, older_than: timedelta = MINIMUM_AGE
-) -> int:
-    """Delete the orphans; return how many bytes were freed."""
-    freed = 0
-    for orphan in list(find_orphans(session, store, older_than)):
-        store.delete(orphan.sha256)
-        freed += orphan.size
-    return freed
+    database: Database, store: ObjectStore, older_than: timedelta = MINIMUM_AGE
+) -> tuple[int, int]:
+    """Delete the orphans; return how many objects and bytes were deleted.
+
+    The rows are looked up again right before each delete, and so is the age of the object.
+    """
+    limit, n_deleted, freed = utc_now() - older_than, 0, 0
+    with database.read_session() as session:
+        orphans = list(find_orphans(session, store, older_than))
+    for orphan in orphans:
+        with database.read_session() as session:  # a new one sees new rows
+            is_named = _is_named(session, orphan.sha256)
+        if not is_named and store.delete_older(orphan.sha256, limit):
+            n_deleted, freed = n_deleted + 1, freed + orphan.size
+    return n_deleted, freed
+
+
+def _is_named(session: Session, sha256: str) -> bool:
+    dataset = select(Dataset.id).where(Dataset.sha256 == sha256, Dataset.deleted_at.is_(None))
+    run = (
+        select(Run.id)
+        .join(Job, Job.id == Run.job_id)
+        .where(Run.signals_sha256 == sha256, Job.deleted_at.is_(None))
+    )
+    return any(session.scalar(query.limit(1)) is not None for query in (dataset, run))

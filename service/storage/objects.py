@@ -2,7 +2,8 @@
 
 The name of an object is the SHA-256 of its bytes: ``sha256/ab/<hash>.mcap``. So it never changes,
 may be written twice without harm, and its hash is its ETag. Objects are written before the row that
-refers to them. Objects without a row are garbage (`service.storage.garbage`).
+refers to them. Objects without a row are garbage (`service.storage.garbage`), once they are old. So
+storing the bytes of an old object again makes it young.
 """
 
 import hashlib
@@ -13,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, final
 from urllib.parse import unquote, urlsplit
@@ -34,6 +35,8 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 _BLOCK = 1 << 20
 _SINGLE_PUT = 64 << 20
 """Largest object in bytes that is sent in one request and thus held in memory."""
+RENEWAL_AGE = timedelta(minutes=30)
+"""An object of a bucket that is stored again after this time is written anew."""
 _RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
 
 
@@ -104,10 +107,9 @@ class ObjectStore(ABC):
             return False
         return True
 
-    def delete(self, sha256: str) -> None:
-        """Delete an object; do nothing if it does not exist."""
-        with suppress(ObjectMissing), _translate_errors("delete an object", sha256):
-            obstore.delete(self._backend, _build_object_name(sha256))
+    @abstractmethod
+    def delete_older(self, sha256: str, limit: datetime) -> bool:
+        """Delete an object that was last written before `limit`; return whether it was."""
 
     def list_objects(self) -> Iterator[StoredObject]:
         """Yield every object, in no particular order."""
@@ -159,13 +161,43 @@ class FolderStore(ObjectStore):
     def _publish(self, source: Path, name: str, size: int) -> None:
         target = self._folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError):  # another writer stored the same bytes
-            os.link(source, target)
+        while not _link_or_touch(source, target):
+            pass
         _sync_folder(target.parent)
         if target.parent not in self._synced:  # its creator may not have synced its parents
             for folder in (target.parent.parent, self._folder):
                 _sync_folder(folder)
             self._synced.add(target.parent)
+
+    def delete_older(self, sha256: str, limit: datetime) -> bool:
+        """Delete an object that was last written before `limit`; return whether it was.
+
+        It is first moved aside. So a writer of the same bytes has renewed it before, which is
+        seen here, or writes it anew.
+        """
+        with suppress(ObjectMissing), _translate_errors("delete an object", sha256):
+            target = self._folder / _build_object_name(sha256)
+            aside = self._temporary / f"{temporary_files.make_temporary_prefix()}{sha256}"
+            os.rename(target, aside)
+            is_older = aside.stat().st_mtime < limit.timestamp()
+            if not is_older:
+                with suppress(FileExistsError):
+                    os.link(aside, target)
+            aside.unlink()
+            return is_older
+        return False
+
+
+def _link_or_touch(source: Path, target: Path) -> bool:
+    """Link a file into place, or renew the one that is there; False if that has just gone."""
+    try:
+        os.link(source, target)
+    except FileExistsError:  # another writer stored the same bytes
+        try:
+            os.utime(target)
+        except FileNotFoundError:
+            return False
+    return True
 
 
 @final
@@ -192,9 +224,27 @@ class BucketStore(ObjectStore):
         if size <= _SINGLE_PUT:
             with suppress(AlreadyExistsError):  # another writer stored the same bytes
                 obstore.put(self._backend, name, source, mode="create", use_multipart=False)
-        elif not self.exists(Path(name).stem):
-            # A multipart put cannot be create-only; a rival writes the same bytes to this name.
-            obstore.put(self._backend, name, source, use_multipart=True)
+                return
+        if self._is_young(name):
+            return
+        # Written anew, an object is young. A multipart put cannot be create-only; a rival writes
+        # the same bytes to this name.
+        obstore.put(self._backend, name, source, use_multipart=size > _SINGLE_PUT)
+
+    def _is_young(self, name: str) -> bool:
+        limit = datetime.now(UTC) - RENEWAL_AGE
+        with suppress(NotFoundError, FileNotFoundError):
+            return bool(obstore.head(self._backend, name)["last_modified"] > limit)
+        return False
+
+    def delete_older(self, sha256: str, limit: datetime) -> bool:
+        """Delete an object that was last written before `limit`; return whether it was."""
+        with suppress(ObjectMissing), _translate_errors("delete an object", sha256):
+            name = _build_object_name(sha256)
+            if obstore.head(self._backend, name)["last_modified"] < limit:
+                obstore.delete(self._backend, name)
+                return True
+        return False
 
 
 def open_store(url: str, **options: Any) -> ObjectStore:

@@ -1,9 +1,10 @@
 """Engines and sessions: one transaction per session, opened for reading or for writing."""
 
+import os
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
@@ -78,6 +79,7 @@ def _create_engine(url: str, **options: Any) -> Engine:
     if address.get_backend_name() == "sqlite":
         settings = {"timeout": BUSY_SECONDS, "check_same_thread": False}
         engine = create_engine(address, json_serializer=to_json, connect_args=settings, **options)
+        event.listen(engine, "do_connect", _create_private_file)
         event.listen(engine, "connect", _prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
         return engine
@@ -90,6 +92,16 @@ def _create_engine(url: str, **options: Any) -> Engine:
     )
     event.listen(engine, "begin", _begin_postgresql)
     return engine
+
+
+def _create_private_file(
+    _dialect: Any, _entry: ConnectionPoolEntry, arguments: list[Any], _settings: dict[str, Any]
+) -> None:
+    """Create the file of a database for this user only; SQLite's other files take its mode."""
+    path = str(arguments[0])
+    if path != ":memory:" and not path.startswith("file:"):
+        with suppress(OSError):  # SQLite tells why it cannot be opened
+            os.close(os.open(path, os.O_RDONLY | os.O_CREAT, 0o600))
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:

@@ -3,7 +3,10 @@
 import hashlib
 import os
 import threading
+import time
 import uuid
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import boto3
 import pytest
@@ -13,6 +16,7 @@ from service.storage import objects
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from service.storage.objects import open_store
 
+FUTURE = datetime.now(UTC) + timedelta(days=1)
 ABSENT = "0" * 64
 CREDENTIALS = {"aws_access_key_id": "test", "aws_secret_access_key": "test"}
 
@@ -73,12 +77,27 @@ def test_a_stream_and_a_file_give_what_their_bytes_give(store, tmp_path):
     assert (tmp_path / "file").exists()
 
 
-def test_storing_again_changes_nothing(store):
+def test_storing_again_makes_an_old_object_young_and_changes_nothing_else(store, monkeypatch):
+    monkeypatch.setattr(objects, "RENEWAL_AGE", timedelta(0))
     store.put_stream([b"same"])
     (before,) = store.list_objects()
+    time.sleep(1.1 if isinstance(store, objects.BucketStore) else 0.02)  # its times are seconds
     store.put_stream([b"same"])
     (after,) = store.list_objects()
-    assert after == before
+    assert replace(after, modified_at=before.modified_at) == before
+    assert after.modified_at > before.modified_at
+    assert not store.delete_older(after.sha256, after.modified_at)
+    assert store.delete_older(after.sha256, after.modified_at + timedelta(seconds=1))
+    assert not store.exists(after.sha256)
+
+
+def test_a_young_object_of_a_bucket_is_not_sent_again(bucket, monkeypatch):
+    url, options = bucket
+    store = open_store(url, **options)
+    monkeypatch.setattr(objects, "_SINGLE_PUT", 1)
+    store.put_stream([b"large"])
+    monkeypatch.setattr(objects.obstore, "put", None)
+    assert store.put_stream([b"large"]).size == 5
 
 
 def test_many_writers_of_the_same_bytes_at_once_all_succeed(store):
@@ -118,7 +137,7 @@ def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
 @pytest.mark.parametrize("name", [ABSENT, "", "../../etc/passwd", "A" * 64, "0" * 63])
 def test_what_is_not_there_is_missing(store, name):
     assert not store.exists(name)
-    store.delete(name)
+    assert not store.delete_older(name, FUTURE)
     reads = (store.get_bytes, store.get_size, lambda one: store.get_range(one, 0, 1))
     for read in reads:
         with pytest.raises(ObjectMissing):
@@ -129,7 +148,7 @@ def test_what_is_not_there_is_missing(store, name):
 
 def test_a_deleted_object_is_gone_and_others_stay(store):
     one, two = store.put_stream([b"1"]).sha256, store.put_stream([b"2"]).sha256
-    store.delete(one)
+    assert store.delete_older(one, FUTURE)
     assert not store.exists(one)
     assert [left.sha256 for left in store.list_objects()] == [two]
 

@@ -93,8 +93,7 @@ def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(p
     first, before, _ = carried_out(place, **sweep(2))
     with place.database.write_session() as session:
         JobRepository(session).delete(first)
-    with place.database.read_session() as session:
-        delete_orphans(session, place.store, older_than=timedelta(0))
+    delete_orphans(place.database, place.store, older_than=timedelta(0))
     _, after, computed = carried_out(place, **sweep(2))
     assert computed == [run.id for run in after]
     assert [run.best_rms for run in after] == [run.best_rms for run in before]

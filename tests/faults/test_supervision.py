@@ -6,13 +6,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
 
 from service.core.settings import Settings
 from service.dispatch import supervisor as supervision
-from service.dispatch.supervisor import Supervisor, find_session_processes, to_environment
+from service.dispatch.supervisor import (
+    Supervisor,
+    find_session_processes,
+    make_paths_absolute,
+    to_environment,
+)
 
 LIMIT_SECONDS = 40.0
 
@@ -115,6 +121,22 @@ def test_the_settings_of_the_child_are_those_of_the_parent(
     for name, value in to_environment(settings).items():
         monkeypatch.setenv(name, value)
     assert Settings() == settings
+
+
+def test_paths_of_the_environment_hold_in_the_folder_of_the_child(tmp_path: Path) -> None:
+    with chdir(tmp_path):
+        paths = make_paths_absolute({"TMPDIR": "tmp", "LAGID_CACHE_DIR": "/cache", "HOME": "h"})
+    assert paths.pop("PYTHONPATH").split(os.pathsep)
+    assert paths == {"TMPDIR": str(tmp_path / "tmp"), "LAGID_CACHE_DIR": "/cache"}
+
+
+def test_the_log_of_a_child_is_for_its_owner_only(tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "a.log"
+    supervisor = Supervisor([sys.executable, "-S", "-c", "print(1)"], {}, log)
+    supervisor.start()
+    until(log.exists, "the log")
+    supervisor.stop()
+    assert (log.stat().st_mode & 0o777, log.parent.stat().st_mode & 0o777) == (0o600, 0o700)
 
 
 def test_a_child_that_was_at_work_is_started_again_without_waiting_longer_each_time(

@@ -1,5 +1,6 @@
 """Objects and rows: what no row names is garbage, what a row names must be there."""
 
+import os
 from datetime import timedelta
 
 import pytest
@@ -9,7 +10,14 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from service.storage.garbage import delete_orphans, find_lost_hashes, find_orphans
+from service.storage import garbage as garbage_collection
+from service.storage.columns import utc_now
+from service.storage.garbage import (
+    MINIMUM_AGE,
+    delete_orphans,
+    find_lost_hashes,
+    find_orphans,
+)
 from service.storage.objects import open_store
 from tests.stored import claimed, new_dataset
 
@@ -53,8 +61,8 @@ def test_collecting_deletes_the_garbage_only(database, store):
     kept, stray = store.put_stream([b"kept"]).sha256, store.put_stream([b"stray"]).sha256
     with database.write_session() as session:
         DatasetRepository(session).add(new_dataset(sha256=kept))
+    assert delete_orphans(database, store, AT_ONCE) == (1, len(b"stray"))
     with database.read_session() as session:
-        assert delete_orphans(session, store, AT_ONCE) == len(b"stray")
         assert find_lost_hashes(session, store) == set()
     assert store.exists(kept)
     assert not store.exists(stray)
@@ -65,3 +73,53 @@ def test_an_object_that_a_row_names_but_is_not_there_is_lost(database, store):
         DatasetRepository(session).add(new_dataset(sha256="e" * 64))
     with database.read_session() as session:
         assert find_lost_hashes(session, store) == {"e" * 64}
+
+
+OLD = 2 * MINIMUM_AGE.total_seconds()
+
+
+@pytest.fixture
+def orphan(store, tmp_path):
+    """An object that waits in vain for its row, as after a crash between the two."""
+    sha256 = store.put_stream([b"live"]).sha256
+    (file,) = (tmp_path / "objects").rglob("*.mcap")
+    os.utime(file, (file.stat().st_mtime - OLD,) * 2)
+    return sha256
+
+
+@pytest.mark.parametrize("has_row", [True, False])
+def test_an_orphan_that_is_stored_again_while_garbage_is_collected_stays(
+    database, store, orphan, monkeypatch, has_row
+):
+    def find_and_let_others_write(*arguments):
+        orphans = list(find_orphans(*arguments))
+        if has_row:  # for which nothing was written, such as a run that was taken over
+            with database.write_session() as session:
+                DatasetRepository(session).add(new_dataset(sha256=orphan))
+        else:  # its row comes later
+            store.put_stream([b"live"])
+        assert [one.sha256 for one in orphans] == [orphan]
+        return orphans
+
+    monkeypatch.setattr(garbage_collection, "find_orphans", find_and_let_others_write)
+    assert delete_orphans(database, store) == (0, 0)
+    assert store.get_bytes(orphan) == b"live"
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_an_object_that_is_stored_again_in_the_moment_it_is_deleted_stays(
+    store, orphan, monkeypatch, when
+):
+    rename = os.rename
+
+    def rename_and_let_others_write(*paths):
+        if when == "before":
+            store.put_stream([b"live"])
+        rename(*paths)
+        if when == "after":
+            store.put_stream([b"live"])
+
+    monkeypatch.setattr(os, "rename", rename_and_let_others_write)
+    assert store.delete_older(orphan, utc_now() - MINIMUM_AGE) is (when == "after")
+    assert store.get_bytes(orphan) == b"live"
+    assert list((store._folder / "tmp").iterdir()) == []

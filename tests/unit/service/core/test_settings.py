@@ -1,6 +1,7 @@
 """Settings, defaults and names that wire types take from the core."""
 
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from service.core.settings import Settings, is_loopback
 from service.jobs.schemas import JobIn
 from service.jobs.to_core import to_algorithm, to_loss
 from service.pages.choices import DEFAULTS, NAMES, TEXTS, list_choices
+from service.storage.sessions import Database
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (
     LOSS_KINDS,
@@ -129,3 +131,47 @@ def test_database_and_store_lie_in_the_data_folder_unless_named(tmp_path: Path) 
     assert settings.resolved_database_url == f"sqlite:///{tmp_path / 'lagid.db'}"
     assert settings.resolved_store_url == (tmp_path / "objects").as_uri()
     assert Settings(store_url="s3://bucket").resolved_store_url == "s3://bucket"
+
+
+def mode(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_a_new_data_folder_and_its_database_are_for_their_owner_only(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "above" / "data")
+    settings.prepare_data_folder()
+    database = Database(settings.resolved_database_url)
+    with database.engine.begin() as connection:
+        connection.exec_driver_sql("CREATE TABLE a (b)")
+        modes = {file.name: mode(file) for file in settings.data_dir.iterdir()}
+    database.dispose()
+    assert mode(settings.data_dir) == 0o700
+    assert modes == dict.fromkeys(("lagid.db", "lagid.db-shm", "lagid.db-wal"), 0o600)
+    assert settings.describe_open_files() is None
+
+
+def test_what_other_users_can_read_is_told_in_one_line_and_not_changed(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "data", tmp_path / "elsewhere.db"
+    folder.mkdir()
+    folder.chmod(0o755)
+    (folder / "lagid.db").touch(0o644)
+    settings = Settings(data_dir=folder)
+    settings.prepare_data_folder()
+    assert settings.describe_open_files() == (
+        f"other users of this machine may reach {folder} (mode 755); `chmod 700 {folder}` closes it"
+    )
+    assert mode(folder) == 0o755
+    folder.chmod(0o700)
+    assert settings.describe_open_files() is None
+    elsewhere.touch()
+    elsewhere.chmod(0o640)
+    settings = Settings(data_dir=folder, database_url=f"sqlite:///{elsewhere}")
+    assert f"`chmod 600 {elsewhere}`" in (settings.describe_open_files() or "")
+
+
+def test_the_path_of_a_sqlite_file_does_not_depend_on_the_working_folder(tmp_path: Path) -> None:
+    with chdir(tmp_path):
+        settings = Settings(database_url="sqlite:///a.db?timeout=3")
+    assert settings.resolved_database_url == f"sqlite:///{tmp_path}/a.db?timeout=3"
+    for url in ("sqlite:///:memory:", "sqlite:////a.db", "sqlite://", "postgresql+psycopg://h/d"):
+        assert Settings(database_url=url).resolved_database_url == url
