@@ -1,6 +1,7 @@
 """`lagid serve`, `lagid dispatcher`, `lagid db …` and `lagid doctor`."""
 
 import errno
+import os
 import signal
 import socket
 import sys
@@ -21,6 +22,7 @@ from service.core.errors import Misconfigured, Unavailable
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
+    from service.core.folder_lock import FolderLock
     from service.core.settings import Settings
     from service.dispatch.supervisor import Supervisor
     from service.storage.sessions import Database
@@ -48,7 +50,10 @@ def serve(
     settings = load_settings(host=host, port=port, data_dir=data_dir, cpus=cpus)
     settings.check_exposure()
     _prepare_data_folder(settings)
-    with open_listener(settings.host, settings.port) as listener:
+    with (
+        _lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
+        open_listener(settings.host, settings.port) as listener,
+    ):
         from service.dispatch.supervisor import supervise_dispatcher
 
         _exit_on_signals()
@@ -61,8 +66,11 @@ def serve(
 
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
+            url = f"http://{settings.host}:{bound}/"
+            if lock is not None:
+                lock.describe_holder(f"`lagid serve` at {url} (process {os.getpid()})")
             out.print(
-                f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); Ctrl-C ends it",
+                f"lagid serves {url} (data in {folder}); Ctrl-C ends it",
                 soft_wrap=True,
             )
             _run_server(create_app(settings), listener, supervisor)
@@ -75,6 +83,18 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     from service.dispatch.process import run_process
 
     raise typer.Exit(run_process(settings))
+
+
+def _lock_data_folder(
+    settings: "Settings", *, with_dispatcher: bool
+) -> "AbstractContextManager[FolderLock | None]":
+    """Lock the data folder for a dispatcher. Web processes without one may share a folder."""
+    from service.core.folder_lock import lock_folder
+
+    if not with_dispatcher:
+        return nullcontext()
+    advice = "a second one with --no-dispatcher only serves pages, and --data-dir names another"
+    return lock_folder(settings.data_dir, advice)
 
 
 def _prepare_data_folder(settings: "Settings") -> None:
@@ -206,6 +226,48 @@ def upgrade_database(data_dir: DataDir = None) -> None:
         )
 
 
+@database_app.command("downgrade")
+def downgrade_database(
+    revision: Annotated[str, typer.Argument(help="Earlier revision, or base: no tables at all.")],
+    data_dir: DataDir = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Go back to the tables of an earlier version; what only later ones can store is lost."""
+    from service.storage import migrate
+
+    settings = load_settings(data_dir=data_dir)
+    _require_database(settings)
+    settings.prepare_data_folder()
+    with (
+        _lock_data_folder(settings, with_dispatcher=True),
+        open_database(settings) as database,
+    ):
+        undone = migrate.list_undone_migrations(database, revision)
+        for name, description in undone:
+            out.print(f"undoes {name}: {description}", markup=False)
+        lost = "all of its data" if revision == "base" else "what only these revisions store"
+        out.print(f"The database loses {lost}. Stop all dispatchers, and back it up first.")
+        if not yes:
+            _ask_to_go_on()
+        migrate.downgrade_database(database, revision)
+        out.print(f"the database is at revision {revision}", markup=False)
+
+
+def _ask_to_go_on() -> None:
+    if not sys.stdin.isatty():
+        raise Misconfigured("nothing was done, because nobody can answer here; add --yes")
+    if not typer.confirm("Go on?"):
+        raise typer.Exit(1)
+
+
+def _require_database(settings: "Settings") -> None:
+    if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
+        raise Misconfigured(
+            f"there is no database in {settings.data_dir.absolute()}. Create one with "
+            "`lagid serve` or `lagid db upgrade`, or name another folder with --data-dir."
+        )
+
+
 @database_app.command("check")
 def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
     """Compare database and store: revision, lost objects, objects that no row refers to."""
@@ -213,11 +275,7 @@ def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
     from service.storage.objects import open_store
 
     settings = load_settings(data_dir=data_dir)
-    if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
-        raise Misconfigured(
-            f"there is no database in {settings.data_dir.absolute()}. Create one with "
-            "`lagid serve` or `lagid db upgrade`, or name another folder with --data-dir."
-        )
+    _require_database(settings)
     with open_database(settings) as database:
         migrate.check_revision(database)
         store = open_store(settings.resolved_store_url)

@@ -11,10 +11,13 @@
     - ObjectMissing        the object store has no object of that hash
     - ObjectStoreFailed    the object store did not answer, refused, or is not writable
     - DatabaseNotAtHead    the tables belong to another version of the program
+        - DatabaseIsNewer  that version is a later one, which this program does not know
+    - UnknownRevision      there is no migration of that name below the present one
 
 `status` is the HTTP status of the error when it reaches a client.
 """
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 from sqlalchemy.exc import DontWrapMixin
@@ -119,3 +122,27 @@ class DatabaseNotAtHead(StorageError):
             "run `lagid db upgrade`"
         )
         self.current, self.head = current, head
+
+
+class DatabaseIsNewer(DatabaseNotAtHead):
+    """The tables belong to a later version of the program, which this one does not know."""
+
+    def __init__(self, current: str, head: str | None) -> None:
+        StorageError.__init__(
+            self,
+            f"a newer lagid has upgraded the database to revision {current}; this one knows "
+            f"revisions up to {head}. Install the newer version, or run its "
+            f"`lagid db downgrade {head}` first.",
+        )
+        self.current, self.head = current, head
+
+
+class UnknownRevision(StorageError, LookupError):
+    """There is no migration of that name below the present revision of the database."""
+
+    def __init__(self, revision: str, known: Sequence[str]) -> None:
+        super().__init__(
+            f"{revision!r} is not an earlier revision of the database. Earlier ones, the latest "
+            f"first: {', '.join(known)}"
+        )
+        self.revision = revision

@@ -15,7 +15,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, func, select
 
 import migrations
-from service.storage.errors import DatabaseNotAtHead
+from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base
 
@@ -25,17 +25,52 @@ LOCK_WAIT_SECONDS = 900.0
 
 
 def upgrade_database(database: Database, revision: str = "head") -> None:
-    """Create all tables, or migrate them to a revision."""
+    """Create all tables, or migrate them to a revision.
+
+    Raises
+    ------
+    DatabaseIsNewer
+        If a later version of the program has migrated the database.
+    """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
+        _refuse_newer_database(_read_revision(connection))
         command.upgrade(_make_config(connection), revision)
 
 
 def downgrade_database(database: Database, revision: str = "base") -> None:
-    """Go back to an earlier revision; data that only later revisions can store is lost."""
+    """Go back to an earlier revision; data that only later revisions can store is lost.
+
+    Raises
+    ------
+    DatabaseIsNewer
+        If a later version of the program has migrated the database: only that one can undo it.
+    """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
+        _refuse_newer_database(_read_revision(connection))
         command.downgrade(_make_config(connection), revision)
+
+
+def list_undone_migrations(database: Database, revision: str) -> list[tuple[str, str]]:
+    """List revision and description of the migrations that `downgrade_database` would undo.
+
+    Raises
+    ------
+    DatabaseIsNewer
+        If a later version of the program has migrated the database.
+    UnknownRevision
+        If the revision is not an earlier one of this database. The earliest is ``base``.
+    """
+    current = read_current_revision(database)
+    _refuse_newer_database(current)
+    if current is None:
+        raise UnknownRevision(revision, ())
+    done = list(ScriptDirectory.from_config(_make_config()).iterate_revisions(current, "base"))
+    names = [*(script.revision for script in done[1:]), "base"]
+    if revision not in names:
+        raise UnknownRevision(revision, names)
+    return [(script.revision, script.doc) for script in done[: names.index(revision) + 1]]
 
 
 def find_head_revision() -> str | None:
@@ -46,12 +81,13 @@ def find_head_revision() -> str | None:
 def read_current_revision(database: Database) -> str | None:
     """Return the revision of the database; None before the first migration."""
     with database.engine.connect() as connection:
-        return MigrationContext.configure(connection).get_current_revision()
+        return _read_revision(connection)
 
 
 def check_revision(database: Database) -> None:
     """Raise `DatabaseNotAtHead` unless the database has the revision of this program."""
     current, needed = read_current_revision(database), find_head_revision()
+    _refuse_newer_database(current)
     if current != needed:
         raise DatabaseNotAtHead(current, needed)
 
@@ -61,6 +97,16 @@ def list_differences(database: Database) -> list[str]:
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         return [str(difference) for difference in compare_metadata(context, Base.metadata)]
+
+
+def _read_revision(connection: Connection) -> str | None:
+    return MigrationContext.configure(connection).get_current_revision()
+
+
+def _refuse_newer_database(current: str | None) -> None:
+    scripts = ScriptDirectory.from_config(_make_config())
+    if current is not None and current not in {one.revision for one in scripts.walk_revisions()}:
+        raise DatabaseIsNewer(current, scripts.get_current_head())
 
 
 def _lock_migrations(connection: Connection) -> None:

@@ -12,6 +12,7 @@ from service.core.states import JobState
 from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import build_child_command, build_import_path
 from sysid.kernels.machine_code import _compile_in_subprocess
+from tests.commands import check_refusal, run_lagid
 from tests.foreign_modules import ForeignFolder
 from tests.repository import ROOT
 from tests.standing import Service
@@ -79,3 +80,12 @@ def test_nobody_else_reaches_rays_folder(service: Service) -> None:
         assert inner == get_inner_folder(folder)
         assert inner.stat().st_mode & 0o077 == 0o077  # so it needs the folder around it
         assert folder.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_second_service_on_the_same_folder_says_so_and_ends(service: Service) -> None:
+    words = ("serve", "--port", "0", "--data-dir", service.stand.folder)
+    line = check_refusal(run_lagid(*words))
+    assert f"`lagid serve` at {service.stand.url}/" in line
+    assert f"works on {service.stand.folder}; a second one with --no-dispatcher" in line

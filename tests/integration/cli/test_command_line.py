@@ -4,9 +4,11 @@ import json
 import os
 import signal
 import socket
+import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -424,6 +426,46 @@ def test_tables_are_made_and_checked_by_command(tmp_path: Path) -> None:
     assert "no database" in check_refusal(run_lagid("db", "check", "--data-dir", tmp_path))
     assert run_lagid("db", "upgrade", "--data-dir", tmp_path).code == 0
     assert "at head" in run_lagid("db", "check", "--data-dir", tmp_path).stdout
+
+
+def test_a_database_of_a_newer_lagid_is_one_line_for_every_command(tmp_path: Path) -> None:
+    assert run_lagid("db", "upgrade", "--data-dir", tmp_path).code == 0
+    with closing(sqlite3.connect(tmp_path / "lagid.db")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '9999'")
+    commands = [("serve", "--no-dispatcher", "--port", 0), ("db", "check"), ("db", "upgrade")]
+    for words in (*commands, ("db", "downgrade", "base", "--yes")):
+        line = check_refusal(run_lagid(*words, "--data-dir", tmp_path))
+        assert "a newer lagid has upgraded the database to revision 9999" in line
+        assert "`lagid db downgrade 0001`" in line
+
+
+def test_a_downgrade_tells_what_is_lost_and_asks(tmp_path: Path) -> None:
+    place = ("--data-dir", tmp_path)
+    assert "no database" in check_refusal(run_lagid("db", "downgrade", "base", *place))
+    assert run_lagid("db", "upgrade", *place).code == 0
+    unknown = check_refusal(run_lagid("db", "downgrade", "0009", *place))
+    assert "'0009' is not an earlier revision" in unknown
+    assert "base" in unknown
+    asked = run_lagid("db", "downgrade", "base", *place)
+    assert "undoes 0001: Create the first tables" in asked.stdout
+    assert "loses all of its data" in asked.stdout
+    assert "--yes" in check_refusal(asked)
+    assert "at head" in run_lagid("db", "check", *place).stdout  # nothing was done
+    assert run_lagid("db", "downgrade", "base", "--yes", *place).code == 0
+    assert "revision none" in check_refusal(run_lagid("db", "check", *place))
+    assert run_lagid("db", "upgrade", *place).code == 0
+
+
+def test_a_data_folder_that_others_can_read_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data").chmod(0o750)
+    with socket.socket() as taken:  # so that it ends
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        words = ("serve", "--port", taken.getsockname()[1], "--data-dir", tmp_path / "data")
+        warning, _refused = run_lagid(*words).stderr.splitlines()
+    assert warning.startswith("warning: other users")
+    assert f"`chmod 700 {tmp_path / 'data'}`" in warning
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from sqlalchemy import inspect, text
 
 import migrations
 from service.storage import migrate, sessions
-from service.storage.errors import DatabaseNotAtHead
+from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Project
 
@@ -47,6 +47,20 @@ def test_a_database_that_is_not_at_the_head_is_told(empty_database):
     migrate.upgrade_database(empty_database)
     migrate.check_revision(empty_database)
     assert migrate.read_current_revision(empty_database) == migrate.find_head_revision()
+
+
+def test_a_database_of_a_later_version_is_not_touched(database):
+    with database.engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    actions = (migrate.upgrade_database, migrate.downgrade_database, migrate.check_revision)
+    try:
+        for action in actions:
+            with pytest.raises(DatabaseIsNewer, match=r"9999.*up to 0001"):
+                action(database)
+        assert migrate.read_current_revision(database) == "9999"
+    finally:  # PostgreSQL's is that of all tests
+        with database.engine.begin() as connection:
+            connection.execute(text("UPDATE alembic_version SET version_num = '0001'"))
 
 
 def test_upgrading_again_changes_nothing(database):
@@ -160,6 +174,11 @@ def test_a_second_revision_carries_the_rows_over_and_back(database, revisions):
         migrate.check_revision(database)
     migrate.upgrade_database(database)
     assert copies(database) == ["default"]
+    undone = migrate.list_undone_migrations(database, "base")
+    assert [name for name, _ in undone] == ["0002", "0001"]
+    assert [name for name, _ in migrate.list_undone_migrations(database, "0001")] == ["0002"]
+    with pytest.raises(UnknownRevision, match="Earlier ones, the latest first: 0001, base"):
+        migrate.list_undone_migrations(database, "0002")
     migrate.downgrade_database(database, "0001")
     assert columns(database) == before
     with database.read_session() as session:
