@@ -97,11 +97,14 @@ def _create_engine(url: str, **options: Any) -> Engine:
 def _create_private_file(
     _dialect: Any, _entry: ConnectionPoolEntry, arguments: list[Any], _settings: dict[str, Any]
 ) -> None:
-    """Create the file of a database for this user only; SQLite's other files take its mode."""
+    """Create the file of a database for this user only; SQLite's other files take its mode.
+
+    A file that is there is not opened: to close it would drop the locks of all its connections.
+    """
     path = str(arguments[0])
     if path != ":memory:" and not path.startswith("file:"):
         with suppress(OSError):  # SQLite tells why it cannot be opened
-            os.close(os.open(path, os.O_RDONLY | os.O_CREAT, 0o600))
+            os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:

@@ -1,5 +1,6 @@
 """Settings, defaults and names that wire types take from the core."""
 
+import os
 from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
@@ -175,3 +176,16 @@ def test_the_path_of_a_sqlite_file_does_not_depend_on_the_working_folder(tmp_pat
     assert settings.resolved_database_url == f"sqlite:///{tmp_path}/a.db?timeout=3"
     for url in ("sqlite:///:memory:", "sqlite:////a.db", "sqlite://", "postgresql+psycopg://h/d"):
         assert Settings(database_url=url).resolved_database_url == url
+
+
+def test_another_connection_drops_no_lock_of_the_first(tmp_path: Path) -> None:
+    """As closing any descriptor of the file would, of which SQLite knows nothing."""
+    file = tmp_path / "a.db"
+    database = Database(f"sqlite:///{file}")
+    with database.engine.begin() as first:
+        first.exec_driver_sql("CREATE TABLE a (b)")
+        database.engine.connect().close()  # a second connection of the pool
+        mine = f" {os.getpid()} ", f":{file.stat().st_ino} "
+        locks = Path("/proc/locks").read_text().splitlines()
+        assert [line for line in locks if all(part in line for part in mine)]
+    database.dispose()
