@@ -55,7 +55,7 @@ class Stand:
         environment: Mapping[str, str] | None = None,
         working_folder: Path | None = None,
     ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.temporary = Path(tempfile.mkdtemp(prefix=""))  # short: Ray puts sockets there
         self.folder, self.port = folder, find_free_port()
         self._working_folder = working_folder
