@@ -9,6 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import boto3
+import obstore
 import pytest
 from moto.server import ThreadedMotoServer
 
@@ -96,7 +97,7 @@ def test_a_young_object_of_a_bucket_is_not_sent_again(bucket, monkeypatch):
     store = open_store(url, **options)
     monkeypatch.setattr(objects, "_SINGLE_PUT", 1)
     store.put_stream([b"large"])
-    monkeypatch.setattr(objects.obstore, "put", None)
+    monkeypatch.setattr(obstore, "put", None)
     assert store.put_stream([b"large"]).size == 5
 
 
