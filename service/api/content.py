@@ -26,6 +26,7 @@ from service.core.errors import (
     UnsupportedMediaType,
 )
 from service.core.settings import Settings
+from service.core.text_checks import parse_digits
 from service.datasets.datasets import FileFormat, check_upload_size
 from service.storage.objects import ObjectStore
 
@@ -34,6 +35,7 @@ MCAP_TYPE = "application/x-mcap"
 CROSS_ORIGIN = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
+    "Cross-Origin-Resource-Policy": "cross-origin",
 }
 _RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
 
@@ -116,9 +118,9 @@ def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
         return None  # several ranges, or another unit: RFC 9110 lets a server send the whole
     first, last = match.groups()
     if not first:
-        start, stop = max(size - int(last), 0), size
+        start, stop = max(size - parse_digits(last), 0), size
     else:
-        start, stop = int(first), min(int(last) + 1 if last else size, size)
+        start, stop = parse_digits(first), min(parse_digits(last) + 1 if last else size, size)
     if start >= stop:
         raise UnsatisfiableRange(text, size)
     return ByteRange(start, stop)
@@ -161,7 +163,7 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
         _detect_format(kind, None)  # refused before the body is read
     announced = request.headers.get("content-length", "")
     if announced.isdecimal():
-        check_upload_size(int(announced), settings)
+        check_upload_size(parse_digits(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
     with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:

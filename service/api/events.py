@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from service.api.dependencies import Parts, PartsDep
 from service.core.errors import InvalidRequest
+from service.core.text_checks import MANY, parse_digits
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
@@ -75,8 +76,8 @@ def _format_event(event: Event) -> str:
 def _parse_event_id(text: str | None) -> int:
     if not text:
         return 0
-    if not text.isdecimal() or int(text) >= 2**63:
+    if not text.isdecimal() or parse_digits(text) == MANY:
         raise InvalidRequest.from_fault(
             "?Last-Event-ID", f"found {text!r}; need the id of an event"
         )
-    return int(text)
+    return parse_digits(text)

@@ -66,7 +66,7 @@ async def check_model(request: Request) -> CheckOut:
 
 
 async def _read_document(request: Request) -> Any:
-    kind = request.headers.get("content-type", "application/json").partition(";")[0].strip()
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind not in ("application/json", *YAML_TYPES):
         raise UnsupportedMediaType(f"found {kind!r}; need application/json or application/yaml")
     text = bytearray()

@@ -13,7 +13,7 @@ from sqlalchemy.exc import TimeoutError as SqlTimeout
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-from service.api.html import error_page, wants_html
+from service.api.html import PROTECTIVE_HEADERS, error_page, wants_html
 from service.core.errors import (
     Conflict,
     FieldError,
@@ -115,11 +115,16 @@ def install_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _handle_unexpected_error)
 
 
-def _handle_service_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, ServiceError)
+def error_response(request: Request, error: ServiceError) -> Response:
+    """Answer with the problem document of an error that the service raises on purpose."""
     return problem_response(
         request, error.status, error.kind, error.title, error.detail, error.errors, error.headers
     )
+
+
+def _handle_service_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ServiceError)
+    return error_response(request, error)
 
 
 def _handle_storage_error(request: Request, error: Exception) -> Response:
@@ -197,7 +202,9 @@ def _handle_unexpected_error(request: Request, error: Exception) -> Response:
     # Starlette logs the traceback. The client gets no internal detail.
     log.error("%s %s failed: %r", request.method, request.url.path, error)
     detail = "unexpected error; see the server's log"
-    return problem_response(request, 500, "internal", "The service failed", detail)
+    # This answer does not pass the middleware.
+    headers = PROTECTIVE_HEADERS
+    return problem_response(request, 500, "internal", "The service failed", detail, headers=headers)
 
 
 def _unreadable_reason(cause: BaseException | None) -> str | None:

@@ -1,12 +1,14 @@
 """Every error the service raises on purpose, each with its HTTP status.
 
 * ServiceError
+    - ForeignOrigin          403  a page of another origin sent a request that changes something
     - NotFound               404  the dataset, model, job or run does not exist
     - Conflict               409  the state of the resource does not allow the request
     - StaleVersion           412  a precondition (If-Match) does not hold
     - TooLarge               413  the body exceeds a limit
     - UnsupportedMediaType   415  the media type of the body is not supported
     - UnsatisfiableRange     416  a byte range outside the content
+    - MisdirectedRequest     421  the Host header names another server
     - InvalidRequest         422  the body or a query value is invalid; lists every fault
     - QuotaExceeded          429  the project has reached its limit of unfinished work
     - Unavailable            503  a component of the service is down
@@ -71,6 +73,12 @@ class ServiceError(Exception):
         return {}
 
 
+class ForeignOrigin(ServiceError):
+    """A page of another origin sent a request that changes something."""
+
+    status, kind, title = 403, "foreign-origin", "Not allowed from another origin"
+
+
 class NotFound(ServiceError):
     """The dataset, model, job or run does not exist."""
 
@@ -124,6 +132,12 @@ class UnsatisfiableRange(ServiceError):
     def headers(self) -> Mapping[str, str]:
         """The length of the content, as RFC 9110 requires."""
         return {"Content-Range": f"bytes */{self.size}"}
+
+
+class MisdirectedRequest(ServiceError):
+    """The Host header names another server."""
+
+    status, kind, title = 421, "misdirected", "The request is meant for another server"
 
 
 class InvalidRequest(ServiceError):

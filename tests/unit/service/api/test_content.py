@@ -57,6 +57,9 @@ def test_a_file_comes_whole_with_its_length(file: str) -> None:
         ("bytes=-3", slice(-3, None)),
         ("bytes=-1000", slice(0, None)),
         ("bytes=4-1000", slice(4, None)),
+        ("bytes=0-" + "9" * 5000, slice(0, None)),
+        ("bytes=-" + "9" * 5000, slice(0, None)),
+        ("bytes=" + "0" * 5000 + "2-4", slice(2, 5)),
     ],
 )
 def test_a_range_is_within_the_file(file: str, text: str, part: slice) -> None:
@@ -66,7 +69,9 @@ def test_a_range_is_within_the_file(file: str, text: str, part: slice) -> None:
     assert found.headers["content-range"] == f"bytes {start}-{stop - 1}/{len(whole)}"
 
 
-@pytest.mark.parametrize("text", ["bytes=8-", "bytes=9-12", "bytes=5-4", "bytes=-0"])
+@pytest.mark.parametrize(
+    "text", ["bytes=8-", "bytes=9-12", "bytes=5-4", "bytes=-0", f"bytes={'9' * 5000}-"]
+)
 def test_a_range_outside_the_file_is_refused_also_if_the_object_goes_on(text: str) -> None:
     with pytest.raises(UnsatisfiableRange, match="8 bytes"):
         answer("second", range=text)
