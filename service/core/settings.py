@@ -73,7 +73,7 @@ class Settings(BaseSettings):
     allow_open_host: bool = False
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
-    max_body_bytes: int = Field(default=32 * 1024**2, ge=1)
+    max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)
