@@ -49,6 +49,8 @@ class Settings(BaseSettings):
         More names by which requests may address the service, such as that of a reverse proxy.
     max_upload_bytes, max_body_bytes : int
         Longest recording, and longest body of any other request. Larger ones are answered by 413.
+    max_streams : int
+        Event streams of one web process. A further one is answered by 503.
     max_open_jobs, max_open_runs : int
         Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
     project_cores : int or None
@@ -74,6 +76,7 @@ class Settings(BaseSettings):
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
+    max_streams: int = Field(default=500, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import events as event_routes
+from service.api import event_feed
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
@@ -170,7 +170,7 @@ def test_a_stream_is_whole_whatever_is_read_at_once(
     whole = events(server, job)
     assert whole == ["state", *["state", "end", "state"] * 3, "state", "end"]
     for most in (1, 2, len(whole)):
-        monkeypatch.setattr(event_routes, "MAX_BATCH_EVENTS", most)
+        monkeypatch.setattr(event_feed, "MAX_BATCH_EVENTS", most)
         assert events(server, job) == whole
 
 
