@@ -47,7 +47,10 @@ def _limit_resources(limits: UploadLimits) -> None:
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     if task["kind"] == "csv":
         recording, notes = read_csv(
-            Path(task["source"]), sample_time=task["sample_time"], segments=task["segments"]
+            Path(task["source"]),
+            sample_time=task["sample_time"],
+            segments=task["segments"],
+            limits=limits,
         )
         messages = list(notes)
     else:
