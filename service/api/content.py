@@ -4,6 +4,7 @@ Objects are sent with ranges, ETags and cross-origin headers, which MCAP viewers
 body goes to a temporary file; its bytes are hashed and counted as they arrive.
 """
 
+import asyncio
 import hashlib
 import re
 from collections.abc import AsyncIterator
@@ -18,8 +19,10 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from service.core import temporary_files
+from service.core.concurrency import MAX_WAIT_SECONDS
 from service.core.errors import (
     InvalidRequest,
+    ServiceBusy,
     StaleVersion,
     TooLarge,
     UnsatisfiableRange,
@@ -148,11 +151,18 @@ class Upload:
 
 
 @asynccontextmanager
-async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[Upload]:
+async def receive_upload(
+    request: Request, settings: Settings, places: asyncio.Semaphore
+) -> AsyncIterator[Upload]:
     """Receive the body as a file that exists until the block ends.
+
+    The block has one of `places`. A body that waits for one is not read yet: it waits with its
+    sender, and needs neither disk nor thread.
 
     Raises
     ------
+    ServiceBusy
+        If no place became free in time.
     TooLarge
         As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
@@ -166,13 +176,29 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
         check_upload_size(parse_digits(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
-    with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
-        path = Path(folder) / "upload"
-        if kind == MULTIPART:
-            yield await _receive_form(request, path, settings)
-        else:
-            digest = await _save_body(request.stream(), path, settings)
-            yield Upload(path, _detect_format(kind, None), digest, None)
+    async with _take_place(places):
+        with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
+            path = Path(folder) / "upload"
+            if kind == MULTIPART:
+                yield await _receive_form(request, path, settings)
+            else:
+                digest = await _save_body(request.stream(), path, settings)
+                yield Upload(path, _detect_format(kind, None), digest, None)
+
+
+@asynccontextmanager
+async def _take_place(places: asyncio.Semaphore) -> AsyncIterator[None]:
+    try:
+        async with asyncio.timeout(MAX_WAIT_SECONDS):
+            await places.acquire()
+    except TimeoutError:
+        raise ServiceBusy(
+            "as many uploads as are allowed at once are on their way (LAGID_MAX_UPLOADS); try again"
+        ) from None
+    try:
+        yield
+    finally:
+        places.release()
 
 
 async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:

@@ -55,7 +55,7 @@ async def add_dataset(
     sample_time: SampleTime = None,
 ) -> DatasetOut:
     """Store a recording, CSV or MCAP. The same bytes again return the same dataset (200)."""
-    async with receive_upload(request, parts.settings) as upload:
+    async with receive_upload(request, parts.settings, parts.upload_places) as upload:
         stored = await run_in_threadpool(
             datasets.add_upload,
             parts.database,

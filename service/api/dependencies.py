@@ -1,5 +1,6 @@
 """Dependencies of routes: the parts of the service, sessions, and page cursors."""
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,6 +27,11 @@ class Parts:
     database: Database
     store: ObjectStore
     stopping: Event = field(default_factory=Event)
+
+    @cached_property
+    def upload_places(self) -> asyncio.Semaphore:
+        """Places of the uploads that are received and read at once."""
+        return asyncio.Semaphore(self.settings.max_uploads)
 
     @cached_property
     def feed(self) -> EventFeed:

@@ -171,6 +171,11 @@ class Unavailable(ServiceError):
 
     status, kind, title = 503, "unavailable", "A part of the service is down"
 
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to ask again, in seconds."""
+        return {"Retry-After": "1"}
+
 
 class ServiceBusy(Unavailable):
     """Too many heavy requests run at once."""

@@ -49,6 +49,9 @@ class Settings(BaseSettings):
         More names by which requests may address the service, such as that of a reverse proxy.
     max_upload_bytes, max_body_bytes : int
         Longest recording, and longest body of any other request. Larger ones are answered by 413.
+    max_uploads : int
+        Uploads that a web process receives and reads at once. A further one waits for 20 s, and is
+        then answered by 503.
     max_streams : int
         Event streams of one web process. A further one is answered by 503.
     max_open_jobs, max_open_runs : int
@@ -76,6 +79,7 @@ class Settings(BaseSettings):
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
+    max_uploads: int = Field(default=4, ge=1)
     max_streams: int = Field(default=500, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     max_open_jobs: int = Field(default=1000, ge=1)
