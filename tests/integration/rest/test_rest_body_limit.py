@@ -132,7 +132,7 @@ def test_the_fields_of_an_object_are_counted_before_they_are_looked_at(
 
 
 def test_more_faults_than_anybody_reads_are_counted_and_not_described(own: TestClient) -> None:
-    axis = {"path": "/seed", "values": [1], "labels": [0] * 10_001}
+    axis: dict[str, Any] = {"path": "/seed", "values": [1], "labels": [0] * 10_001}
     body = {"model": "fopdt", "datasets": ["none"], "sweep": {"axes": [axis]}}
     [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
     assert fault["pointer"] == ""
