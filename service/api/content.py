@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
+from starlette.types import Message, Receive
 
 from service.core import temporary_files
 from service.core.concurrency import MAX_WAIT_SECONDS
@@ -24,6 +25,7 @@ from service.core.errors import (
     InvalidRequest,
     ServiceBusy,
     StaleVersion,
+    StalledRequest,
     TooLarge,
     UnsatisfiableRange,
     UnsupportedMediaType,
@@ -138,6 +140,7 @@ CSV_TYPES = ("text/csv", "application/csv", "text/plain")
 MCAP_TYPES = ("application/x-mcap", "application/mcap", "application/vnd.mcap")
 MULTIPART = "multipart/form-data"
 PIECE_BYTES = 1 << 20
+MAX_PAUSE_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +166,8 @@ async def receive_upload(
     ------
     ServiceBusy
         If no place became free in time.
+    StalledRequest
+        If the sender pauses for too long.
     TooLarge
         As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
@@ -176,6 +181,7 @@ async def receive_upload(
         check_upload_size(parse_digits(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
+    request = Request(request.scope, _limit_pauses(request.receive))
     async with _take_place(places):
         with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
             path = Path(folder) / "upload"
@@ -184,6 +190,19 @@ async def receive_upload(
             else:
                 digest = await _save_body(request.stream(), path, settings)
                 yield Upload(path, _detect_format(kind, None), digest, None)
+
+
+def _limit_pauses(receive: Receive) -> Receive:
+    """Limit the time until the next piece of a body: a sender that stops must not keep a place."""
+
+    async def receive_in_time() -> Message:
+        try:
+            async with asyncio.timeout(MAX_PAUSE_SECONDS):
+                return await receive()
+        except TimeoutError:
+            raise StalledRequest(f"nothing of the body came for {MAX_PAUSE_SECONDS:g} s") from None
+
+    return receive_in_time
 
 
 @asynccontextmanager

@@ -28,6 +28,7 @@ PROBLEM_KINDS = {
     "method-not-allowed": "The path exists, but not for this method.",
     "not-found": "The resource does not exist.",
     "range": "The byte range lies outside the content.",
+    "stalled": "Nothing of the body arrived for too long. Send it again.",
     "stale": "The resource has changed since it was read.",
     "too-large": "The body is larger than the stated limit.",
     "too-much-unfinished": "The project has reached its limit of unfinished jobs or runs. "

@@ -3,6 +3,7 @@
 * ServiceError
     - ForeignOrigin          403  a page of another origin sent a request that changes something
     - NotFound               404  the dataset, model, job or run does not exist
+    - StalledRequest         408  the sender of a body stopped
     - Conflict               409  the state of the resource does not allow the request
     - StaleVersion           412  a precondition (If-Match) does not hold
     - TooLarge               413  the body exceeds a limit
@@ -93,6 +94,12 @@ class DatasetNotFound(ServiceError):
     """No dataset has that identifier or name, or several share the name; the text says which."""
 
     status, kind, title = 404, "not-found", "Not found"
+
+
+class StalledRequest(ServiceError):
+    """The sender of a body stopped."""
+
+    status, kind, title = 408, "stalled", "The body did not arrive"
 
 
 class Conflict(ServiceError):
