@@ -63,7 +63,9 @@ def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
         async with httpx.AsyncClient(base_url=plain.base_url, timeout=60, limits=limits) as client:
             async with open_streams(client, path) as tasks:
                 await asyncio.sleep(0.2)
-                answer = await client.get(path)
+                async with client.stream("GET", path) as answer:
+                    assert answer.status_code == 503
+                    await answer.aread()
                 refused(answer, 503, "unavailable")
                 assert int(answer.headers["retry-after"]) > 0
                 statements.clear()
