@@ -47,7 +47,13 @@ def settings_of(folder: Path, **changes: object) -> Settings:
     folder.mkdir(parents=True, exist_ok=True)
     copy_sqlite_template(folder)
     # Tests claim jobs without a heartbeat, and compile between two writes: the lease is long.
-    values = {"data_dir": folder, "poll_seconds": 0.02, "lease_seconds": 3600, **changes}
+    values = {
+        "data_dir": folder,
+        "poll_seconds": 0.02,
+        "lease_seconds": 3600,
+        "allowed_hosts": ("testserver",),  # the name that Starlette's test client asks for
+        **changes,
+    }
     return Settings.model_validate(values)
 
 

@@ -20,7 +20,8 @@ from service.api import (
     runs,
 )
 from service.api.dependencies import Parts
-from service.api.middleware import BodyLimit
+from service.api.html import PROTECTIVE_HEADERS
+from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
@@ -50,6 +51,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    app.add_middleware(OriginCheck, settings=chosen)
+    app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
         health.router,

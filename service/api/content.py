@@ -4,6 +4,7 @@ Objects are sent with ranges, ETags and cross-origin headers, which MCAP viewers
 body goes to a temporary file; its bytes are hashed and counted as they arrive.
 """
 
+import asyncio
 import hashlib
 import re
 from collections.abc import AsyncIterator
@@ -16,16 +17,21 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
+from starlette.types import Message, Receive
 
 from service.core import temporary_files
+from service.core.concurrency import MAX_WAIT_SECONDS
 from service.core.errors import (
     InvalidRequest,
+    ServiceBusy,
     StaleVersion,
+    StalledRequest,
     TooLarge,
     UnsatisfiableRange,
     UnsupportedMediaType,
 )
 from service.core.settings import Settings
+from service.core.text_checks import parse_digits
 from service.datasets.datasets import FileFormat, check_upload_size
 from service.storage.objects import ObjectStore
 
@@ -34,6 +40,7 @@ MCAP_TYPE = "application/x-mcap"
 CROSS_ORIGIN = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
+    "Cross-Origin-Resource-Policy": "cross-origin",
 }
 _RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
 
@@ -116,9 +123,9 @@ def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
         return None  # several ranges, or another unit: RFC 9110 lets a server send the whole
     first, last = match.groups()
     if not first:
-        start, stop = max(size - int(last), 0), size
+        start, stop = max(size - parse_digits(last), 0), size
     else:
-        start, stop = int(first), min(int(last) + 1 if last else size, size)
+        start, stop = parse_digits(first), min(parse_digits(last) + 1 if last else size, size)
     if start >= stop:
         raise UnsatisfiableRange(text, size)
     return ByteRange(start, stop)
@@ -133,6 +140,7 @@ CSV_TYPES = ("text/csv", "application/csv", "text/plain")
 MCAP_TYPES = ("application/x-mcap", "application/mcap", "application/vnd.mcap")
 MULTIPART = "multipart/form-data"
 PIECE_BYTES = 1 << 20
+MAX_PAUSE_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,11 +154,20 @@ class Upload:
 
 
 @asynccontextmanager
-async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[Upload]:
+async def receive_upload(
+    request: Request, settings: Settings, places: asyncio.Semaphore
+) -> AsyncIterator[Upload]:
     """Receive the body as a file that exists until the block ends.
+
+    The block has one of `places`. A body that waits for one is not read yet: it waits with its
+    sender, and needs neither disk nor thread.
 
     Raises
     ------
+    ServiceBusy
+        If no place became free in time.
+    StalledRequest
+        If the sender pauses for too long.
     TooLarge
         As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
@@ -161,16 +178,46 @@ async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[
         _detect_format(kind, None)  # refused before the body is read
     announced = request.headers.get("content-length", "")
     if announced.isdecimal():
-        check_upload_size(int(announced), settings)
+        check_upload_size(parse_digits(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, so that its size can be checked")
-    with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
-        path = Path(folder) / "upload"
-        if kind == MULTIPART:
-            yield await _receive_form(request, path, settings)
-        else:
-            digest = await _save_body(request.stream(), path, settings)
-            yield Upload(path, _detect_format(kind, None), digest, None)
+    request = Request(request.scope, _limit_pauses(request.receive))
+    async with _take_place(places):
+        with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
+            path = Path(folder) / "upload"
+            if kind == MULTIPART:
+                yield await _receive_form(request, path, settings)
+            else:
+                digest = await _save_body(request.stream(), path, settings)
+                yield Upload(path, _detect_format(kind, None), digest, None)
+
+
+def _limit_pauses(receive: Receive) -> Receive:
+    """Limit the time until the next piece of a body: a sender that stops must not keep a place."""
+
+    async def receive_in_time() -> Message:
+        try:
+            async with asyncio.timeout(MAX_PAUSE_SECONDS):
+                return await receive()
+        except TimeoutError:
+            raise StalledRequest(f"nothing of the body came for {MAX_PAUSE_SECONDS:g} s") from None
+
+    return receive_in_time
+
+
+@asynccontextmanager
+async def _take_place(places: asyncio.Semaphore) -> AsyncIterator[None]:
+    try:
+        async with asyncio.timeout(MAX_WAIT_SECONDS):
+            await places.acquire()
+    except TimeoutError:
+        raise ServiceBusy(
+            "as many uploads as are allowed at once are on their way (LAGID_MAX_UPLOADS); try again"
+        ) from None
+    try:
+        yield
+    finally:
+        places.release()
 
 
 async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:

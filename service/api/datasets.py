@@ -7,6 +7,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
+from service.api.bodies import JsonRoute
 from service.api.content import CROSS_ORIGIN, content_response, preflight_response, receive_upload
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
 from service.core.wire import Page
@@ -16,7 +17,7 @@ from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOu
 from service.formats.csv_recordings import generate_csv
 from service.repositories.datasets import DatasetRepository, StoredDataset
 
-router = APIRouter(prefix="/v1", tags=["datasets"])
+router = APIRouter(prefix="/v1", tags=["datasets"], route_class=JsonRoute)
 
 UPLOAD_BODY: dict[str, Any] = {
     "requestBody": {
@@ -54,7 +55,7 @@ async def add_dataset(
     sample_time: SampleTime = None,
 ) -> DatasetOut:
     """Store a recording, CSV or MCAP. The same bytes again return the same dataset (200)."""
-    async with receive_upload(request, parts.settings) as upload:
+    async with receive_upload(request, parts.settings, parts.upload_places) as upload:
         stored = await run_in_threadpool(
             datasets.add_upload,
             parts.database,

@@ -1,13 +1,16 @@
 """Dependencies of routes: the parts of the service, sessions, and page cursors."""
 
+import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Event
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
 from sqlalchemy.orm import Session
 
+from service.api.event_feed import EventFeed
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
@@ -24,6 +27,17 @@ class Parts:
     database: Database
     store: ObjectStore
     stopping: Event = field(default_factory=Event)
+
+    @cached_property
+    def upload_places(self) -> asyncio.Semaphore:
+        """Places of the uploads that are received and read at once."""
+        return asyncio.Semaphore(self.settings.max_uploads)
+
+    @cached_property
+    def feed(self) -> EventFeed:
+        """The events of all jobs that have a stream."""
+        settings = self.settings
+        return EventFeed(self.database, self.stopping, settings.poll_seconds, settings.max_streams)
 
 
 def get_parts(request: Request) -> Parts:

@@ -16,14 +16,19 @@ from service.storage.errors import StorageError
 router = APIRouter(tags=["health"])
 
 PROBLEM_KINDS = {
+    "foreign-origin": "A page of another origin sent a request that changes something. "
+    "Use the service's own pages, or a program.",
     "conflict": "The current state of the job does not allow this request.",
     "internal": "An unexpected error occurred. The server's log has the details.",
     "invalid": "The body or a query value is invalid. `errors` lists every fault. "
     "Type errors come first. Once all types are right, the answer lists the other faults.",
     "invalid-upload": "The file cannot be read. The message says where and why.",
+    "misdirected": "The Host header is none of the service's names. Use its address, or let its "
+    "operator add the name to LAGID_ALLOWED_HOSTS.",
     "method-not-allowed": "The path exists, but not for this method.",
     "not-found": "The resource does not exist.",
     "range": "The byte range lies outside the content.",
+    "stalled": "Nothing of the body arrived for too long. Send it again.",
     "stale": "The resource has changed since it was read.",
     "too-large": "The body is larger than the stated limit.",
     "too-much-unfinished": "The project has reached its limit of unfinished jobs or runs. "

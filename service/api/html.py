@@ -10,6 +10,11 @@ from service.pages.render import render_template
 
 PROGRAM_PATHS = ("/v1/", "/static/", "/pages/", "/healthz", "/readyz", "/metrics", "/openapi.json")
 """Paths, or their prefixes, that programs and scripts request."""
+PROTECTIVE_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer: no guessed media type, and no use inside pages of other origins."""
 # Scripts and data come from this server only. Plotly styles its own elements, hence the inline
 # styles. It writes pictures for download through blob: and data: addresses.
 PAGE_HEADERS = {
@@ -18,7 +23,6 @@ PAGE_HEADERS = {
         "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
         "frame-ancestors 'none'"
     ),
-    "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "same-origin",
     "Cache-Control": "no-store",
 }

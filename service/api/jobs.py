@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import StreamingResponse
 
+from service.api.bodies import JsonRoute
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.core.states import JobState
 from service.core.wire import Page
@@ -20,7 +21,7 @@ from service.sweeps.schemas import SummaryOut
 from service.trends import trend
 from service.trends.schemas import TrendOut
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
 
 IdempotencyKeyHeader = Annotated[
     str | None, Header(max_length=200, description="the same key returns the same job")

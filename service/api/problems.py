@@ -1,6 +1,5 @@
 """Turn every error into an RFC 9457 problem document."""
 
-import errno
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from sqlalchemy.exc import TimeoutError as SqlTimeout
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-from service.api.html import error_page, wants_html
+from service.api.html import PROTECTIVE_HEADERS, error_page, wants_html
 from service.core.errors import (
     Conflict,
     FieldError,
@@ -24,6 +23,7 @@ from service.core.errors import (
     UnsupportedMediaType,
     to_field_errors,
 )
+from service.core.temporary_files import FULL_DISK_ERRORS, FULL_DISK_MESSAGE
 from service.core.text_checks import LONE_SURROGATE
 from service.core.validation import describe_error, explain_errors, find_body_type
 from service.storage.errors import StorageError
@@ -32,7 +32,6 @@ from sysid.core.errors import SysidError
 
 log = logging.getLogger(__name__)
 
-RETRY_HEADERS = {"Retry-After": "1"}
 TOO_DEEP_MESSAGE = "the body is nested too deeply"
 MAX_FAULTS = 1000
 """Limit on reported fields, since each one is compared with the valid names."""
@@ -48,7 +47,7 @@ STATUS_KINDS = {
 
 STORAGE_KINDS = {
     error_type.status: (error_type.kind, error_type.title)
-    for error_type in (NotFound, Conflict, InvalidRequest, Unavailable)
+    for error_type in (NotFound, Conflict, InvalidRequest)
 }
 
 
@@ -115,17 +114,24 @@ def install_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _handle_unexpected_error)
 
 
-def _handle_service_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, ServiceError)
+def error_response(request: Request, error: ServiceError) -> Response:
+    """Answer with the problem document of an error that the service raises on purpose."""
     return problem_response(
         request, error.status, error.kind, error.title, error.detail, error.errors, error.headers
     )
+
+
+def _handle_service_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ServiceError)
+    return error_response(request, error)
 
 
 def _handle_storage_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, StorageError)
     if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR:
         log.error("%s %s: %s", request.method, request.url.path, error)
+    if error.status == Unavailable.status:
+        return error_response(request, Unavailable(str(error)))
     kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     return problem_response(request, error.status, kind, title, str(error))
 
@@ -135,18 +141,15 @@ def _handle_database_outage(request: Request, error: Exception) -> Response:
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
     detail = "the database does not answer, or its disk is full. Nothing was changed. Try again."
-    away = Unavailable(detail)
-    return problem_response(
-        request, away.status, away.kind, away.title, away.detail, headers=RETRY_HEADERS
-    )
+    return error_response(request, Unavailable(detail))
 
 
 def _handle_os_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, OSError)
-    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno not in FULL_DISK_ERRORS:
         return _handle_unexpected_error(request, error)
     log.error("%s %s: %s", request.method, request.url.path, error)
-    return _handle_service_error(request, Unavailable("a disk of the server is full"))
+    return error_response(request, Unavailable(FULL_DISK_MESSAGE))
 
 
 def _handle_recursion_error(request: Request, error: Exception) -> Response:
@@ -197,7 +200,9 @@ def _handle_unexpected_error(request: Request, error: Exception) -> Response:
     # Starlette logs the traceback. The client gets no internal detail.
     log.error("%s %s failed: %r", request.method, request.url.path, error)
     detail = "unexpected error; see the server's log"
-    return problem_response(request, 500, "internal", "The service failed", detail)
+    # This answer does not pass the middleware.
+    headers = PROTECTIVE_HEADERS
+    return problem_response(request, 500, "internal", "The service failed", detail, headers=headers)
 
 
 def _unreadable_reason(cause: BaseException | None) -> str | None:

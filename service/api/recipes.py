@@ -2,13 +2,14 @@
 
 from fastapi import APIRouter, Response, status
 
+from service.api.bodies import JsonRoute
 from service.api.dependencies import PartsDep
 from service.api.jobs import IdempotencyKeyHeader
 from service.jobs.schemas import JobOut
 from service.sweeps import noise, reidentify
 from service.sweeps.schemas import NoiseSweepIn, ReidentifyIn
 
-recipe_router = APIRouter(prefix="/v1/recipes", tags=["jobs"])
+recipe_router = APIRouter(prefix="/v1/recipes", tags=["jobs"], route_class=JsonRoute)
 
 
 @recipe_router.post("/noise-sweep", status_code=status.HTTP_202_ACCEPTED)

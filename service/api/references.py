@@ -2,12 +2,13 @@
 
 from fastapi import APIRouter
 
+from service.api.bodies import JsonRoute
 from service.api.dependencies import Cursor, Limit, ReadSession, WriteSession
 from service.core.wire import Page
 from service.jobs import references
 from service.jobs.schemas import ReferenceIn, ReferenceOut
 
-reference_router = APIRouter(prefix="/v1/references", tags=["references"])
+reference_router = APIRouter(prefix="/v1/references", tags=["references"], route_class=JsonRoute)
 
 
 @reference_router.get("")

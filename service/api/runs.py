@@ -4,6 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
+from service.api.bodies import JsonRoute
 from service.api.content import ByteRange, content_response
 from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
@@ -29,7 +30,7 @@ from service.runs.schemas import (
 )
 from sysid.export.export import MAX_PADE_ORDER, ExportFormat
 
-router = APIRouter(prefix="/v1/runs", tags=["runs"])
+router = APIRouter(prefix="/v1/runs", tags=["runs"], route_class=JsonRoute)
 
 
 @router.get("/{run_id}")
@@ -118,7 +119,7 @@ def read_run_signals(
     return content_response(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)
 
 
-comparison_router = APIRouter(prefix="/v1", tags=["runs"])
+comparison_router = APIRouter(prefix="/v1", tags=["runs"], route_class=JsonRoute)
 
 
 @comparison_router.post("/runs:compare")

@@ -1,12 +1,15 @@
 """Every error the service raises on purpose, each with its HTTP status.
 
 * ServiceError
+    - ForeignOrigin          403  a page of another origin sent a request that changes something
     - NotFound               404  the dataset, model, job or run does not exist
+    - StalledRequest         408  the sender of a body stopped
     - Conflict               409  the state of the resource does not allow the request
     - StaleVersion           412  a precondition (If-Match) does not hold
     - TooLarge               413  the body exceeds a limit
     - UnsupportedMediaType   415  the media type of the body is not supported
     - UnsatisfiableRange     416  a byte range outside the content
+    - MisdirectedRequest     421  the Host header names another server
     - InvalidRequest         422  the body or a query value is invalid; lists every fault
     - QuotaExceeded          429  the project has reached its limit of unfinished work
     - Unavailable            503  a component of the service is down
@@ -71,6 +74,12 @@ class ServiceError(Exception):
         return {}
 
 
+class ForeignOrigin(ServiceError):
+    """A page of another origin sent a request that changes something."""
+
+    status, kind, title = 403, "foreign-origin", "Not allowed from another origin"
+
+
 class NotFound(ServiceError):
     """The dataset, model, job or run does not exist."""
 
@@ -85,6 +94,12 @@ class DatasetNotFound(ServiceError):
     """No dataset has that identifier or name, or several share the name; the text says which."""
 
     status, kind, title = 404, "not-found", "Not found"
+
+
+class StalledRequest(ServiceError):
+    """The sender of a body stopped."""
+
+    status, kind, title = 408, "stalled", "The body did not arrive"
 
 
 class Conflict(ServiceError):
@@ -126,6 +141,12 @@ class UnsatisfiableRange(ServiceError):
         return {"Content-Range": f"bytes */{self.size}"}
 
 
+class MisdirectedRequest(ServiceError):
+    """The Host header names another server."""
+
+    status, kind, title = 421, "misdirected", "The request is meant for another server"
+
+
 class InvalidRequest(ServiceError):
     """The body or a query value is invalid."""
 
@@ -156,6 +177,11 @@ class Unavailable(ServiceError):
     """A component that the service needs is down."""
 
     status, kind, title = 503, "unavailable", "A part of the service is down"
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to ask again, in seconds."""
+        return {"Retry-After": "1"}
 
 
 class ServiceBusy(Unavailable):

@@ -4,9 +4,10 @@ import stat
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Annotated, Any
 
-from pydantic import Field, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BeforeValidator, Field, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.core.errors import Misconfigured
 
@@ -17,6 +18,13 @@ LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 def make_sqlite_url(path: Path) -> str:
     """Return the address of a SQLite file."""
     return f"sqlite:///{path.absolute()}"
+
+
+def _split_names(value: Any) -> Any:
+    """Split names separated by commas, as an environment variable holds them."""
+    if not isinstance(value, str):
+        return value
+    return [name.strip().lower() for name in value.split(",") if name.strip()]
 
 
 class Settings(BaseSettings):
@@ -38,8 +46,15 @@ class Settings(BaseSettings):
         None: API keys are off on loopback and required elsewhere.
     allow_open_host : bool
         Serve other hosts although this version has no API keys yet.
+    allowed_hosts : tuple of str
+        More names by which requests may address the service, such as that of a reverse proxy.
     max_upload_bytes, max_body_bytes : int
         Longest recording, and longest body of any other request. Larger ones are answered by 413.
+    max_uploads : int
+        Uploads that a web process receives and reads at once. A further one waits for 20 s, and is
+        then answered by 503.
+    max_streams : int
+        Event streams of one web process. A further one is answered by 503.
     max_open_jobs, max_open_runs : int
         Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
     project_cores : int or None
@@ -62,8 +77,11 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535)
     require_keys: bool | None = None
     allow_open_host: bool = False
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
-    max_body_bytes: int = Field(default=32 * 1024**2, ge=1)
+    max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
+    max_uploads: int = Field(default=4, ge=1)
+    max_streams: int = Field(default=500, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)
@@ -96,6 +114,16 @@ class Settings(BaseSettings):
     def resolved_store_url(self) -> str:
         """Address of the object store."""
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
+
+    def is_served_host(self, name: str) -> bool:
+        """Return whether a request may address the service by this name or address.
+
+        These are the names and addresses of loopback, the host it listens on, and `allowed_hosts`.
+        If it listens for other machines, any address is served: only a name can be rebound.
+        """
+        if is_loopback(name) or (name and name in (self.host.lower(), *self.allowed_hosts)):
+            return True
+        return not is_loopback(self.host) and _is_address(name)
 
     def prepare_data_folder(self) -> None:
         """Create the data folder, for this user only, if it does not exist.
@@ -154,9 +182,14 @@ class Settings(BaseSettings):
 
 def is_loopback(host: str) -> bool:
     """Return whether a host name or address can be reached from this machine only."""
-    if host == "localhost":
+    if host == "localhost" or host.endswith(".localhost"):
         return True
+    return _is_address(host) and ip_address(host).is_loopback
+
+
+def _is_address(host: str) -> bool:
     try:
-        return ip_address(host).is_loopback
+        ip_address(host)
     except ValueError:
         return False
+    return True

@@ -4,6 +4,7 @@ The name holds the machine (boot and PID namespace), and the number and the star
 Containers that share a folder have the same host name and numbers, but not these.
 """
 
+import errno
 import os
 import re
 import shutil
@@ -14,6 +15,8 @@ from pathlib import Path
 from service.core.processes import has_process_ended, read_start
 from sysid.core.machine import make_machine_tag
 
+FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT)
+FULL_DISK_MESSAGE = "a disk of the server is full. Nothing was stored. Try again."
 STALE_SECONDS = 24 * 3600
 """Age in s after which a file is removed, whichever machine it came from."""
 

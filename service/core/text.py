@@ -5,6 +5,7 @@ This module imports the standard library only, so that every command may use it.
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import TypeGuard
@@ -12,6 +13,9 @@ from typing import TypeGuard
 DASH = "–"
 _THIN_SPACE = "\u202f"  # narrow no-break space: groups digits and joins a number to its unit
 _MAX_JSON = 60
+FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last four: full width
+"""First characters of formulas in common spreadsheets."""
+_NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 
 
 def format_number(value: float | None, digits: int = 4) -> str:
@@ -137,6 +141,18 @@ def format_labels(labels: Mapping[str, object]) -> str:
     return ", ".join(f"{name} = {format_value(value)}" for name, value in labels.items())
 
 
+def escape_formula(value: object) -> object:
+    """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
+    if not isinstance(value, str):
+        return value
+    return ("'" if _is_formula(value) else "") + value.replace("\r", " ")
+
+
+def unescape_formula(text: str) -> str:
+    """Return a text without the apostrophe that `escape_formula` put before it."""
+    return text[1:] if text.startswith("'") and _is_formula(text[1:]) else text
+
+
 TEMPLATE_FILTERS = {
     "number": format_number,
     "unit": format_unit,
@@ -144,6 +160,10 @@ TEMPLATE_FILTERS = {
     "duration": format_duration,
     "age": format_age,
 }
+
+
+def _is_formula(text: str) -> bool:
+    return text.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(text)
 
 
 def _is_positive(stderr: float | None) -> TypeGuard[float]:

@@ -1,10 +1,8 @@
 """Base classes and fields of all wire types. The client imports none of them."""
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Generic, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
-from pydantic_core import PydanticCustomError
 
 from service.core.documents import to_finite
 
@@ -12,33 +10,6 @@ Item = TypeVar("Item")
 
 Pointer = Annotated[str, Field(pattern=r"^(/[^/]+)+$", examples=["/noise/sigma"])]
 """A JSON pointer into a job body."""
-
-
-MAX_DEPTH = 50
-"""Depth of nested lists and objects in a body; a model document has five levels."""
-
-
-def check_depth(value: Any) -> Any:
-    """Return the value if it is not nested too deeply to be copied or written."""
-    level, depth = [value], 0
-    while level := [
-        inner
-        for item in level
-        if isinstance(item, dict | list)
-        for inner in _iterate_children(item)
-    ]:
-        depth += 1
-        if depth > MAX_DEPTH:
-            raise PydanticCustomError(
-                "nesting",
-                "need lists and objects nested at most {most} levels deep",
-                {"most": MAX_DEPTH},
-            )
-    return value
-
-
-def _iterate_children(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
-    return value.values() if isinstance(value, dict) else value
 
 
 class Body(BaseModel):

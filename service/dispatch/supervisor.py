@@ -161,7 +161,10 @@ def to_environment(settings: Settings) -> dict[str, str]:
     """Convert the settings to environment variables for a child."""
     values = settings.model_dump(mode="json", exclude_none=True)
     values["data_dir"] = str(settings.data_dir.absolute())
-    return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
+    return {
+        f"LAGID_{name.upper()}": ",".join(value) if isinstance(value, list) else str(value)
+        for name, value in values.items()
+    }
 
 
 def _open_private(path: str, flags: int) -> int:

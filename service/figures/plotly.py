@@ -11,7 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.core.text import append_unit, bracket_unit, join_estimate, plain_unit
+from service.core.text import (
+    append_unit,
+    bracket_unit,
+    escape_formula,
+    join_estimate,
+    plain_unit,
+)
 from service.figures import theme
 from service.figures.data import Floats, FreeParameter, IslandImprovement, RunFigureData
 from service.figures.grid import Place, PlotGrid, add_axes, add_caption
@@ -205,7 +211,7 @@ def to_csv(figure: Figure) -> str:
     matrix = any("z" in trace for trace in traces)
     rows.writerow(["series", "x", "y", *(["z"] if matrix else [])])
     for trace in traces:
-        name = trace.get("name", "")
+        name = escape_formula(trace.get("name", ""))
         if "z" in trace:
             for y, line in zip(trace["y"], trace["z"], strict=True):
                 rows.writerows((name, x, y, z) for x, z in zip(trace["x"], line, strict=True))

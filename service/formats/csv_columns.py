@@ -8,8 +8,10 @@ from math import isinf, isnan
 import numpy as np
 from numpy.typing import NDArray
 
+from service.core.text import unescape_formula
 from service.formats.csv_layout import CsvColumn, CsvLayout
 from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.types import FloatArray
 
 BLOCK_ROWS = 50_000
@@ -27,7 +29,9 @@ class CsvTable:
         return np.asarray(self.columns[name], dtype=np.float64)
 
 
-def read_columns(lines: Iterable[str], layout: CsvLayout) -> CsvTable:
+def read_columns(
+    lines: Iterable[str], layout: CsvLayout, max_rows: int = DEFAULT_LIMITS.messages
+) -> CsvTable:
     """Read all columns of the body; `lines` begin with the header.
 
     Empty fields and ``nan`` in value columns become ``nan``: they are missing.
@@ -36,9 +40,13 @@ def read_columns(lines: Iterable[str], layout: CsvLayout) -> CsvTable:
     ------
     InvalidUpload
         If a row is ragged, a number is a text or infinite, or a time is missing; with row and
-        column. Also if there are no rows.
+        column. Also if there are no rows, or more than `max_rows`.
     """
-    blocks = list(_iterate_blocks(lines, layout))
+    blocks = []
+    for block in _iterate_blocks(lines, layout):
+        blocks.append(block)
+        if block[1][-1] > max_rows + 1:  # the header is row 1
+            raise InvalidUpload(f"the file has more than {max_rows} rows")
     if not blocks:
         raise InvalidUpload("there are no rows below the header")
     rows = np.concatenate([block_rows for _, block_rows in blocks])
@@ -97,7 +105,7 @@ def _parse_column(
     numbers: NDArray[np.int64],
 ) -> ColumnValues:
     if column.role == "label":
-        return np.array([text.strip() for text in texts], dtype=np.str_)
+        return np.array([unescape_formula(text.strip()) for text in texts], dtype=np.str_)
     try:
         values = np.fromiter(map(convert, texts), np.float64, len(texts))
         if np.isfinite(values).all():

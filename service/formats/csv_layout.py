@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.text import unescape_formula
 from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import suggest_name
 from sysid.core.units import find_conversion_factor
 
@@ -46,31 +48,48 @@ class CsvLayout:
 
 
 def detect_layout(
-    lines: Sequence[str], segments: Sequence[str], sample_time: float | None
+    lines: Sequence[str],
+    segments: Sequence[str],
+    sample_time: float | None,
+    max_channels: int = DEFAULT_LIMITS.channels,
 ) -> CsvLayout:
     """Detect the layout of a file from its first lines.
 
     Raises
     ------
     InvalidUpload
-        If there is no usable header, or if the time is missing or given twice.
+        If there is no usable header, if it has too many signals, or if the time is missing or given
+        twice.
     """
     separator = _detect_separator(lines[0])
+    reader = csv.reader(lines, delimiter=separator)
     try:
-        rows = list(csv.reader(lines, delimiter=separator))
+        header = next(reader)
+        if len(header) - len(segments) - 1 > max_channels:  # not read any further
+            raise _build_width_error(len(header), max_channels)
+        rows = list(reader)
     except csv.Error as error:
         raise InvalidUpload(f"the first rows cannot be read ({error})") from None
-    names = [_split_unit(field) for field in rows[0]]
-    if len(names) == 1 and (sample_time is None or _is_number(rows[0][0])):
+    names = [_split_unit(field) for field in header]
+    if len(names) == 1 and (sample_time is None or _is_number(header[0])):
         raise InvalidUpload(
-            f"there is only one column ({rows[0][0].strip()!r}); need a time column and a signal, "
+            f"there is only one column ({header[0].strip()!r}); need a time column and a signal, "
             "separated by comma, semicolon or tab"
         )
     _check_names(names)
     columns = _assign_roles(names, segments, sample_time)
-    if not any(column.role == "value" for column in columns):
+    signals = sum(column.role == "value" for column in columns)
+    if signals == 0:
         raise InvalidUpload("there is no signal: every column is time or a label")
-    return CsvLayout(columns, separator, separator != "," and _has_decimal_commas(rows[1:]))
+    if signals > max_channels:
+        raise _build_width_error(len(header), max_channels)
+    return CsvLayout(columns, separator, separator != "," and _has_decimal_commas(rows))
+
+
+def _build_width_error(columns: int, max_channels: int) -> InvalidUpload:
+    return InvalidUpload(
+        f"the header has {columns} columns; at most {max_channels} signals are read", row=1
+    )
 
 
 def _detect_separator(header: str) -> str:
@@ -79,8 +98,9 @@ def _detect_separator(header: str) -> str:
 
 
 def _split_unit(field: str) -> tuple[str, str]:
-    match = _UNIT.match(field.strip())
-    return (match["name"], match["unit"].strip()) if match else (field.strip(), "")
+    text = unescape_formula(field.strip())
+    match = _UNIT.match(text)
+    return (match["name"], match["unit"].strip()) if match else (text, "")
 
 
 def _is_number(field: str) -> bool:

@@ -24,9 +24,11 @@ from typing import BinaryIO, cast
 
 import numpy as np
 
+from service.core.text import escape_formula
 from service.formats.csv_columns import ColumnValues, CsvTable, read_columns
 from service.formats.csv_layout import CsvLayout, detect_layout, find_unit_seconds
 from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
 
@@ -79,6 +81,7 @@ def read_csv(
     *,
     sample_time: float | None = None,
     segments: Sequence[str] = (),
+    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a CSV file.
 
@@ -91,6 +94,8 @@ def read_csv(
     segments : sequence of str
         Columns of labels, numbers or text. Consecutive rows with equal labels form a segment, and
         the time may restart with each segment. Segments follow each other on one axis.
+    limits : UploadLimits
+        Those of an MCAP file hold here too: signals, and rows as messages.
 
     Returns
     -------
@@ -110,8 +115,8 @@ def read_csv(
             raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
         if not first[0].strip():
             raise InvalidUpload("the first row is empty; need a header such as t,u,y", row=1)
-        layout = detect_layout(first, segments, sample_time)
-        table = read_columns(chain(first, lines), layout)
+        layout = detect_layout(first, segments, sample_time, limits.channels)
+        table = read_columns(chain(first, lines), layout, limits.messages)
     notes = ["decimal commas were read as decimal points"] if layout.has_decimal_commas else []
     times, spans = _build_times(table, layout, sample_time, notes)
     return _build_recording(table, layout, times, spans, notes), tuple(notes)
@@ -303,12 +308,14 @@ def generate_csv(recording: Recording) -> Iterator[str]:
     """Generate CSV text in blocks: time in s, label columns of segments, one column per channel.
 
     Within a segment the times are those of the segment. So an upload with ``?segments=`` and the
-    label columns gives the same recording. A cell is empty where its channel has no sample.
+    label columns gives the same recording. A cell is empty where its channel has no sample. A text
+    that a spreadsheet would take for a formula gets a leading apostrophe, which `read_csv` removes.
     """
     labels = sorted({name for segment in recording.segments for name in segment.labels})
     buffer = StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["t", *labels, *(_format_heading(channel) for channel in recording.channels)])
+    headings = ["t", *labels, *(_format_heading(channel) for channel in recording.channels)]
+    writer.writerow(map(escape_formula, headings))
     for number, row in enumerate(_iterate_rows(recording, labels), 1):
         writer.writerow(row)
         if number % WRITTEN_BLOCK_ROWS == 0:
@@ -362,7 +369,7 @@ def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
 
 def _format_value(value: float | str) -> str:
     if isinstance(value, str):
-        return value
+        return str(escape_formula(value))
     return repr(value) if isfinite(value) else ""
 
 

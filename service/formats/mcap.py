@@ -96,7 +96,8 @@ def write_recording(
     Raises
     ------
     ValueError
-        If the times exceed the range of a file's clock, or a metadata key is reserved.
+        If the times exceed the range of a file's clock, or a metadata key is reserved. Also if the
+        recording exceeds a limit of the reader.
     """
     topics, history = group_into_topics(recording), group_history_topics(recording)
     manifest = build_manifest(recording, topics, metadata or {}, history)

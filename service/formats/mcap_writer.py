@@ -29,6 +29,7 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
+from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap_messages import (
     MESSAGE_HEADER,
     NumericField,
@@ -43,6 +44,7 @@ from sysid.core.types import FloatArray
 
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 CHUNK_SAMPLES: Final = 16_384
+CHUNK_BYTES: Final = DEFAULT_LIMITS.record_bytes // 2  # a chunk may not become smaller
 LIBRARY: Final = "lagid"
 ZSTD_LEVEL: Final = -1  # half the time of the usual 3, and 4 % larger for measured doubles
 FOOTER_BODY: Final = 20
@@ -53,7 +55,8 @@ _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 class McapWriter:
     """Writes an MCAP file front to back; `write` takes the bytes.
 
-    All checksums are written: of each chunk, of the data section, and of the summary.
+    All checksums are written: of each chunk, of the data section, and of the summary. Nothing is
+    written that our reader would refuse by its limits (`service.formats.limits`).
     """
 
     def __init__(self, write: Callable[[bytes], object]) -> None:
@@ -85,6 +88,10 @@ class McapWriter:
         if message in self._messages:
             message = f"{message}_{number}"
         data = build_schema(message, fields)
+        if len(data) > DEFAULT_LIMITS.schema_bytes:
+            raise ValueError(
+                f"the names of {len(fields)} channels are too long to be stored; shorten them"
+            )
         schema = Schema(number, data, "protobuf", f"lagid.{message}")
         channel = Channel(number, path, "protobuf", {}, number)
         for record, encoded in ((schema, self._schemas), (channel, self._channels)):
@@ -101,7 +108,8 @@ class McapWriter:
         """Add all samples of a channel, in chunks."""
         fields = self._fields[channel - 1]
         layout = make_record_dtype(fields)
-        messages = np.zeros(min(CHUNK_SAMPLES, log_times.size), layout)
+        chunk_samples = min(CHUNK_SAMPLES, max(CHUNK_BYTES // layout.itemsize, 1))
+        messages = np.zeros(min(chunk_samples, log_times.size), layout)
         messages["opcode"] = Opcode.MESSAGE
         messages["length"] = layout.itemsize - MESSAGE_HEADER
         messages["channel"] = channel
@@ -109,8 +117,8 @@ class McapWriter:
             messages[f"tag{i}"] = encode_tag_value(field)
         index = np.zeros(messages.size, _INDEX)
         index["offset"] = layout.itemsize * np.arange(messages.size)
-        for first in range(0, log_times.size, CHUNK_SAMPLES):
-            part = slice(first, min(first + CHUNK_SAMPLES, log_times.size))
+        for first in range(0, log_times.size, chunk_samples):
+            part = slice(first, min(first + chunk_samples, log_times.size))
             chunk = messages[: part.stop - first]
             chunk["sequence"] = np.arange(part.start, part.stop)
             chunk["log_time"] = chunk["publish_time"] = log_times[part]
@@ -194,6 +202,11 @@ class McapWriter:
 
     def _put_record(self, record: McapRecord | bytes) -> int:
         data = record if isinstance(record, bytes) else _encode_record(record)
+        if len(data) > DEFAULT_LIMITS.record_bytes:
+            raise ValueError(
+                f"a {type(record).__name__} of {len(data)} bytes cannot be stored; the recording "
+                "has too many segments or too long names"
+            )
         self._put_bytes(data)
         return len(data)
 

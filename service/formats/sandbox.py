@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from service.core import temporary_files
+from service.core.errors import Unavailable
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
@@ -60,6 +61,8 @@ def read_untrusted(
     ------
     InvalidUpload
         If the file cannot be used for any reason.
+    Unavailable
+        If the disk of temporary files is full.
     """
     source = Path(path)
     size = source.stat().st_size
@@ -115,6 +118,8 @@ def _parse_answer(
         answer = json.loads(child.stdout)
         if "error" in answer:
             raise InvalidUpload(**answer["error"])
+        if answer.get("is_disk_full"):
+            raise Unavailable(temporary_files.FULL_DISK_MESSAGE)
         return tuple(answer["notes"])
     except (json.JSONDecodeError, KeyError, TypeError):
         reason = (child.stderr.strip().splitlines() or ["no message"])[-1]

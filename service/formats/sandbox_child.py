@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from service.core.temporary_files import FULL_DISK_ERRORS
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
 from service.formats.limits import MIB, UploadLimits
@@ -17,7 +18,10 @@ from sysid.data.records import Recording
 
 
 def main() -> int:
-    """Read the file of the task and write it again; answer with notes or with the error."""
+    """Read the file of the task and write it again; answer with notes or with the error.
+
+    A full disk is no fault of the file and has an answer of its own.
+    """
     task = json.load(sys.stdin)
     limits = UploadLimits(**task["limits"])
     _limit_resources(limits)
@@ -25,6 +29,10 @@ def main() -> int:
         answer: dict[str, Any] = {"notes": _convert_file(task, limits)}
     except InvalidUpload as error:
         answer = {"error": _describe_invalid_upload(error)}
+    except OSError as error:
+        if error.errno not in FULL_DISK_ERRORS:
+            raise
+        answer = {"is_disk_full": True}
     except MemoryError:
         answer = {"error": {"what": _describe_memory_limit(limits)}}
     sys.stdout.write(json.dumps(answer))
@@ -47,7 +55,10 @@ def _limit_resources(limits: UploadLimits) -> None:
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     if task["kind"] == "csv":
         recording, notes = read_csv(
-            Path(task["source"]), sample_time=task["sample_time"], segments=task["segments"]
+            Path(task["source"]),
+            sample_time=task["sample_time"],
+            segments=task["segments"],
+            limits=limits,
         )
         messages = list(notes)
     else:

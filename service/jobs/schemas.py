@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.states import StateName
-from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, check_depth
+from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed
 from sysid.core.settings import (
     MAX_BITS,
     MAX_EVALUATIONS,
@@ -252,11 +252,6 @@ class IdentificationIn(Body):
     reuse: bool = Field(
         default=True, description="take over results of earlier runs with the same specification"
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _check_depth(cls, value: Any) -> Any:
-        return check_depth(value)
 
     def dump_set_fields(self, *also: str) -> dict[str, Any]:
         """Dump these fields and those in `also`, if they were set."""

@@ -1,9 +1,10 @@
 """The events of jobs in order: the source of the event stream."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES
@@ -11,6 +12,14 @@ from service.storage.columns import Document
 from service.storage.tables import Event, Job
 
 EventKind = Literal["state", "progress", "log", "end"]
+
+
+@dataclass(frozen=True, slots=True)
+class JobHead:
+    """The number of a job's last event (0 if there is none), and whether the job has ended."""
+
+    last: int
+    is_over: bool
 
 
 class EventRepository:
@@ -45,6 +54,12 @@ class EventRepository:
         """List the events of a job after number `last_id`, oldest first."""
         newer = select(Event).where(Event.job_id == job_id, Event.id > last_id)
         return list(self._session.scalars(newer.order_by(Event.id).limit(limit)))
+
+    def read_heads(self, job_ids: Collection[str]) -> dict[str, JobHead]:
+        """Read how far the events of these jobs are."""
+        last = select(func.max(Event.id)).where(Event.job_id == Job.id).scalar_subquery()
+        rows = self._session.execute(select(Job.id, Job.state, last).where(Job.id.in_(job_ids)))
+        return {job_id: JobHead(number or 0, state.is_terminal) for job_id, state, number in rows}
 
     def list_latest(
         self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()

@@ -20,6 +20,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.core.states import JobState
+from service.core.text_checks import MANY
 from service.repositories.history import HistoryPoint, MigrantPoint, unpack_history, unpack_migrants
 from service.storage.columns import Document, to_json
 from service.storage.errors import InvalidCursor, RowNotFound
@@ -155,7 +156,14 @@ class RunRepository:
 def entry_equals(
     session: Session, column: InstrumentedAttribute[Document], key: str, value: object
 ) -> ColumnElement[bool]:
-    """Return the condition that a document has this value under a key."""
+    """Return the condition that a document has this value under a key.
+
+    Raises
+    ------
+    UnstorableValue
+        If no document can have it.
+    """
+    to_json([key, value])
     if session.get_bind().dialect.name == "postgresql":
         return type_coerce(column, JSONB)[key] == cast(literal(to_json(value)), JSONB)
     return _sqlite_entry_equals(column, key, value)
@@ -205,6 +213,10 @@ def _parse_cursor(cursor: str) -> tuple[float | None, int]:
         value, number = json.loads(cursor)
     except (ValueError, TypeError):
         raise InvalidCursor(cursor) from None
-    if not isinstance(value, int | float | None) or not isinstance(number, int):
+    if not (isinstance(value, float | None) or _is_count(value)) or not _is_count(number):
         raise InvalidCursor(cursor)
     return value, number
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MANY

@@ -188,6 +188,10 @@ def parse_filters(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
             raise InvalidRequest.from_fault(f"?{name}", f"found {text!r}; need path=value")
         try:
             conditions[key] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             conditions[key] = value
+        if isinstance(conditions[key], int) and abs(conditions[key]) >= 2**63:
+            raise InvalidRequest.from_fault(
+                f"?{name}", f"found {text!r:.80}; need a number of at most 64 bits"
+            )
     return conditions

@@ -3,12 +3,11 @@
 import csv
 import io
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.text import append_unit
+from service.core.text import append_unit, escape_formula
 from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
@@ -16,9 +15,6 @@ from service.storage.sessions import Database
 from service.storage.tables import Run
 
 RUNS_PER_PART = 500
-FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last four: full width
-"""First characters of formulas in common spreadsheets."""
-_NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = (
     "number",
     "id",
@@ -132,13 +128,5 @@ def _to_csv_value(value: object) -> object:
 
 def _to_csv_lines(rows: Iterable[Sequence[Any]]) -> str:
     sink = io.StringIO()
-    csv.writer(sink, lineterminator="\n").writerows(map(_escape_formula, row) for row in rows)
+    csv.writer(sink, lineterminator="\n").writerows(map(escape_formula, row) for row in rows)
     return sink.getvalue()
-
-
-def _escape_formula(value: object) -> object:
-    """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
-    if not isinstance(value, str):
-        return value
-    is_formula = value.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(value)
-    return ("'" if is_formula else "") + value.replace("\r", " ")

@@ -13,7 +13,7 @@ import yaml
 from sysid.core.errors import Fault, InvalidModel, join_pointer, suggest_name
 
 MAX_DOCUMENT_CHARACTERS = 262_144
-_MAX_DEPTH = 20
+_MAX_DEPTH, _MAX_NODES = 20, 20_000
 
 _BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 _FLOAT = re.compile(
@@ -31,7 +31,7 @@ class _YamlLoader(yaml.SafeLoader):
     """
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
-    _depth = 0
+    _depth = _nodes = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
@@ -41,6 +41,9 @@ class _YamlLoader(yaml.SafeLoader):
             _reject_node(f"the tag {event.tag[:60]!r} is not allowed; write plain data", event)
         if self._depth >= _MAX_DEPTH:
             _reject_node(f"nested deeper than {_MAX_DEPTH} levels", event)
+        self._nodes += 1
+        if self._nodes > _MAX_NODES:  # each takes tens of microseconds
+            _reject_node(f"more than {_MAX_NODES} names, values and lists", event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1

@@ -1,12 +1,12 @@
 """What a claim reads does not grow with the jobs there ever were; on both databases."""
 
 from datetime import timedelta
-from types import SimpleNamespace
+from threading import Event as Flag
 
 import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
-from service.api.events import _read_events
+from service.api.event_feed import EventFeed
 from service.core.states import JobState
 from service.jobs.schemas import JobIn
 from service.queue.admission import Admission
@@ -166,7 +166,9 @@ def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specifi
             queue.reap_expired(LeaseOwners(ended=frozenset({got.lease.owner})))
         with database.read_session() as session:
             assert JobRepository(session).get_state(got.job.id) is JobState.QUEUED
-        _read_events(SimpleNamespace(database=database), got.job.id, 0)
+        feed = EventFeed(database, Flag(), 1.0, 1)
+        feed._read_batch(got.job.id, 0)
+        assert feed._read_heads([got.job.id])[got.job.id].last > 0
 
     found = statements_of(database, work)
     assert len(found) > 5

@@ -34,6 +34,7 @@ ARGUMENTS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--host-resolver-rules=MAP *.test 127.0.0.1",  # names that were rebound to this machine
     "--process-per-site",  # one process for all tabs: it keeps compiled scripts
 ]
 

@@ -156,7 +156,10 @@ def test_the_report_of_a_job_names_no_other_file(client: TestClient, filled: Fil
     assert answer.status_code == 200
     assert "src=" not in head
     assert "<link" not in answer.text
-    assert "sha256-" in answer.headers["content-security-policy"]
+    policy = answer.headers["content-security-policy"]
+    assert "sha256-" in policy
+    assert policy.endswith("; frame-ancestors 'none'")
+    assert "frame-ancestors" not in head  # not known there: browsers would complain
 
 
 def test_a_model_is_shown_as_yaml(client: TestClient) -> None:

@@ -4,11 +4,13 @@ import asyncio
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from threading import get_ident
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
+from service.api import bodies
 from service.api.app import create_app
 from service.api.middleware import BodyLimit
 from service.core.errors import TooLarge
@@ -86,13 +88,13 @@ def test_nothing_of_a_long_body_is_read_and_of_one_of_unknown_length_no_more_tha
     assert read([], 100) == 4
 
 
-def test_a_sweep_over_a_hundred_thousand_labelled_values_is_within_the_limit(
+def test_a_sweep_over_forty_thousand_labelled_values_is_within_the_limit(
     tmp_path: Path,
 ) -> None:
     axis = {
         "path": "/datasets",
-        "values": [["ds_0123456789abcdefghjkmnpqrs"]] * 100_000,
-        "labels": [{"pressure_bar": 1.2345678901234567 + k, "length_m": k} for k in range(100_000)],
+        "values": [["ds_0123456789abcdefghjkmnpqrs"]] * 40_000,
+        "labels": [{"pressure_bar": 1.2345678901234567 + k, "length_m": k} for k in range(40_000)],
     }
     body = {"model": "fopdt", "datasets": ["ds"], "sweep": {"axes": [axis]}}
     assert len(json.dumps(body)) < Settings(data_dir=tmp_path).max_body_bytes
@@ -114,3 +116,57 @@ def test_lengths_of_an_axis_are_bounded(own: TestClient, axis: Any, pointer: str
     }
     faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
     assert [one["pointer"] for one in faults] == [pointer]  # of type: no other is sought
+
+
+def test_the_fields_of_an_object_are_counted_before_they_are_looked_at(own: TestClient) -> None:
+    paths = own.get("/openapi.json").json()["paths"]
+    routes = [
+        (method, path.replace("{", "").replace("}", ""))
+        for path, methods in paths.items()
+        for method, operation in methods.items()
+        if "application/json" in operation.get("requestBody", {}).get("content", {})
+    ]
+    assert {("post", "/v1/jobs"), ("post", "/v1/models"), ("put", "/v1/references/name")} <= {
+        *routes
+    }
+    many = {f"k{n}": 1 for n in range(30_000)}
+    told = "an object of the body has 30000 fields; at most 10000 are read"
+    for method, path in routes:
+        answer = own.request(method, path, json={"model": many})
+        if path == "/v1/models:check":
+            assert answer.json()["errors"][0]["detail"] == told
+        else:
+            assert refused(answer, 422, "invalid") == [{"pointer": "", "detail": told}]
+
+
+def test_more_faults_than_anybody_reads_are_counted_and_not_described(own: TestClient) -> None:
+    axis: dict[str, Any] = {"path": "/seed", "values": [1], "labels": [0] * 10_001}
+    body = {"model": "fopdt", "datasets": ["none"], "sweep": {"axes": [axis]}}
+    [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    assert fault["pointer"] == ""
+    assert "the body has 10001 faults" in fault["detail"]
+    axis["labels"].pop()
+    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    assert faults[-1]["detail"] == "9000 more faults are not listed"
+
+
+def test_long_bodies_are_read_outside_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[int] = []
+
+    def read(body: bytes, kind: Any) -> int:
+        threads.append(get_ident())
+        return len(body)
+
+    async def play() -> int:
+        for size in (bodies.SMALL_BODY_BYTES, bodies.SMALL_BODY_BYTES + 1):
+
+            async def receive(size: int = size) -> dict[str, Any]:
+                return {"type": "http.request", "body": b" " * size, "more_body": False}
+
+            scope = {"type": "http", "method": "POST", "path": "/", "headers": []}
+            assert await bodies._JsonRequest(scope, receive).json() == size
+        return get_ident()
+
+    monkeypatch.setattr(bodies, "_read_body", read)
+    loop = awaited(play)
+    assert [thread == loop for thread in threads] == [True, False]

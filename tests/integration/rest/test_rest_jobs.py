@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import events as event_routes
+from service.api import event_feed
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
@@ -151,7 +151,7 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     assert events(own, job) == ["state", "state", "log", "state", "end"]
     assert events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
     assert events(own, job, **{"Last-Event-ID": "5"}) == []
-    for text in ("x", "-1", "9" * 19, "9" * 30):
+    for text in ("x", "-1", "9" * 19, "9" * 30, "9" * 5000):
         answer = own.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": text})
         refused(answer, 422, "invalid")
     read = own.get(f"/v1/jobs/{job}").json()
@@ -170,7 +170,7 @@ def test_a_stream_is_whole_whatever_is_read_at_once(
     whole = events(server, job)
     assert whole == ["state", *["state", "end", "state"] * 3, "state", "end"]
     for most in (1, 2, len(whole)):
-        monkeypatch.setattr(event_routes, "MAX_BATCH_EVENTS", most)
+        monkeypatch.setattr(event_feed, "MAX_BATCH_EVENTS", most)
         assert events(server, job) == whole
 
 

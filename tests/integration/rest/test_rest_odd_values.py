@@ -130,3 +130,42 @@ def test_of_very_many_faults_a_thousand_are_told(server: TestClient, dataset: st
     faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
     assert len(faults) == 1002
     assert faults[-1]["detail"] == "more faults follow; they are not listed"
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        {"cursor": f"[null,{'9' * 30}]"},
+        {"cursor": "[true,true]"},
+        {"cursor": "[null,false]"},
+        {"cursor": "[9999999999999999999999,1]", "order": "evaluations"},
+        {"cursor": "[1,1.5]"},
+        {"cell": f"/seed={'9' * 30}"},
+        {"cell": f"/seed={'9' * 5000}"},
+        {"cell": "/seed=" + "[" * 20_000},
+        {"cell": '/seed="\\ud800"'},
+        {"cell": "/seed=NaN"},
+        {"cell": "/se\x00ed=1"},
+        {"label": f"n={'9' * 30}"},
+    ],
+    ids=lambda query: next(iter(query.values()))[:20],
+)
+def test_positions_and_filters_that_no_database_can_compare_are_refused_or_match_nothing(
+    server: TestClient, dataset: str, query: dict[str, str]
+) -> None:
+    body = {"model": "fopdt", "datasets": [dataset]}
+    job = server.post("/v1/jobs", json=body).json()["id"]
+    answer = server.get(f"/v1/jobs/{job}/runs", params=query)
+    if answer.status_code == 200:
+        assert answer.json()["items"] == []
+    else:
+        assert refused(answer, 422, "invalid") is not None
+        assert len(answer.content) < 7000
+
+
+def test_a_range_of_5000_digits_ends_with_the_file(server: TestClient, dataset: str) -> None:
+    path = f"/v1/datasets/{dataset}/content"
+    whole = server.get(path).content
+    answer = server.get(path, headers={"Range": f"bytes=0-{'9' * 5000}"})
+    assert (answer.status_code, answer.content) == (206, whole)
+    refused(server.get(path, headers={"Range": f"bytes={'9' * 5000}-"}), 416, "range")

@@ -2,6 +2,8 @@
 
 import errno
 import sqlite3
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -9,7 +11,11 @@ from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from service.api import content
-from tests.rest import CSV, parts_of, recording, refused
+from service.api.app import create_app
+from service.datasets import datasets
+from service.formats import sandbox
+from service.storage.errors import ObjectStoreFailed
+from tests.rest import CSV, parts_of, recording, refused, settings_of
 
 
 def away(*_args: Any, **_options: Any) -> Any:
@@ -36,6 +42,69 @@ def test_a_full_disk_is_a_part_that_is_down(
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
     assert "a disk of the server is full" in answer.json()["detail"]
+    assert answer.headers["retry-after"] == "1"
+
+
+class FullFolder(TemporaryDirectory[str]):
+    """A folder where the reader of an upload finds no space."""
+
+    def __enter__(self) -> str:
+        folder = super().__enter__()
+        (Path(folder) / "clean.mcap").symlink_to("/dev/full")
+        return folder
+
+
+def test_a_full_folder_of_the_reading_process_is_no_fault_of_the_file(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sandbox, "TemporaryDirectory", FullFolder)
+    answer = server.post("/v1/datasets", content=recording(period=0.07), headers=CSV)
+    refused(answer, 503, "unavailable")
+    assert "a disk of the server is full" in answer.json()["detail"]
+    assert answer.headers["retry-after"] == "1"
+
+
+def test_an_object_store_that_is_full_says_when_to_come_back(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_args: Any) -> None:
+        raise ObjectStoreFailed("the object store cannot write an object: no space")
+
+    monkeypatch.setattr(parts_of(server).store, "put_file", full)
+    answer = server.post("/v1/datasets", content=recording(period=0.06), headers=CSV)
+    refused(answer, 503, "unavailable")
+    assert answer.headers["retry-after"] == "1"
+
+
+def test_uploads_at_once_are_bounded_and_each_gives_its_place_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def post(text: bytes) -> Any:
+        return client.post("/v1/datasets", content=text, headers=CSV)
+
+    app = create_app(settings_of(tmp_path, max_uploads=1))
+    with TestClient(app, raise_server_exceptions=False) as client:
+        places = parts_of(client).upload_places
+        assert post(recording()).status_code == 201
+        refused(post(b"no recording"), 422, "invalid-upload")
+        monkeypatch.setattr(content, "MAX_WAIT_SECONDS", 0.1)
+        assert client.portal is not None
+        client.portal.call(places.acquire)  # as an upload that is on its way
+        answer = post(recording(period=0.2))
+        refused(answer, 503, "unavailable")
+        assert "LAGID_MAX_UPLOADS" in answer.json()["detail"]
+        assert int(answer.headers["retry-after"]) > 0
+        client.portal.call(places.release)
+        held = []
+        add_upload = datasets.add_upload
+
+        def add(*args: Any, **options: Any) -> Any:
+            held.append(places.locked())
+            return add_upload(*args, **options)
+
+        monkeypatch.setattr(datasets, "add_upload", add)
+        assert post(recording(period=0.2)).status_code == 201
+        assert held == [True]
 
 
 def test_another_fault_of_a_disk_is_not_told_as_a_full_one_and_its_words_stay_inside(

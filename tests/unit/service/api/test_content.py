@@ -1,12 +1,17 @@
 """Bytes over HTTP: of several files in one object each answer has its own, whole or in part."""
 
+import asyncio
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.requests import Request
 
-from service.api.content import ByteRange, content_response
-from service.core.errors import StaleVersion, UnsatisfiableRange
+from service.api import content
+from service.api.content import ByteRange, content_response, receive_upload
+from service.core.errors import StaleVersion, StalledRequest, UnsatisfiableRange
+from service.core.settings import Settings
 from tests.rest import awaited
 
 FIRST, SECOND = b"0123456789", b"abcdefgh"
@@ -57,6 +62,9 @@ def test_a_file_comes_whole_with_its_length(file: str) -> None:
         ("bytes=-3", slice(-3, None)),
         ("bytes=-1000", slice(0, None)),
         ("bytes=4-1000", slice(4, None)),
+        ("bytes=0-" + "9" * 5000, slice(0, None)),
+        ("bytes=-" + "9" * 5000, slice(0, None)),
+        ("bytes=" + "0" * 5000 + "2-4", slice(2, 5)),
     ],
 )
 def test_a_range_is_within_the_file(file: str, text: str, part: slice) -> None:
@@ -66,7 +74,9 @@ def test_a_range_is_within_the_file(file: str, text: str, part: slice) -> None:
     assert found.headers["content-range"] == f"bytes {start}-{stop - 1}/{len(whole)}"
 
 
-@pytest.mark.parametrize("text", ["bytes=8-", "bytes=9-12", "bytes=5-4", "bytes=-0"])
+@pytest.mark.parametrize(
+    "text", ["bytes=8-", "bytes=9-12", "bytes=5-4", "bytes=-0", f"bytes={'9' * 5000}-"]
+)
 def test_a_range_outside_the_file_is_refused_also_if_the_object_goes_on(text: str) -> None:
     with pytest.raises(UnsatisfiableRange, match="8 bytes"):
         answer("second", range=text)
@@ -91,3 +101,31 @@ def test_each_file_has_its_own_version() -> None:
         with pytest.raises(StaleVersion):
             answer("second", if_match=other)
     assert answer("second", if_match="*").status_code == 200
+
+
+def test_a_sender_that_stops_loses_its_place(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    async def receive() -> dict[str, Any]:
+        if pieces:
+            return {"type": "http.request", "body": pieces.pop(), "more_body": True}
+        await asyncio.sleep(60)
+        raise AssertionError("nobody waits so long")
+
+    async def play(headers: list[tuple[bytes, bytes]]) -> None:
+        places = asyncio.Semaphore(1)
+        scope = {"type": "http", "method": "POST", "path": "/v1/datasets", "headers": headers}
+        for _ in range(2):
+            with pytest.raises(StalledRequest):
+                async with receive_upload(Request(scope, receive), settings, places):
+                    pass
+        assert not places.locked()
+
+    settings = Settings(data_dir=tmp_path)
+    monkeypatch.setattr(content, "MAX_PAUSE_SECONDS", 0.05)
+    for headers in (
+        [(b"content-type", b"text/csv")],
+        [(b"content-type", b"multipart/form-data; boundary=x"), (b"content-length", b"99")],
+    ):
+        pieces = [b"--x\r\n"]
+        awaited(partial(play, headers))

@@ -236,6 +236,8 @@ def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
     assert plotly.to_csv(plotly.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
+    line = plotly.to_csv(signals.plot_signals([signal(3, "=1+1")])).splitlines()[1]
+    assert line.startswith("'=1+1")  # no formula in a spreadsheet
 
 
 def test_a_figure_in_the_dark_has_the_same_data() -> None:

@@ -1,5 +1,6 @@
 """CSV files: what is understood, and that every fault is told with its place in one line."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from service.formats.csv_recordings import generate_csv, read_csv
 from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
 from sysid.data.records import Channel, Recording
 
 
@@ -272,3 +274,39 @@ def test_a_channel_with_several_values_at_a_time_has_a_row_for_each() -> None:
 
 def test_a_stray_quote_is_told_with_its_row() -> None:
     assert refused('t,u\n0,1\n1,2\n2,"3"x\n').row == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [("=1+1", "'=1+1"), ("@SUM(A1)", "'@SUM(A1)"), ("+x", "'+x"), ("x=1", "x=1")],
+)
+def test_no_name_or_label_is_a_formula_in_a_spreadsheet_and_each_comes_back(
+    name: str, written: str
+) -> None:
+    content = f"t,run,{name} [V],y [m]\n0,{name},1,2\n1,{name},1,2\n"
+    before, _ = read_csv(content.encode(), segments=["run"])
+    text = "".join(generate_csv(before))
+    assert text.splitlines()[0] == f"t,run,{written} [V],y [m]"
+    assert text.splitlines()[1].split(",")[1] == written
+    after, _ = read_csv(text.encode(), segments=["run"])
+    assert [channel.name for channel in after.channels] == [name, "y"]
+    assert after.segments == before.segments
+
+
+def test_more_signals_than_the_limit_are_refused_before_anything_below_the_header() -> None:
+    limits = replace(DEFAULT_LIMITS, channels=3)
+    for header, options in (
+        ("t,a,b,c,d", {}),
+        ("a,b,c,d", {"sample_time": 1.0}),
+        ("t,run,a,b,c,d", {"segments": ["run"]}),
+    ):
+        error = refused(f"{header}\nthis is no row\n", limits=limits, **options)
+        assert error.row == 1
+        assert f"the header has {header.count(',') + 1} columns; at most 3 signals" in str(error)
+    assert len(read_csv(b"t,a,b,c\n0,1,2,3\n", limits=limits)[0].channels) == 3
+
+
+def test_more_rows_than_the_limit_are_refused() -> None:
+    limits = replace(DEFAULT_LIMITS, messages=3)
+    assert read_csv(b"t,u\n0,1\n1,2\n2,3\n", limits=limits)[0].channels[0].values.size == 3
+    assert "more than 3 rows" in str(refused("t,u\n0,1\n1,2\n2,3\n3,4\n", limits=limits))

@@ -17,6 +17,7 @@ from mcap.records import DataEnd, Footer, McapRecord, Message, MessageIndex, Sum
 from mcap.stream_reader import StreamReader
 
 from service.formats import mcap_writer
+from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import (
     FittedOutput,
     read_fitted_outputs,
@@ -286,3 +287,26 @@ def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
     topics = {channel.topic for channel in summary.channels.values()}
     assert topics == {"/fit/run_1", "/fit/run_1/2"}
     assert b"y_residual" in next(iter(summary.schemas.values())).data
+
+
+def test_the_widest_recording_is_written_within_the_limits_of_the_reader() -> None:
+    times = np.arange(7000) * 0.01
+    zeros = np.zeros(times.size)
+    names = [f"channel{number}" for number in range(DEFAULT_LIMITS.channels)]
+    content = recorded(Recording(tuple(Channel(name, times, zeros) for name in names)))
+    read = read_recording(BytesIO(content), DEFAULT_LIMITS)
+    assert [channel.name for channel in read.channels] == names
+    np.testing.assert_array_equal(read.channels[-1].times, times)
+
+
+def test_names_and_segments_that_the_reader_would_refuse_are_not_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    times = np.arange(3.0)
+    long = [Channel(f"{'n' * 2000}{number}", times, times) for number in range(600)]
+    with pytest.raises(ValueError, match="names of 600 channels are too long"):
+        recorded(Recording(tuple(long)))
+    monkeypatch.setattr(mcap_writer, "DEFAULT_LIMITS", replace(DEFAULT_LIMITS, record_bytes=500))
+    spans = tuple(Segment(float(n), n + 0.5, float(n), {"run": float(n)}) for n in range(20))
+    with pytest.raises(ValueError, match="too many segments"):
+        recorded(Recording((Channel("u", np.arange(20.0), np.zeros(20)),), spans))

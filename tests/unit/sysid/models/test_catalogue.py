@@ -93,6 +93,7 @@ def test_files_that_cannot_be_read_are_told_in_one_line(tmp_path: Path) -> None:
         ("a: !!python/object/apply:os.system [ls]", "the tag"),
         ("a: !!int x", "the tag"),
         ("[" * 1000, "nested deeper than 20"),
+        ("[" + "0," * 20_000 + "]", "more than 20000 names"),
         ("? {a: 1}\n: 2", "unhashable key"),
         ("a: 1\n---\nb: 2", "expected a single document"),
         ("a: \x00", "special characters"),

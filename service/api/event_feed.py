@@ -1,0 +1,164 @@
+"""Read the events of jobs once for all streams of this process.
+
+A stream that asks the database by itself costs a thread and a connection, several times a second.
+Here one query asks for the news of all jobs that have a stream. Streams of one job that stand at
+the same event share what is read.
+"""
+
+import asyncio
+import json
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from threading import Event as Flag
+
+from starlette.concurrency import run_in_threadpool
+
+from service.core.errors import ServiceBusy
+from service.repositories.events import EventRepository, JobHead
+from service.repositories.jobs import JobRepository
+from service.storage.retry import TRANSIENT_ERRORS, is_transient
+from service.storage.sessions import Database
+from service.storage.tables import Event
+
+MAX_BATCH_EVENTS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class EventBatch:
+    """Events of a job as the text of a stream.
+
+    Attributes
+    ----------
+    last : int
+        Number of the last event that was sent.
+    is_full : bool
+        More events may be there already.
+    is_over : bool
+        The job has ended.
+    """
+
+    text: str
+    last: int
+    is_full: bool
+    is_over: bool
+
+
+class EventFeed:
+    """Events for the streams of one event loop; `stopping` ends all of them."""
+
+    def __init__(
+        self, database: Database, stopping: Flag, poll_seconds: float, max_streams: int
+    ) -> None:
+        self._database, self._stopping = database, stopping
+        self._poll_seconds, self._max_streams = poll_seconds, max_streams
+        self._streams: Counter[str] = Counter()
+        self._heads: dict[str, JobHead] = {}
+        self._reads: dict[tuple[str, int], asyncio.Task[EventBatch]] = {}
+        self._poller: asyncio.Task[None] | None = None
+        self._changed = asyncio.Event()
+
+    def check_room(self) -> None:
+        """Check that one more stream may be opened.
+
+        Raises
+        ------
+        ServiceBusy
+            If there are as many as this process allows.
+        """
+        if self._streams.total() >= self._max_streams:
+            raise ServiceBusy(
+                f"{self._max_streams} event streams are open; at most so many are allowed "
+                "(LAGID_MAX_STREAMS). Ask for the job instead, or try again."
+            )
+
+    @asynccontextmanager
+    async def watch_job(self, job_id: str) -> AsyncIterator[None]:
+        """Look for news of a job during the block."""
+        self._streams[job_id] += 1
+        try:
+            yield
+        finally:
+            self._streams[job_id] -= 1
+            if not self._streams[job_id]:
+                del self._streams[job_id]
+                self._heads.pop(job_id, None)
+
+    async def read_after(self, job_id: str, last: int) -> EventBatch:
+        """Read the events after a number; streams that ask for the same share one reading.
+
+        Raises
+        ------
+        RowNotFound
+            If there is no such job.
+        """
+        key = (job_id, last)
+        if key not in self._reads:
+            reading = run_in_threadpool(self._read_batch, job_id, last)
+            self._reads[key] = task = asyncio.ensure_future(reading)
+            task.add_done_callback(lambda _: self._reads.pop(key))
+        return await asyncio.shield(self._reads[key])  # a client that leaves does not stop it
+
+    async def wait_for_news(self, job_id: str, last: int, seconds: float) -> bool:
+        """Wait until a job has events after a number, or has ended; False if nothing came."""
+        self._start_poller()
+        before = self._heads.get(job_id)
+        try:
+            async with asyncio.timeout(seconds):
+                while not self._has_news(job_id, last, before):
+                    await self._changed.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    def _has_news(self, job_id: str, last: int, before: JobHead | None) -> bool:
+        if self._stopping.is_set() or self._poller is None or self._poller.done():
+            return True
+        head = self._heads.get(job_id)
+        # A head that was there before may be older than what the stream has read.
+        return head is not None and (head.last > last or (head.is_over and head is not before))
+
+    def _start_poller(self) -> None:
+        if self._poller is None or self._poller.done():
+            self._poller = asyncio.create_task(self._poll())
+            self._poller.add_done_callback(lambda _: self._wake_streams())
+
+    async def _poll(self) -> None:
+        """Look for news until there is no stream. If this fails, streams read by themselves."""
+        while self._streams and not self._stopping.is_set():
+            await asyncio.sleep(self._poll_seconds)
+            try:
+                heads = await run_in_threadpool(self._read_heads, list(self._streams))
+            except TRANSIENT_ERRORS as error:
+                if not is_transient(error):
+                    raise
+                continue  # the database may come back; the streams wait for it
+            has_changed, self._heads = heads != self._heads, heads
+            if has_changed:
+                self._wake_streams()
+
+    def _wake_streams(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _read_heads(self, job_ids: list[str]) -> dict[str, JobHead]:
+        with self._database.read_session() as session:
+            return EventRepository(session).read_heads(job_ids)
+
+    def _read_batch(self, job_id: str, last: int) -> EventBatch:
+        """Read newer events, and whether the job has ended, in one transaction."""
+        with self._database.read_session() as session:
+            state = JobRepository(session).get_state(job_id)
+            events = EventRepository(session).list_after(job_id, last, MAX_BATCH_EVENTS)
+        return EventBatch(
+            "".join(map(_format_event, events)),
+            events[-1].id if events else last,
+            len(events) == MAX_BATCH_EVENTS,
+            state.is_terminal,
+        )
+
+
+def _format_event(event: Event) -> str:
+    data = {**event.data, "at": event.created_at.isoformat()}
+    return f"id: {event.id}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"

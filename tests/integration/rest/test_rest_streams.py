@@ -1,0 +1,114 @@
+"""Many event streams: one look for news serves them all, and there are at most so many."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+from sqlalchemy import event
+from starlette.testclient import TestClient
+
+from service.api.app import create_app
+from service.api.event_feed import EventFeed
+from service.storage.sessions import Database
+from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
+from tests.serving import serve_in_thread
+
+STREAMS = 30
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[httpx.Client, str, Database]]:
+    """A service on a port with room for 30 streams, and a queued job."""
+    app = create_app(settings_of(tmp_path, max_streams=STREAMS, poll_seconds=0.05))
+    with serve_in_thread(app) as url, httpx.Client(base_url=url, timeout=60) as client:
+        steps = store_csv(_AppOf(app), recording())
+        job = client.post("/v1/jobs", json={"model": "fopdt", "datasets": [steps]}).json()["id"]
+        yield client, job, app.state.parts.database
+
+
+class _AppOf:
+    """What `store_csv` needs of a test client."""
+
+    def __init__(self, app: object) -> None:
+        self.app = app
+
+
+async def read_stream(client: httpx.AsyncClient, path: str, opened: asyncio.Queue[int]) -> str:
+    async with client.stream("GET", path) as answer:
+        await opened.put(answer.status_code)
+        return (await answer.aread()).decode()
+
+
+@asynccontextmanager
+async def open_streams(
+    client: httpx.AsyncClient, path: str
+) -> AsyncIterator[list[asyncio.Task[str]]]:
+    opened: asyncio.Queue[int] = asyncio.Queue()
+    tasks = [asyncio.create_task(read_stream(client, path, opened)) for _ in range(STREAMS)]
+    assert {await opened.get() for _ in tasks} == {200}
+    yield tasks
+
+
+def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
+    served: tuple[httpx.Client, str, Database],
+) -> None:
+    plain, job, database = served
+    path, statements = f"/v1/jobs/{job}/events", []
+
+    async def play() -> list[str]:
+        limits = httpx.Limits(max_connections=2 * STREAMS)
+        async with httpx.AsyncClient(base_url=plain.base_url, timeout=60, limits=limits) as client:
+            async with open_streams(client, path) as tasks:
+                await asyncio.sleep(0.2)
+                async with client.stream("GET", path) as answer:
+                    assert answer.status_code == 503
+                    await answer.aread()
+                refused(answer, 503, "unavailable")
+                assert int(answer.headers["retry-after"]) > 0
+                statements.clear()
+                await asyncio.sleep(0.5)
+                idle = sum("events" in statement for statement in statements)
+                await client.post(f"/v1/jobs/{job}:cancel")
+                texts = await asyncio.gather(*tasks)
+            assert 0 < idle <= 15  # 10 looks for news; of each stream alone 30 times as many
+            return texts
+
+    event.listen(database.engine, "before_cursor_execute", lambda *call: statements.append(call[2]))
+    texts = awaited(play)
+    assert len(set(texts)) == 1
+    assert texts[0].count("event: end") == 1
+    assert plain.get(path).text == texts[0]  # the places of the streams are free again
+
+
+def test_readings_of_one_event_are_shared_and_a_reader_that_leaves_stops_nobody(
+    own: TestClient,
+) -> None:
+    parts = parts_of(own)
+    body = {"model": "fopdt", "datasets": [store_csv(own, recording())]}
+    job = own.post("/v1/jobs", json=body).json()["id"]
+    feed, reads = EventFeed(parts.database, parts.stopping, 0.01, 1), []
+    read = feed._read_batch
+
+    def count(job_id: str, last: int) -> object:
+        reads.append(last)
+        return read(job_id, last)
+
+    feed._read_batch = count  # type: ignore[method-assign,assignment]
+
+    async def play() -> None:
+        tasks = [asyncio.create_task(feed.read_after(job, 0)) for _ in range(5)]
+        await asyncio.sleep(0)
+        tasks[0].cancel()
+        batches = await asyncio.gather(*tasks[1:])
+        assert {batch.text.count("event: state") for batch in batches} == {1}
+        assert reads == [0]
+        await feed.read_after(job, 0)
+        assert reads == [0, 0]
+        async with feed.watch_job(job):
+            assert await feed.wait_for_news(job, 0, 60)
+            assert not await feed.wait_for_news(job, batches[0].last, 0.1)
+
+    awaited(play)
