@@ -117,7 +117,8 @@ def test_a_child_learns_that_its_supervisor_was_killed(tmp_path: Path) -> None:
 def test_the_settings_of_the_child_are_those_of_the_parent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = Settings(data_dir=tmp_path / "data", cpus=3, lease_seconds=7.0)
+    hosts = ("lab.example", "proxy.example")
+    settings = Settings(data_dir=tmp_path / "data", cpus=3, lease_seconds=7.0, allowed_hosts=hosts)
     for name, value in to_environment(settings).items():
         monkeypatch.setenv(name, value)
     assert Settings() == settings
