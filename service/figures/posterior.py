@@ -68,8 +68,8 @@ def plot_posterior(parameters: Sequence[CornerParameter], correlation: Floats) -
         figure["layout"]["title"] = {
             "text": title,
             "font": {"size": 12},
-            "x": 1,
-            "xanchor": "right",
+            "x": 0.5,  # clear of the first histogram and of the buttons at the right
+            "xanchor": "center",
         }
     return figure
 
