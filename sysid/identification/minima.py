@@ -33,7 +33,7 @@ from sysid.uncertainty.linear_model import LinearOutputModel
 
 _DELAY_PLACES, _PLACES = 128, 16  # of a scan: over the range of a time lag, of another parameter
 _STARTS, _STARTS_IN_DOUBT = 6, 12  # dips from which least squares continues, in a round
-_TRIAL_STEPS, _MAX_STEPS = 4, 20  # of least squares from each, and from a promising one
+_TRIAL_STEPS, _MAX_STEPS = 4, 60  # of least squares from each, and from a promising one
 _PROMISING = 1.5  # times the RMS of the best: least squares continues below it
 _MAX_ROUNDS = 4
 _MOST_CONTINUED = 8  # minima of the search from which least squares continues
@@ -366,12 +366,12 @@ def mark_ambiguous(
 def _pair_with_own(
     problem: Problem, theta: FloatArray, minima: Sequence[Minimum]
 ) -> list[tuple[Minimum, Minimum]]:
-    """Pair the minimum nearest to the estimate (D,) with each other that is compatible."""
-    if not minima:
+    """Pair the compatible minimum nearest to the estimate (D,) with each other one."""
+    compatible = [minimum for minimum in minima if minimum.is_compatible]
+    if not compatible:
         return []
-    places = to_unit(problem.evaluator, np.array([theta, *(m.values for m in minima)]))
-    own = int(np.argmin(np.max(np.abs(places[1:] - places[0]), axis=1, initial=0.0)))
-    return [(minima[own], m) for i, m in enumerate(minima) if i != own and m.is_compatible]
+    own = min(compatible, key=lambda one: compute_distance(problem, one.values, theta))
+    return [(own, one) for one in compatible if one is not own]
 
 
 def _mark_one(

@@ -266,7 +266,9 @@ def test_an_estimate_that_a_noise_model_moved_is_not_ambiguous_for_it() -> None:
         Estimate(name, "1", value, -10.0, 20.0, 0.01, (value - 0.02, value + 0.02), "identified")
         for name, value in zip(names, moved.tolist(), strict=True)
     )
-    minima = collect_minima(problem, [Fit(white, 0.02), Fit(far, 0.0200001)])
+    ruled_out = np.array([2.21, 1.5, 1.33, 0.0])  # nearer to the estimate, but no better for it
+    fits = [Fit(white, 0.02), Fit(far, 0.0200001), Fit(ruled_out, 0.05)]
+    minima = collect_minima(problem, fits)
     marked = mark_ambiguous(problem, estimates, FoundMinima(minima, 0))
     assert [one.status for one in marked] == [
         "identified",
