@@ -46,7 +46,7 @@ from sysid.identification.minima import (
     scan_parameters,
 )
 from sysid.identification.noise_model_choice import confirm_noise_model, is_ar1_indicated
-from sysid.identification.search_evidence import is_noise
+from sysid.identification.search_evidence import is_explained
 from sysid.identification.unrecorded_input import compare_where_recorded
 from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
@@ -390,7 +390,8 @@ class _EstimateSearch:
         if restarts.confirmed > share:
             return False
         simulated = self.problem.predict(end.theta[None])[0]
-        return not is_noise(run_residual_tests(self.problem, simulated, "estimation"))
+        tests = run_residual_tests(self.problem, simulated, "estimation")
+        return not is_explained(self.problem, end.rms, tests)
 
     def _repeat_fits(self, ends: list[Fit], most: int) -> tuple[list[Fit], int]:
         """Fit the minima of a longer integration step again, unless they are among the ends."""

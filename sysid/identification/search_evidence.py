@@ -31,11 +31,10 @@ def assess_search(
 ) -> SearchEvidence:
     """Assess the evidence that the estimate, with its RMS and residual tests, is the best."""
     restarts = count_restarts(*state.champions_and_counters)
-    is_negligible = rms <= _NEGLIGIBLE_SHARE * problem.output_scale
     because: Literal["starts", "residuals"] | None = None
     if found.agreeing >= _ENOUGH_STARTS:
         because = "starts"
-    elif is_negligible or is_noise(tests):
+    elif is_explained(problem, rms, tests):
         because = "residuals"
     return SearchEvidence(
         because is not None,
@@ -47,8 +46,13 @@ def assess_search(
     )
 
 
-def is_noise(tests: ResidualTests | None) -> bool:
-    """Whether no test of the residuals finds anything but noise; False if none was possible."""
+def is_explained(problem: Problem, rms: float, tests: ResidualTests | None) -> bool:
+    """Whether the residuals are negligible, or no test of them finds anything but noise.
+
+    False if they are not negligible and no test was possible.
+    """
+    if rms <= _NEGLIGIBLE_SHARE * problem.output_scale:
+        return True
     known = [] if tests is None else [test.p for test in tests.tests if test.p is not None]
     return bool(known) and min(known) > _UNLIKELY
 

@@ -6,13 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.identification import best_estimate
 from sysid.identification.identify import identify
 from sysid.identification.minima import scan_by_projection
 from sysid.identification.projection import draw_projected_places, find_linear_parameters
+from sysid.identification.search_evidence import is_explained
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.residuals.residual_tests import run_residual_tests
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
@@ -124,3 +128,27 @@ def test_the_bounds_of_a_catalogue_model_hide_no_lag(seed: int) -> None:
     (lag,) = (one for one in found.estimates if one.name == "L")
     assert lag.value == pytest.approx(TRUTH["L"], abs=0.05)
     assert found.search.agreeing_starts >= 2
+
+
+def test_negligible_residuals_and_noise_leave_no_doubt() -> None:
+    problem = plant()
+    assert is_explained(problem, 0.9e-3 * problem.output_scale, None)
+    assert not is_explained(problem, 1.1e-3 * problem.output_scale, None)
+    for theta, explained in ((place(problem), True), (place(problem, L=0.6), False)):
+        simulated = problem.predict(theta[None])[0]
+        (rms,) = problem.evaluate_fitness(theta[None])
+        tests = run_residual_tests(problem, simulated, "estimation")
+        assert is_explained(problem, rms, tests) == explained
+
+
+def test_nothing_is_drawn_where_the_residuals_are_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is in doubt there, although hardly a random start agrees."""
+
+    def refuse(*_: object) -> None:
+        pytest.fail("places were drawn")
+
+    monkeypatch.setattr(best_estimate, "scan_by_projection", refuse)
+    quick = GeneticAlgorithm(generations=60)
+    found = identify(load_model("sopdt"), telegraph(), quick, seed=1)
+    assert found.search.because == "residuals"
+    assert found.search.agreeing_starts < 2
