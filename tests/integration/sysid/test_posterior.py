@@ -1,8 +1,5 @@
 """The posterior of a measured record where the linear model of the standard errors fails."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,6 +10,7 @@ from sysid.data.derivations import derive_recording
 from sysid.data.records import Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
+from tests.needs import DATA
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
@@ -20,8 +18,7 @@ LABELS = ("length_m", "p_nom_bar", "phase", "file", "repeat")
 
 def read_tube(length: float, pressure: float) -> Record:
     """The pooled filling of a pneumatic tube."""
-    source = Path(os.environ["LAGID_DATA"]) / "pneuact_tube" / "pneuact_tube.csv"
-    recording, _ = read_csv(source, segments=LABELS)
+    recording, _ = read_csv(DATA / "pneuact_tube" / "pneuact_tube.csv", segments=LABELS)
     chosen = {"length_m": length, "p_nom_bar": pressure, "phase": "fill"}
     pooling = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
     pooled = derive_recording(recording, [{"select": chosen}, {"pool": pooling}])
