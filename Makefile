@@ -28,29 +28,28 @@ $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --config-settings editable_mode=compat -e .
-	@$(BIN)/python -c 'from sysid.identification.warmup import compile_search; compile_search()'  # compile the search once
 	@git config core.hooksPath .ci/hooks 2>/dev/null || true  # subjects of at most 72 characters
 	@touch $@
 
-demo: $(READY)
+demo: warm
 	@$(BIN)/lagid demo
 
-paper: $(READY)
+paper: warm
 	@$(BIN)/lagid paper
 
-serve: $(READY)
+serve: warm
 	@exec $(BIN)/lagid serve
 
 # Bytecode is kept for the next run, also where the shell says otherwise: modules of tests are
 # compiled twice, and every process that a test starts compiles its modules again.
 test suite check: export PYTHONDONTWRITEBYTECODE =
 
-# Compiled code first: processes side by side would each compile it. Then linters beside tests, as
-# tests of services wait more than they compute; these are one group and begin.
-test: $(READY) warm
+# Linters beside the compilation of the search, which processes of tests side by side would each
+# do. Tests of services begin, as they wait more than they compute.
+test: $(READY)
 	@$(MAKE) --no-print-directory -j2 check-code suite
 
-suite: $(READY)
+suite: warm
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadscope --no-loadscope-reorder
 
 warm: $(READY)

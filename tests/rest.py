@@ -21,13 +21,18 @@ PROBLEM = "application/problem+json"
 
 
 def recording(n: int = 300, period: float = 0.1, columns: tuple[str, ...] = ("u", "y")) -> bytes:
-    """CSV of a step response with gain 2, time constant 1 s and dead time 0.5 s."""
+    """CSV of a step response with gain 2, time constant 1 s and dead time 0.5 s.
+
+    It has a little noise. Without any, half the integration step changes every estimate by more
+    than its standard error, and each identification goes on to hundreds of substeps.
+    """
     t = np.arange(n) * period
     u = np.where((t // 7) % 2 == 0, 0.0, 1.0)
     y = np.zeros(n)
     lag = round(0.5 / period)
     for k in range(1, n):
         y[k] = y[k - 1] + period * (2 * u[max(k - 1 - lag, 0)] - y[k - 1])
+    y += np.random.default_rng(1).normal(0.0, 0.005, n)
     rows = [",".join(["t", *columns])]
     rows += [f"{a:.6g},{b:.6g},{c:.6g}" for a, b, c in zip(t, u, y, strict=True)]
     return ("\n".join(rows) + "\n").encode()

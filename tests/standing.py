@@ -14,6 +14,7 @@ from sqlalchemy import select
 
 from benchmarks import paper_example
 from benchmarks.breaking.audit import is_over
+from benchmarks.breaking.disks import small_disk
 from benchmarks.breaking.stand import Stand, standing_service, until
 from benchmarks.breaking.work import DEADLY, GREEDY
 from service.storage.tables import Checkpoint, Job, Run
@@ -21,11 +22,12 @@ from tests.foreign_modules import ForeignFolder
 
 LIMIT_SECONDS = 200.0
 LEASE_SECONDS = 2.0
+DISK_MEGABYTES = 128
 ENDLESS = {"generations": 10_000_000, "stop": {"settled": None}}
 
 
 class Service:
-    """The service with one dataset; `clock` and `ray_away` break it (`benchmarks/breaking/shim`).
+    """The service with one core and one dataset; `clock` and `ray_away` break it (`shim`).
 
     Attributes
     ----------
@@ -33,18 +35,25 @@ class Service:
         Has files that break the service, its data and the recording of the dataset.
     foreign : ForeignFolder
         Where the service was started.
+    disk : Path or None
+        The small file system with all its data; None where none can be mounted.
     """
 
-    def __init__(self, stand: Stand, folder: Path, foreign: ForeignFolder) -> None:
-        self.stand, self.folder, self.foreign = stand, folder, foreign
+    def __init__(
+        self, stand: Stand, folder: Path, foreign: ForeignFolder, disk: Path | None
+    ) -> None:
+        self.stand, self.folder, self.foreign, self.disk = stand, folder, foreign, disk
         self.clock, self.ray_away = folder / "clock", folder / "ray-away"
         record = paper_example.write_csv(folder / "record.csv", seed=1)
         self._dataset = stand.client.add_dataset(record, name="example 1")["id"]
 
+    def build_body(self, **body: Any) -> dict[str, Any]:
+        """Build the request for a job on the dataset."""
+        return {"model": "duffing-eq16", "datasets": [self._dataset], "reuse": False, **body}
+
     def submit(self, **body: Any) -> str:
         """Submit a job on the dataset; return its id."""
-        common = {"model": "duffing-eq16", "datasets": [self._dataset], "reuse": False}
-        return str(self.stand.client.submit({**common, **body})["id"])
+        return str(self.stand.client.submit(self.build_body(**body))["id"])
 
     def submit_endless(self) -> str:
         """Submit a job that does not end by itself; return its id once it makes progress."""
@@ -100,16 +109,18 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         "LAGID_WORKER_MEMORY_MB": "512",
     }
     foreign = ForeignFolder(folder)
-    stand = Stand(
-        folder / "data",
-        lease_seconds=LEASE_SECONDS,
-        environment=environment,
-        working_folder=foreign.path,
-    )
-    with standing_service(stand):
-        yield Service(stand, folder, foreign)
-        stand.stop()
-        assert stand.leftovers() == []
+    with small_disk(folder / "disk", DISK_MEGABYTES) as disk:
+        stand = Stand(
+            (disk or folder) / "data",
+            cpus=1,  # each fault starts a worker for each core, for seconds of computing
+            lease_seconds=LEASE_SECONDS,
+            environment=environment,
+            working_folder=foreign.path,
+        )
+        with standing_service(stand):
+            yield Service(stand, folder, foreign, disk)
+            stand.stop()
+            assert stand.leftovers() == []
 
 
 @pytest.fixture

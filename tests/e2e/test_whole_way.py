@@ -1,14 +1,13 @@
 """From a file on a user's disk to estimates on the page, through the whole service."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.client.embedded import run_embedded_service
+from tests.standing import Service
 
 pytestmark = [
     pytest.mark.browser,
@@ -19,12 +18,6 @@ pytestmark = [
 
 K, T, L, STEP = 2.0, 0.35, 0.12, 0.02
 LAST = "plot => Math.max(0, ...(plot.data ?? []).flatMap(trace => trace.x))"
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with run_embedded_service(tmp_path_factory.mktemp("whole"), cpus=2) as url:
-        yield url
 
 
 def recording(path: Path) -> Path:
@@ -42,8 +35,8 @@ def recording(path: Path) -> Path:
     return path
 
 
-def filled_in(service: str, page: Page, path: Path, name: str) -> None:
-    page.goto(f"{service}/#new")
+def filled_in(service: Service, page: Page, path: Path, name: str) -> None:
+    page.goto(f"{service.stand.url}/#new")
     page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
     page.get_by_label("or upload CSV or MCAP").set_input_files(path)
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
@@ -53,7 +46,7 @@ def filled_in(service: str, page: Page, path: Path, name: str) -> None:
 
 
 def test_a_file_becomes_estimates_with_their_errors(
-    service: str, page: Page, tmp_path: Path
+    service: Service, page: Page, tmp_path: Path
 ) -> None:
     filled_in(service, page, recording(tmp_path / "step.csv"), "whole way")
     page.get_by_role("button", name="Identify").click()
@@ -67,7 +60,9 @@ def test_a_file_becomes_estimates_with_their_errors(
     expect(page.locator('[data-figure="response"] .scatterlayer .trace')).to_have_count(4)
 
 
-def test_a_long_search_is_watched_and_cancelled(service: str, page: Page, tmp_path: Path) -> None:
+def test_a_long_search_is_watched_and_cancelled(
+    service: Service, page: Page, tmp_path: Path
+) -> None:
     filled_in(service, page, recording(tmp_path / "step.csv"), "long")
     page.get_by_label("generations").fill("10000000")
     page.get_by_label("method").select_option("simple")

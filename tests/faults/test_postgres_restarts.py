@@ -34,7 +34,7 @@ def server() -> Iterator[Any]:
 def test_a_killed_database_costs_nothing_but_time(tmp_path: Path, server: Any) -> None:
     stand = Stand(tmp_path / "data", database_url=server.get_uri(), lease_seconds=2.0, cpus=1)
     with standing_service(stand):
-        stream = Stream(stand, tmp_path, size=0.3)
+        stream = Stream(stand, tmp_path, kinds=("sweep",), size=0.3)
         stream.measure()
         stream.start()
         (before,) = stand.family.dispatchers()

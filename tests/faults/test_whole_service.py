@@ -33,7 +33,7 @@ FAULTS = [
 @pytest.fixture(scope="module")
 def bench(standing: Service) -> Iterator[Bench]:
     """The service at work on jobs whose undisturbed results are known."""
-    stream = Stream(standing.stand, standing.folder, size=0.3)
+    stream = Stream(standing.stand, standing.folder, kinds=("sweep", "long"), size=0.3)
     stream.measure("cancelled")
     stream.start()
     yield Bench(standing.stand, stream, clock=standing.clock)

@@ -212,9 +212,14 @@ def test_an_open_loop_follows_given_samples_a_dataset_or_a_formula(served: Serve
         again = simulated(served, served.lag, {"inputs": {"u": one}, "samples": 101})
         assert again["outputs"][0]["samples"] == 101
         if one["kind"] == "series":
-            expected = np.interp(again["outputs"][0]["times"], times, values)
+            coarse = np.array(again["outputs"][0]["times"])
+            others = np.abs(coarse - 1.0 - p["L"]) > 0.05
+            expected = np.interp(coarse, times, values)
             np.testing.assert_allclose(
-                again["outputs"][0]["values"], expected, rtol=1e-2, atol=1e-4
+                np.array(again["outputs"][0]["values"])[others],
+                expected[others],
+                rtol=1e-2,
+                atol=1e-4,
             )
 
 
