@@ -138,7 +138,8 @@ def find_best_estimate(
     """Find the best estimate of a search that has ended, and analyse it.
 
     The integration step is halved until the estimates and their errors stand still, or until a
-    limit is reached. Then those that still change are not identified.
+    limit is reached. Then those that still change are not identified, or have the change in their
+    errors.
     """
     refines = is_refining(algorithm, len(state.islands))
     search = _EstimateSearch(problem, state, budget, deadline, refines=refines)
@@ -157,7 +158,7 @@ def find_best_estimate(
     changes = {} if half is None else half.changes
     noise = search.apply_noise_model(is_settled=not changes)
     minima = search.collect_minima(noise.theta)
-    marked = mark_changing(search.analysis.estimates, changes, limit)
+    marked = mark_changing(search.analysis.estimates, half, limit)
     analysis = replace(search.analysis, estimates=marked)
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
 

@@ -12,11 +12,14 @@ again. The sensitivities are computed with half the step too, because errors mat
 If an estimate or its error changes, the finer step replaces the longer one, until both stand still
 or a limit is reached. A small relative move is accepted if the record fits far better with the
 longer step, as data simulated with it do.
+
+Without noise the standard errors are so small that no step is short enough. There a small relative
+move at the limit is an error of the solver, and is added to the standard error.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, inf, log10
+from math import ceil, hypot, inf, log10, sqrt
 
 import numpy as np
 
@@ -38,6 +41,7 @@ _NOTABLE_GROWTH = 1.3  # of a standard error with half the step
 _NOTABLE_ERROR = 1e-3  # of the output's size: smaller integration errors act linearly
 _NOTABLE_SHARE = 0.01  # of a value: smaller moves are accepted if the original step fits far better
 _RANGE_SHARE = 0.1  # of that share, of the range: so are these, such as those of values near 0
+_SMALL_SHARE = 1e-3  # of a value: a smaller move is no doubt if there is no noise
 _TINY = float(np.finfo(float).tiny)
 _LIKELIHOOD_GAIN = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_STEPS = 2_000_000  # of one simulation
@@ -59,12 +63,15 @@ class HalfStep:
         The estimate with half the step, as fitted or predicted.
     changes : mapping of str to str
         What changes notably, in words, by parameter; empty: all stand still.
+    small_moves : mapping of str to float
+        Of these, moves of less than a thousandth of a value, if the residuals are negligible.
     evaluations : int
     """
 
     problem: Problem
     theta: FloatArray
     changes: Mapping[str, str]
+    small_moves: Mapping[str, float]
     evaluations: int
 
 
@@ -120,7 +127,8 @@ def compare_half_step(
     if not moves and may_search:
         growths, count = _compare_errors(fine, theta, analysis, left)
         spent += count
-    return HalfStep(fine, end, moves | growths, spent)
+    small = _find_small_moves(problem, sqrt(own / error.size), analysis.estimates, end, moves)
+    return HalfStep(fine, end, moves | growths, small, spent)
 
 
 def find_limit(
@@ -171,18 +179,33 @@ def choose_starts(
 
 
 def mark_changing(
-    estimates: tuple[Estimate, ...], changes: Mapping[str, str], limit: str
+    estimates: tuple[Estimate, ...], half: HalfStep | None, limit: str
 ) -> tuple[Estimate, ...]:
-    """Mark estimates that change with half the step, beyond a limit, as not identified."""
-    return tuple(
-        replace(
-            estimate,
-            status="unidentifiable",
-            reason=f"half the integration step still changes it: {changes[estimate.name]}; {limit}",
-        )
-        if estimate.name in changes and estimate.status in ("identified", "at bound")
-        else estimate
-        for estimate in estimates
+    """Mark estimates that change with half the step, beyond a limit, as not identified.
+
+    The standard error of one that moves little instead includes the move.
+    """
+    if half is None:
+        return estimates
+    return tuple(_mark_estimate(estimate, half, limit) for estimate in estimates)
+
+
+def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
+    if estimate.name not in half.changes or estimate.status not in ("identified", "at bound"):
+        return estimate
+    move = half.small_moves.get(estimate.name)
+    if move is None or estimate.stderr is None or estimate.interval95 is None:
+        reason = f"half the integration step still changes it: {half.changes[estimate.name]}"
+        return replace(estimate, status="unidentifiable", reason=f"{reason}; {limit}")
+    stderr = hypot(estimate.stderr, move)
+    factor = stderr / estimate.stderr
+    lower, upper = (estimate.value + factor * (end - estimate.value) for end in estimate.interval95)
+    return replace(
+        estimate,
+        stderr=stderr,
+        interval95=(max(lower, estimate.lower), min(upper, estimate.upper)),
+        reason=f"its error is that of the integration: half the step moves it by {move:.1g}"
+        f"{format_unit(estimate.unit)}, and the record has no noise",
     )
 
 
@@ -285,6 +308,30 @@ def _describe_moves(
                 f"{_format(estimate.value, shift)}{unit}{often}"
             )
     return described
+
+
+def _find_small_moves(
+    problem: Problem,
+    rms: float,
+    estimates: tuple[Estimate, ...],
+    end: FloatArray,
+    moves: Mapping[str, str],
+) -> dict[str, float]:
+    """Find notable moves that are small compared to their values, if the residuals (RMS) are."""
+    if rms > _NOTABLE_ERROR * problem.output_scale:
+        return {}
+    values = dict(zip(problem.free_names, end.tolist(), strict=True))
+    shifts = {e.name: abs(values[e.name] - e.value) for e in estimates if e.name in moves}
+    return {
+        e.name: shifts[e.name]
+        for e in estimates
+        if e.name in shifts and shifts[e.name] <= _SMALL_SHARE * _get_size(e)
+    }
+
+
+def _get_size(estimate: Estimate) -> float:
+    """Get the size of a value; of one near 0, that of a hundredth of its range."""
+    return max(abs(estimate.value), 0.01 * (estimate.upper - estimate.lower))
 
 
 def _get_error(estimate: Estimate) -> float | None:

@@ -262,7 +262,7 @@ def test_under_a_noise_model_estimates_that_still_change_are_not_called_identifi
 def test_the_limits_of_a_finer_fit_have_names() -> None:
     record = sampled(STIFF)
     finest, coarse = (
-        HalfStep(Problem.build(two_lags(substeps), [record]), np.zeros(4), {}, 0)
+        HalfStep(Problem.build(two_lags(substeps), [record]), np.zeros(4), {}, {}, 0)
         for substeps in (MAX_SUBSTEPS, 2)
     )
     work = 10**9
@@ -279,7 +279,7 @@ def test_a_finer_fit_starts_from_what_is_best_with_the_finer_step() -> None:
     """The last champion may owe its fit to the longer step."""
     truth = np.array([STIFF[name] for name in ("K", "T1", "r", "L")])
     far = truth * np.array([1.0, 1.0, 4.0, 1.3])
-    half = HalfStep(Problem.build(two_lags(8), [sampled(STIFF)]), far, {}, 0)
+    half = HalfStep(Problem.build(two_lags(8), [sampled(STIFF)]), far, {}, {}, 0)
     starts, rms, count = choose_starts(half, [[truth, far], [far]])
     np.testing.assert_array_equal(starts, [truth, far])
     np.testing.assert_array_equal(rms, half.problem.evaluate_fitness(np.array([truth, far])))
@@ -300,3 +300,53 @@ def test_an_interval_wider_than_the_range_identifies_nothing(
     assert 0.3 < lag.stderr < 0.5
     assert lag.status == status
     assert lag.reason.endswith("is wider than its range") == (status == "unidentifiable")
+
+
+def exact_first_order(sd: float = 0.0) -> Record:
+    """Gain 2, time constant 1 s, dead time 0.5 s: the solution of the equation, no solver's."""
+    times = 0.1 * np.arange(300)
+    u = np.where((times // 7) % 2 == 0, 0.0, 1.0)
+    decay = np.exp(-0.1)
+    y = lfilter([0.0] * 6 + [2.0 * (1 - decay)], [1.0, -decay], u)
+    y += np.random.default_rng(1).normal(0.0, sd, y.size)
+    return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+
+
+@pytest.mark.slow
+def test_without_noise_a_small_move_is_an_error_and_no_doubt() -> None:
+    """No step is short enough for the standard errors of residuals that are the solver's."""
+    bounds = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
+    found = identify(load_model("fopdt"), exact_first_order(), QUICK, parameters=bounds)
+    estimates = by_name(found)
+    for name, truth in {"K": 2.0, "T": 1.0, "L": 0.5}.items():
+        one = estimates[name]
+        assert one.status == "identified"
+        assert one.value == pytest.approx(truth, rel=1e-4)
+        assert one.interval95 is not None
+        assert one.interval95[0] <= truth <= one.interval95[1]
+    assert "half the step moves it" in estimates["L"].reason
+
+
+def test_a_move_that_is_not_small_or_of_a_noisy_record_is_a_doubt() -> None:
+    small = Estimate("L", "s", 0.5, 0.0, 2.0, 1e-6, (0.499998, 0.500002), "identified")
+    half = HalfStep(
+        Problem.build(two_lags(8), [sampled(STIFF)]), np.zeros(4), {"L": "far"}, {"L": 4e-6}, 0
+    )
+    (kept,) = integration_step.mark_changing((small,), half, "limit")
+    assert (kept.status, kept.value) == ("identified", 0.5)
+    assert kept.stderr == pytest.approx(np.hypot(1e-6, 4e-6))
+    assert kept.interval95 == pytest.approx((0.5 - 2 * kept.stderr, 0.5 + 2 * kept.stderr))
+    (marked,) = integration_step.mark_changing((small,), replace(half, small_moves={}), "limit")
+    assert (marked.status, marked.reason) == (
+        "unidentifiable",
+        "half the integration step still changes it: far; limit",
+    )
+    for noise, is_small in ((0.0, True), (0.02, False)):
+        problem = Problem.build(load_model("fopdt"), [exact_first_order(noise)])
+        one = replace(small, name="L")
+        moved = {"L": "L moved"}
+        end = np.array([0.5 + 4e-6 if name == "L" else 1.0 for name in problem.free_names])
+        found = integration_step._find_small_moves(problem, max(noise, 1e-6), (one,), end, moved)
+        assert bool(found) is is_small
+        end[problem.free_names.index("L")] = 0.51
+        assert integration_step._find_small_moves(problem, 1e-6, (one,), end, moved) == {}
