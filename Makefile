@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+COLLECTED := $(VENV)/.collected
 FAST   := not slow and not ray and not postgres and not browser and not data
 TEST_PROCESSES ?= 3
 # One cache for all checkouts of a user: mypy looks at the content of files, not at their place.
@@ -44,13 +45,18 @@ serve: warm
 # compiled twice, and every process that a test starts compiles its modules again.
 test suite check: export PYTHONDONTWRITEBYTECODE =
 
-# Linters beside the compilation of the search, which processes of tests side by side would each
-# do. Tests of services begin, as they wait more than they compute.
+# Linters beside the compilation of the search and of bytecode, which processes of tests side by
+# side would each do. Tests of services begin, as they wait more than they compute.
 test: $(READY)
 	@$(MAKE) --no-print-directory -j2 check-code suite
 
-suite: warm
+suite: warm $(COLLECTED)
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadscope --no-loadscope-reorder
+
+# Once: bytecode of all tests, which each process of the suite would otherwise make.
+$(COLLECTED): $(READY)
+	@$(BIN)/python -m pytest --collect-only --quiet >/dev/null || true  # the suite tells the reason
+	@touch $@
 
 warm: $(READY)
 	@$(BIN)/python -c 'from sysid.identification.warmup import compile_search; compile_search()'
