@@ -10,7 +10,11 @@ from sysid.identification.run import advance_run, begin_run
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.migration import migrate
 from sysid.search.adaptive_search import start_local_search
-from sysid.search.basin_hopping import is_behind_champion, is_champion_coloured
+from sysid.search.basin_hopping import (
+    is_behind_champion,
+    is_champion_coloured,
+    is_champion_explained,
+)
 from sysid.search.island import Island
 from sysid.search.operators import encode
 from sysid.search.slopes import evaluate_partial_fitness
@@ -44,6 +48,18 @@ def test_errors_are_coloured_where_the_response_is_wrong(
     before = island.evaluations
     assert is_champion_coloured(PROBLEM.evaluator, plan(), island.arrays) == wanted
     assert island.evaluations == before + 1
+
+
+@pytest.mark.parametrize(("values", "wanted"), [(COULOMB, True), (FALSE, False)])
+def test_only_noise_is_left_where_the_response_is_right(
+    values: dict[str, float], wanted: bool
+) -> None:
+    island = island_at(values)
+    before = island.evaluations
+    assert is_champion_explained(PROBLEM.evaluator, plan(), island.arrays) == wanted
+    assert island.evaluations == before + 1
+    island.search["evaluations"] = plan().most_evaluations
+    assert not is_champion_explained(PROBLEM.evaluator, plan(), island.arrays)
 
 
 def test_a_part_is_lost_where_the_champion_fits_it_better() -> None:
