@@ -330,7 +330,7 @@ class _EstimateSearch:
         equal = own.rms * (1.0 + SAME_OPTIMUM)  # anywhere on a group's surface, or a mirror image
         agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)
-        return FoundMinima(all_minima, agreeing, self._projected, recorded.warnings)
+        return FoundMinima(all_minima, agreeing, self._projected, recorded.is_contradicted)
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""

@@ -142,7 +142,9 @@ def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart
     found = identify(lag_model(), record(periodic(500), 200), seed=3)
     assert status(found, "L") == "ambiguous"
     assert "where the input is recorded" in reason(found, "L")
-    assert any("the data contradict the input that is assumed" in text for text in found.warnings)
+    (told,) = (text for text in found.warnings if "from before the record" in text)
+    assert "Its first value is assumed there, and the data contradict it." in told
+    assert sum("assumed" in text for text in found.warnings) == 1
     compared = [one for one in found.search.minima if one.recorded_from is not None]
     assert len([one for one in compared if one.is_compatible]) == 3
 
