@@ -100,8 +100,8 @@ class StopIn(Body):
     `settled`: `improved` stops once independent restarts have confirmed the best individual. This
     takes `settled` + 2 confirmations, and a third of all restarts. Restarts begin at random places
     and near the best individual. The fewer of the random ones agree, the more confirmations are
-    needed. If the fitness has jumps nearby, `settled` of either kind and nearly all restarts must
-    agree. Null disables it.
+    needed. Those near it are enough if its residuals look like noise. If the fitness has jumps
+    nearby, `settled` of either kind and nearly all restarts must agree. Null disables it.
     """
 
     evaluations: EvaluationLimit | None = SEARCH.stop.evaluations

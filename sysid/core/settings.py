@@ -82,6 +82,7 @@ class Stop:
       start from random points and half near the best individual.
     * At least a third of all restarts must agree.
     * If fewer than half of the random restarts agree, two and a half times as many are needed.
+    * If the best individual's residuals look like noise, those near it are enough.
     * If the fitness jumps nearby, that many of either kind must agree. So must two thirds of the
       random restarts and nine of ten of those nearby.
 

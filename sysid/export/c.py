@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sysid.control.linear_form import IdentifiedModel
+from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
 from sysid.export.expressions import (
     HELPER_ARGUMENTS,
@@ -24,14 +25,15 @@ from sysid.export.program import (
 )
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import MeasuredInitial
+from sysid.simulation.grid import GRID_TOLERANCE
 
 _RESERVED_WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if "
     "inline int long register restrict return short signed sizeof static struct switch typedef "
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
     "pow floor ceil fmin fmax isnan isfinite NAN INFINITY HUGE_VAL NULL size_t malloc free "
-    "between held sample past lately n t p "
-    "step steps i part stage slope work points grid ratio ramp half averaged sample_time "
+    "between between_on_grid held sample past lately n t p step steps i part stage slope work "
+    "points grid ratio ramp half width meets place whole averaged averaged_on_grid sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
     "BUFSIZ RAND_MAX"
 )
@@ -74,7 +76,7 @@ class CLanguage(TargetLanguage):
         return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """Write a call of ``between``, ``held`` or ``averaged``."""
+        """Write a call of a helper that reads an input."""
         return f"{helper}({signal}, n, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
@@ -253,13 +255,28 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
             "    return 1;",
             f"const long steps = points*{substeps};",
         ]
-        if program.helper_names & {"between", "held", "averaged"}:
+        if program.find_step_lengths():
             lines.append("const double ratio = dt/sample_time;")
-    if "held" in program.helper_names:
+    needed = program.find_step_lengths()
+    if needed & {"ramp", "width"}:
         lines.append(
             f"const double ramp = {program.write_ramp_width()}; /* samples: half a jump's width */"
         )
-    if "averaged" in program.helper_names:
+    if "width" in needed:
+        lines += [
+            "double width = ramp; /* samples: between points of an input on lines */",
+            f"for (long k = {MAX_POINTS_PER_STEP}; k > 0; k -= 2) {{ /* few that meet all */",
+            "    int meets = 1;",
+            "    for (long i = 1; i < n; ++i) {",
+            "        const double place = (double)k*(t[i] - t[0])/dt;",
+            "        if (!(fabs(place - floor(place + 0.5)) < 0.05))",
+            "            meets = 0;",
+            "    }",
+            "    if (meets)",
+            "        width = ratio/(double)k;",
+            "}",
+        ]
+    if "half" in needed:
         lines.append(f"const double half = {program.write_half_step()}; /* samples: half a step */")
     return [*lines, f"(void){period};"]
 
@@ -364,8 +381,11 @@ def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
             "        (void)step;",
             *indent_lines(_wrap_statement("grid[i] = ", text), 2),
             "    }",
-            "    for (long i = 0; i < n; ++i)",
-            f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{grid_step});",
+            "    for (long i = 0; i < n; ++i) {",
+            f"        const double place = (t[i] - t[0])/{grid_step}, whole = floor(place + 0.5);",
+            f"        const int meets = fabs(place - whole) < {write_number(GRID_TOLERANCE)};",
+            f"        {name}[i] = between(grid, points + 1, meets ? whole : place);",
+            "    }",
             "    free(grid);",
             "}",
         ]
@@ -431,6 +451,22 @@ static double averaged(const double *signal, long n, double place, double half)
         total += width*signal[k < 0 ? 0 : k < n ? k : n - 1];
     }
     return total/(2*half);
+}
+"""
+_BETWEEN_ON_GRID = """\
+/* What `between` gives at points `width` apart, on lines between them. */
+static double between_on_grid(const double *signal, long n, double place, double width)
+{
+    const double i = floor(place/width), first = between(signal, n, i*width);
+    return first + (place/width - i)*(between(signal, n, (i + 1.0)*width) - first);
+}
+"""
+_AVERAGED_ON_GRID = """\
+/* What `averaged` gives at points `ramp` apart, on lines between them. */
+static double averaged_on_grid(const double *signal, long n, double place, double half, double ramp)
+{
+    const double i = floor(place/ramp), first = averaged(signal, n, i*ramp, half);
+    return first + (place/ramp - i)*(averaged(signal, n, (i + 1.0)*ramp, half) - first);
 }
 """
 _SAMPLE = """\
@@ -528,9 +564,11 @@ HELPERS: Mapping[str, str] = {
     "least": _LEAST,
     "greatest": _GREATEST,
     "between": _BETWEEN,
+    "between_on_grid": _BETWEEN_ON_GRID,
     "held": _HELD,
     "held on grid": _HELD_ON_GRID,
     "averaged": _AVERAGED,
+    "averaged_on_grid": _AVERAGED_ON_GRID,
     "sample": _SAMPLE,
     "past": _PAST,
     "past cubic": _PAST_CUBIC,

@@ -15,7 +15,13 @@ from sysid.language.tree import (
     walk,
 )
 
-HELPER_ARGUMENTS = {"between": "", "held": ", ramp", "averaged": ", half"}
+HELPER_ARGUMENTS = {
+    "between": "",
+    "between_on_grid": ", width",
+    "held": ", ramp",
+    "averaged": ", half",
+    "averaged_on_grid": ", half, ramp",
+}
 """Further arguments of the functions that read inputs, after the position."""
 
 

@@ -14,7 +14,13 @@ from typing import Literal
 from sysid.control.linear_form import IdentifiedModel
 from sysid.core.errors import InvalidSettings
 from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
-from sysid.export.expressions import ExportScope, TargetLanguage, write_expression, write_number
+from sysid.export.expressions import (
+    HELPER_ARGUMENTS,
+    ExportScope,
+    TargetLanguage,
+    write_expression,
+    write_number,
+)
 from sysid.export.identifiers import Identifiers
 from sysid.kernels.reads import (
     find_averaged_inputs,
@@ -184,6 +190,11 @@ class GeneratedProgram:
         )
         return write_number(1.0 / (n_points * self.substeps))
 
+    def find_step_lengths(self) -> set[str]:
+        """Find the lengths that the helpers of the program need: ramp, width, half."""
+        arguments = ", ".join(HELPER_ARGUMENTS.get(name, "") for name in self.helper_names)
+        return {name for name in ("ramp", "width", "half") if name in arguments}
+
     def write_half_step(self) -> str:
         """Write half an integration step in samples: a delayed held input is a mean over a step."""
         return "0.5*ratio" if self.grid_step is not None else write_number(0.5 / self.substeps)
@@ -246,17 +257,17 @@ class LoopScope(ExportScope):
             if substeps == 1 and self.stage != "slope":
                 return program.language.write_element(name, self._write_position(past), 1)
         place = self._write_sample_position(past)
+        on_grid = "" if program.grid_step is None else "_on_grid"
         if held and past.name in program.averaged_input_names:
-            program.helper_names.add("averaged")
-            after = " + half" if program.is_recursion else ""
-            return program.language.write_signal_read("averaged", name, place + after)
-        if not held:
-            program.helper_names.add("between")
-            return program.language.write_signal_read("between", name, place)
-        program.helper_names.add("held")
-        return program.language.write_signal_read(
-            "held", name, place + self._write_jump_offset(past)
-        )
+            helper = f"averaged{on_grid}"
+            place += " + half" if program.is_recursion else ""
+        elif held:
+            helper = "held"
+            place += self._write_jump_offset(past)
+        else:
+            helper = f"between{on_grid}"
+        program.helper_names.add(helper)
+        return program.language.write_signal_read(helper, name, place)
 
     def _write_sample_position(self, past: PastValue) -> str:
         program, place = self.program, self._write_position(past)
@@ -421,6 +432,7 @@ def list_needed_helpers(
 ) -> list[str]:
     """List the texts of used helpers and those they call, each before its caller."""
     wanted = set(used)
+    wanted |= {name.removesuffix("_on_grid") for name in wanted}
     if "lately" in wanted:
         wanted.add("past")
     if "past" in wanted:

@@ -4,6 +4,7 @@ import textwrap
 from collections.abc import Mapping
 
 from sysid.control.linear_form import IdentifiedModel
+from sysid.data.interpolation import MAX_POINTS_PER_STEP
 from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
 from sysid.export.expressions import (
     HELPER_ARGUMENTS,
@@ -23,13 +24,15 @@ from sysid.export.program import (
 )
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import ModelSignal, Output
+from sysid.simulation.grid import GRID_TOLERANCE
 
 _RESERVED_WORDS = (
     "False None True and as assert async await break class continue def del elif else except "
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
-    "slope_4 every points ratio ramp half averaged sample_time range zip map max min int float "
-    "abs len y before between held past lately sign signal array grid print math ValueError"
+    "slope_4 every points ratio ramp half width averaged averaged_on_grid sample_time range zip "
+    "map max min int float abs len y before between between_on_grid held past lately sign signal "
+    "array grid print math ValueError"
 )
 _LINE_WIDTH = 96
 
@@ -68,7 +71,7 @@ class PythonLanguage(TargetLanguage):
         return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
 
     def write_signal_read(self, helper: str, signal: str, place: str) -> str:
-        """Write a call of ``between``, ``held`` or ``averaged``."""
+        """Write a call of a helper that reads an input."""
         return f"{helper}({signal}, {place}{HELPER_ARGUMENTS[helper]})"
 
     def write_clamp(self, value: str, least: int, most: int) -> str:
@@ -224,9 +227,17 @@ def _write_step_count(program: GeneratedProgram) -> list[str]:
             f"steps = points*{substeps}",
             "ratio = dt/sample_time",
         ]
-    if "held" in program.helper_names:
+    needed = program.find_step_lengths()
+    if needed & {"ramp", "width"}:
         lines.append(f"ramp = {program.write_ramp_width()}  # samples: half the width of a jump")
-    if "averaged" in program.helper_names:
+    if "width" in needed:
+        lines += [
+            "width = ramp  # samples: from point to point of an input on lines, few that meet all",
+            f"for k in range({MAX_POINTS_PER_STEP}, 0, -2):",
+            "    if np.max(np.abs(k*(t - t[0])/dt - np.round(k*(t - t[0])/dt))) < 0.05:",
+            "        width = ratio/k",
+        ]
+    if "half" in needed:
         lines.append(f"half = {program.write_half_step()}  # samples: half an integration step")
     return lines
 
@@ -289,6 +300,12 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
     model, substeps = program.identified.model, program.substeps
     by = f"0, steps + 1, {substeps}" if substeps > 1 else "steps + 1"
     lines = []
+    if program.grid_step is not None:
+        whole = f"np.abs(grid - np.round(grid)) < {write_number(GRID_TOLERANCE)}"
+        lines += [
+            f"grid = (t - t[0])/{write_number(program.grid_step)}",
+            f"grid = np.where({whole}, np.round(grid), grid)",
+        ]
     for output in model.outputs:
         text = write_expression(output.expression, program.language, LoopScope(program, "output"))
         loop = f"for {program.loop_variable} in range({by})"
@@ -300,8 +317,7 @@ def _write_outputs(program: GeneratedProgram) -> list[str]:
             "], dtype=np.float64)",
         ]
         if program.grid_step is not None:
-            grid = f"t[0] + {write_number(program.grid_step)}*np.arange(points + 1)"
-            lines.append(f"{target} = np.interp(t, {grid}, {target})")
+            lines.append(f"{target} = np.interp(grid, np.arange(points + 1), {target})")
     return [*lines, f"return {', '.join(program.output_names.values())}"]
 
 
@@ -350,6 +366,18 @@ _AVERAGED = '''def averaged(signal, place, half):
         width = min(k + 1.0, last) - max(float(k), first)
         total += width*signal[min(max(k, 0), signal.size - 1)]
     return total/(2*half)
+'''
+_BETWEEN_ON_GRID = '''def between_on_grid(signal, place, width):
+    """What `between` gives at points `width` apart, on lines between them."""
+    i = np.floor(place/width)
+    first, last = between(signal, i*width), between(signal, (i + 1.0)*width)
+    return first + (place/width - i)*(last - first)
+'''
+_AVERAGED_ON_GRID = '''def averaged_on_grid(signal, place, half, ramp):
+    """What `averaged` gives at points `ramp` apart, on lines between them."""
+    i = np.floor(place/ramp)
+    first, last = averaged(signal, i*ramp, half), averaged(signal, (i + 1.0)*ramp, half)
+    return first + (place/ramp - i)*(last - first)
 '''
 _PAST = '''def past(array, before, step, delay):
     """Value `delay` >= 0 steps before a finished step, linear; `before` the start."""
@@ -401,9 +429,11 @@ _LATELY_BY_SLOPES = '''def lately(array, first, last, before, step, part, there,
 '''
 HELPERS: Mapping[str, str] = {
     "between": _BETWEEN,
+    "between_on_grid": _BETWEEN_ON_GRID,
     "held": _HELD,
     "held on grid": _HELD_ON_GRID,
     "averaged": _AVERAGED,
+    "averaged_on_grid": _AVERAGED_ON_GRID,
     "past": _PAST,
     "past cubic": _PAST_CUBIC,
     "past by slopes": _PAST_BY_SLOPES,

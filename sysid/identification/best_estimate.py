@@ -47,7 +47,7 @@ from sysid.identification.minima import (
 )
 from sysid.identification.noise_model_choice import confirm_noise_model, is_ar1_indicated
 from sysid.identification.search_evidence import is_explained
-from sysid.identification.unrecorded_input import compare_where_recorded
+from sysid.identification.unrecorded_input import RecordedComparison, compare_where_recorded
 from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts
@@ -156,8 +156,9 @@ def find_best_estimate(
             break
         first = first or estimates
     changes = {} if half is None else half.changes
+    recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
     noise = search.apply_noise_model(is_settled=not changes)
-    minima = search.collect_minima(noise.theta)
+    minima = search.collect_minima(recorded)
     marked = mark_changing(search.analysis.estimates, half, limit)
     analysis = replace(search.analysis, estimates=marked)
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
@@ -305,11 +306,23 @@ class _EstimateSearch:
             self._widen_intervals(LocalMinima(None, estimate.minima, estimate.rms, 0))
         return estimate
 
-    def collect_minima(self, theta: FloatArray) -> FoundMinima:
-        """Collect the minima in which least squares ended; `theta` (D,) is the estimate.
+    def compare_where_recorded(self) -> RecordedComparison:
+        """Compare minima where the input is recorded, if the data contradict what is assumed."""
+        if not self._refines:
+            return RecordedComparison()
+        recorded = compare_where_recorded(
+            self.problem,
+            self.theta,
+            self.analysis,
+            self._list_delays(),
+            self._count_scan_simulations(),
+            self._deadline.is_past_grace,
+        )
+        self._budget.spend(recorded.evaluations)
+        return recorded
 
-        Those where the input is recorded are added, if they contradict the input assumed before.
-        """
+    def collect_minima(self, recorded: RecordedComparison) -> FoundMinima:
+        """Collect the minima in which least squares ended, and those where input is recorded."""
         if not self._refines:
             return FoundMinima((), 0)
         problem, groups = self.problem, self.analysis.exchanges
@@ -318,19 +331,10 @@ class _EstimateSearch:
         ]
         minima = collect_minima(problem, fits, self.analysis.linear_model)
         own = min(minima, key=lambda one: compute_distance(problem, one.values, self.theta))
-        recorded = compare_where_recorded(
-            problem,
-            theta,
-            self.analysis,
-            self._list_delays(),
-            self._count_scan_simulations(),
-            self._deadline.is_past_grace,
-        )
-        self._budget.spend(recorded.evaluations)
         equal = own.rms * (1.0 + SAME_OPTIMUM)  # anywhere on a group's surface, or a mirror image
         agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)
-        return FoundMinima(all_minima, agreeing, self._projected, recorded.warnings)
+        return FoundMinima(all_minima, agreeing, self._projected, recorded.is_contradicted)
 
     def _is_late(self) -> bool:
         """Whether no search may begin: the paper's methods have none."""
@@ -455,7 +459,7 @@ class _EstimateSearch:
         values = order_exchangeable(problem, minima.values, self.analysis.exchanges)
         estimates = widen_intervals(
             self.analysis.estimates,
-            problem.free_names,
+            problem.free_parameters,
             problem.n_scored,
             replace(minima, values=values),
             linear.variance_ratio,

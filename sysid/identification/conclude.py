@@ -27,8 +27,10 @@ from sysid.identification.noise_model_choice import explain_noise_model_choice, 
 from sysid.identification.result import Identification
 from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
 from sysid.identification.validation import (
+    mark_refuted,
     split_outputs,
     validate_estimates,
+    warn_refuted,
     warn_still_validation,
 )
 from sysid.identification.warnings import collect_warnings, warn_noise_model, warn_time_limit
@@ -105,10 +107,8 @@ def _build_identification(
     )
     limit = algorithm.safe_limit
     evidence = assess_search(problem, state, metrics.rms, tests, found)
-    analysis = replace(
-        analysis,
-        estimates=mark_unsettled(mark_ambiguous(problem, analysis.estimates, found), evidence),
-    )
+    settled = mark_unsettled(mark_ambiguous(problem, analysis.estimates, found), evidence)
+    analysis = replace(analysis, estimates=mark_refuted(settled, validated))
     holds = list_input_holds(problem)
     if is_refining(algorithm, len(best.ends)):
         left, late = budget.count_left(), deadline.is_past_grace
@@ -138,9 +138,17 @@ def _build_identification(
         agreement=metrics.channels,
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
+            *warn_refuted(metrics, validated),
             *warn_fixed_starts(problem, theta, analysis, deadline.is_past_grace),
-            *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
-            *found.warnings,
+            *collect_warnings(
+                problem,
+                algorithm,
+                analysis,
+                simulated,
+                metrics.rms,
+                tests,
+                is_contradicted=found.is_contradicted,
+            ),
             *warn_unsettled(evidence),
             *describe_input_holds(problem, holds, analysis.estimates, best.lowest_end.rms),
             *describe_exchanges(

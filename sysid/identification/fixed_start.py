@@ -1,16 +1,18 @@
 """Test whether the record starts where the model says that it does.
 
 A state that starts at a fixed number (0 by default) is an assumption about the record. If it is
-wrong, the estimates compensate for it, and their standard errors do not show it.
+wrong, the estimates compensate for it, and their standard errors do not show it. A start at the
+first measured value contains the noise of that sample, and an integrator never forgets it.
 
 The sensitivities of the outputs to each fixed start are added to those of the parameters. If one
 Gauss-Newton step reduces the loss by far more than chance (likelihood ratio; Wilks 1938), the
 model is fitted again with these starts free. A start is reported if it then lies many of its own
 standard errors away. These allow for coloured residuals. If the residuals still drift over the
-whole record, they are too small, and nothing is reported.
+whole record, they are too small, and nothing is reported. Noise alone does that to a measured
+start, so such a start is reported only if it moves an estimate.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +22,15 @@ from sysid.core.errors import InvalidModel
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.core.units import format_unit
-from sysid.models.model import EstimatedInitial, FixedInitial, Model, name_initial_state
+from sysid.kernels.reads import is_difference
+from sysid.models.model import (
+    EstimatedInitial,
+    FixedInitial,
+    InitialState,
+    MeasuredInitial,
+    Model,
+    name_initial_state,
+)
 from sysid.models.parse import parse_model
 from sysid.models.sections import STEADY
 from sysid.search.refine import refine_candidates
@@ -48,7 +58,7 @@ def warn_fixed_starts(
     analysis: Analysis,
     is_late: Callable[[], bool] | None = None,
 ) -> list[str]:
-    """Warn about fixed initial states that do not fit the record, at an estimate (D,).
+    """Warn about fixed or measured initial states that do not fit the record, at (D,).
 
     Squares of a free run are tested: one step ahead, a start is soon forgotten.
     """
@@ -77,16 +87,26 @@ def warn_fixed_starts(
         for state in predicted
         if (starts := _list_wrong_starts(problem, state, by_name))
     }
-    if not wrong:
+    moves = _describe_moves(analysis.estimates, by_name)
+    if not (moves or any(state in wrong for state in _list_states(problem, FixedInitial))):
         return []
-    return [_describe_starts(problem, wrong, _describe_moves(analysis.estimates, by_name))]
+    return [_describe_starts(problem, wrong, moves)] if wrong else []
 
 
-def _get_fixed_values(model: Model) -> dict[str, float]:
+def _list_states(problem: Problem, *kinds: type[InitialState]) -> dict[str, int]:
+    """List the states with such initial values, and their numbers."""
+    pairs = zip(problem.model.states, problem.model.initial, strict=True)
+    return {state.name: i for i, (state, initial) in enumerate(pairs) if isinstance(initial, kinds)}
+
+
+def _get_assumed_starts(problem: Problem) -> dict[str, FloatArray]:
+    """Get the starts (E,) of states that start at a number or, not in a recursion, measured."""
+    kinds = (FixedInitial,) if is_difference(problem.model) else (FixedInitial, MeasuredInitial)
     return {
-        state.name: initial.value
-        for state, initial in zip(model.states, model.initial, strict=True)
-        if isinstance(initial, FixedInitial)
+        state: np.array(
+            [experiment.starts[i].first_values[0] for experiment in problem.experiments]
+        )
+        for state, i in _list_states(problem, *kinds).items()
     }
 
 
@@ -94,7 +114,7 @@ def _predict_starts(
     problem: Problem, theta: FloatArray, analysis: Analysis
 ) -> dict[str, FloatArray]:
     """Predict the moves (E,) of each state's starts that would reduce the loss significantly."""
-    if not _get_fixed_values(problem.model):
+    if not _get_assumed_starts(problem):
         return {}
     if analysis.residuals_and_sensitivities is None:  # whitened
         sensitivities = compute_sensitivities(problem, theta)
@@ -106,7 +126,7 @@ def _predict_starts(
     rest = error - basis @ (basis.T @ error)
     loss = float(rest @ rest)
     predicted: dict[str, FloatArray] = {}
-    for state in _get_fixed_values(problem.model):
+    for state in _get_assumed_starts(problem):
         slopes = _compute_start_slopes(problem, theta, state, np.sqrt(loss / error.size))
         others = slopes - basis @ (basis.T @ slopes)
         moves = np.asarray(
@@ -133,15 +153,17 @@ def _compute_start_slopes(
     The step is the one that moves the outputs by about the noise, in whatever unit the state has.
     """
     weight, rows = problem.evaluator.weight[problem.scored_rows], problem.scored_rows
-    value = _get_fixed_values(problem.model)[state]
+    starts = _get_assumed_starts(problem)[state]
+    freed = _free_starts(problem, {state: starts}, {state: 1.0})
+    known = dict(zip(problem.free_names, theta.tolist(), strict=True))
 
     def simulate(step: float) -> FloatArray:
-        moved = _replace_starts(problem, {state: FixedInitial(value + step)})
-        return np.asarray(weight * moved.predict(theta[None])[0][rows])
+        place = _join_starts(freed, known, {state: starts + step})
+        return np.asarray(weight * freed.predict(place[None])[0][rows])
 
     experiments = _number_experiments(problem)
     slopes = np.zeros((rows.size, len(problem.experiments)))
-    step = _FIRST_STEP * max(abs(value), 1.0)
+    step = _FIRST_STEP * max(float(np.max(np.abs(starts))), 1.0)
     with np.errstate(all="ignore"):
         output = simulate(0.0)
         for _ in range(_MAX_TRIALS):
@@ -164,31 +186,48 @@ def _number_experiments(problem: Problem) -> IntArray:
     return np.repeat(np.arange(len(counts), dtype=np.int64), counts)[problem.scored_rows]
 
 
-def _replace_starts(
-    problem: Problem, starts: dict[str, FixedInitial] | dict[str, EstimatedInitial]
+def _free_starts(
+    problem: Problem, starts: Mapping[str, FloatArray], reaches: Mapping[str, float]
 ) -> Problem:
+    """Free the starts of states, with bounds so far beyond their values (E,)."""
     model = problem.untied_model
+    free = {
+        state: EstimatedInitial(
+            float(np.min(starts[state])) - reach, float(np.max(starts[state])) + reach
+        )
+        for state, reach in reaches.items()
+    }
     initial = tuple(
-        starts.get(state.name, start)
+        free.get(state.name, start)
         for state, start in zip(model.states, model.initial, strict=True)
     )
     return problem.rebuild(model=replace(model, initial=initial), weights=problem.output_weights)
+
+
+def _join_starts(
+    freed: Problem, known: Mapping[str, float], starts: Mapping[str, FloatArray]
+) -> FloatArray:
+    """Join values of parameters and starts (E,) of states in the order of a problem (D,)."""
+    values = dict(known)
+    for state, numbers in starts.items():
+        for e, number in enumerate(numbers.tolist()):
+            values[name_initial_state(state, e)] = number
+    return np.array([values[name] for name in freed.free_names])
 
 
 def _fit_free_starts(
     problem: Problem, theta: FloatArray, predicted: dict[str, FloatArray]
 ) -> tuple[float, float, Analysis]:
     """Fit the model with these starts free; return the RMS before and after, and the analysis."""
-    fixed = _get_fixed_values(problem.model)
-    bounds, first = {}, dict(zip(problem.free_names, theta.tolist(), strict=True))
-    for state, moves in predicted.items():
-        half = _BOUND_DISTANCE * float(np.max(np.abs(moves)))
-        bounds[state] = EstimatedInitial(fixed[state] - half, fixed[state] + half)
-        for e, move in enumerate(moves.tolist()):
-            first[name_initial_state(state, e)] = fixed[state] + move
-    freed = _replace_starts(problem, bounds)
-    n = _MAX_STEPS * (len(first) + 1)
-    start = np.array([first[name] for name in freed.free_names])
+    assumed = _get_assumed_starts(problem)
+    known = dict(zip(problem.free_names, theta.tolist(), strict=True))
+    reaches = {
+        state: _BOUND_DISTANCE * float(np.max(np.abs(moves))) for state, moves in predicted.items()
+    }
+    freed = _free_starts(problem, assumed, reaches)
+    moved_starts = {state: assumed[state] + moves for state, moves in predicted.items()}
+    start = _join_starts(freed, known, moved_starts)
+    n = _MAX_STEPS * (start.size + 1)
     (end,) = refine_candidates(freed, [start], n)
     place = start if end is None else end.theta
     after = float(freed.evaluate_fitness(place[None])[0])
@@ -204,10 +243,10 @@ def _fit_free_starts(
 def _list_wrong_starts(
     problem: Problem, state: str, by_name: dict[str, Estimate]
 ) -> list[Estimate]:
-    """List a state's free starts (one for each experiment) that lie far from the fixed one."""
-    value = _get_fixed_values(problem.model)[state]
-    starts = [by_name[name_initial_state(state, e)] for e in range(len(problem.experiments))]
-    return [start for start in starts if _is_far(start, value)]
+    """List a state's free starts (one for each experiment) that lie far from the assumed one."""
+    starts = _get_assumed_starts(problem)[state].tolist()
+    free = [by_name[name_initial_state(state, e)] for e in range(len(starts))]
+    return [one for one, value in zip(free, starts, strict=True) if _is_far(one, value)]
 
 
 def _is_far(start: Estimate, value: float) -> bool:
@@ -243,9 +282,11 @@ def _describe_starts(
     wrong: dict[str, list[Estimate]],
     moves: list[str],
 ) -> str:
-    fixed = _get_fixed_values(problem.model)
+    values, measured = _get_assumed_starts(problem), _list_states(problem, MeasuredInitial)
     assumed = ", ".join(
-        f"{state} = {fixed[state]:g}{format_unit(starts[0].unit)}"
+        f"the first measured {state}"
+        if state in measured
+        else f"{state} = {values[state][0]:g}{format_unit(starts[0].unit)}"
         for state, starts in wrong.items()
     )
     found = ", ".join(
@@ -257,7 +298,7 @@ def _describe_starts(
         f" With {'it' if len(wrong) == 1 else 'them'} free {', '.join(moves)}." if moves else ""
     )
     cures = ", ".join(
-        f"{state}: {_suggest_bounds(fixed[state], starts)}" for state, starts in wrong.items()
+        f"{state}: {_suggest_bounds(values[state], starts)}" for state, starts in wrong.items()
     )
     steady = ", or initial: steady for a plant at rest" if _can_rest(problem.untied_model) else ""
     return (
@@ -275,9 +316,9 @@ def _can_rest(model: Model) -> bool:
     return True
 
 
-def _suggest_bounds(value: float, starts: Sequence[Estimate]) -> str:
-    """Suggest bounds as far beyond the fixed and the free starts as these are apart."""
-    values = [value, *(start.value for start in starts)]
+def _suggest_bounds(assumed: FloatArray, starts: Sequence[Estimate]) -> str:
+    """Suggest bounds as far beyond the assumed and the free starts as these are apart."""
+    values = [*assumed.tolist(), *(start.value for start in starts)]
     span = max(values) - min(values)
     lower, upper = _round(min(values) - span), _round(max(values) + span)
     return f"{{lower: {lower}, upper: {upper}}}"

@@ -21,14 +21,17 @@ A time lag that is rounded to samples is not moved. Its standard error is from p
 and the position on a plateau where a search ends has no meaning.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.core.types import FloatArray
+from sysid.models.parameters import Parameter
 from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import mark_poor_intervals
 from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
 _DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
@@ -192,20 +195,22 @@ class _LocalSearch:
 
 def widen_intervals(
     estimates: tuple[Estimate, ...],
-    names: tuple[str, ...],
+    parameters: Sequence[Parameter],
     n: int,
     minima: LocalMinima,
     variance_ratio: FloatArray,
 ) -> tuple[Estimate, ...]:
     """Widen intervals so that they contain those of all minima that the data do not rule out.
 
-    `variance_ratio` (D,) is that of `LinearOutputModel`, for the parameters `names`.
+    `variance_ratio` (D,) is that of `LinearOutputModel`, for the free `parameters`.
     """
     least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 2.0 * n * np.log(np.where(minima.rms > least, minima.rms / least, 1.0))
     changed = []
-    index_by_name = {name: d for d, name in enumerate(names) if np.isfinite(variance_ratio[d])}
+    index_by_name = {
+        one.name: d for d, one in enumerate(parameters) if np.isfinite(variance_ratio[d])
+    }
     for estimate in estimates:
         if estimate.name in index_by_name and estimate.stderr and estimate.interval95 is not None:
             d = index_by_name[estimate.name]
@@ -217,4 +222,4 @@ def widen_intervals(
             low, high = float(np.min(middle - half)), float(np.max(middle + half))
             estimate = replace(estimate, interval95=(min(lower, low), max(upper, high)))
         changed.append(estimate)
-    return tuple(changed)
+    return mark_poor_intervals(parameters, changed)

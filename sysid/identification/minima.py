@@ -59,12 +59,13 @@ class FoundMinima(NamedTuple):
 
     `agreeing` fits from random points ended in the minimum of the estimate, or in one as low.
     `projected` fits after the search began at random points with the linear parameters solved for.
+    `is_contradicted`: the data contradict the input that is assumed before the record.
     """
 
     minima: tuple[Minimum, ...]
     agreeing: int
     projected: int = 0
-    warnings: tuple[str, ...] = ()
+    is_contradicted: bool = False
 
 
 class ScanResult(NamedTuple):

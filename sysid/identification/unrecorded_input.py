@@ -47,8 +47,34 @@ _UNLIKELY = 1e-3  # probability of these residuals if the assumption holds
 _MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 
 
-def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
-    """Warn about estimates that change without the samples that read an assumed input."""
+def warn_unrecorded_input(
+    problem: Problem, analysis: Analysis, *, is_contradicted: bool
+) -> list[str]:
+    """Warn about samples that read an assumed input, if they matter.
+
+    They do if estimates change without them, or if the data contradict what is assumed
+    (`is_contradicted`, by `compare_where_recorded`).
+    """
+    parts = find_assumed_samples(problem, analysis)
+    assumed = np.concatenate(parts)[problem.scored_rows]
+    moves = _find_moves(problem, analysis, assumed)
+    if not (moves or is_contradicted):
+        return []
+    count = int(np.count_nonzero(assumed))
+    subject, pronoun = (
+        ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
+    )
+    doubt = ", and the data contradict it" if is_contradicted else ""
+    without = f" Without {pronoun} {', '.join(moves)}." if moves else ""
+    return [
+        f"{subject} an input from before the record, which was not recorded. Its first value is "
+        f"assumed there{doubt}.{without} {_ADVICE} skip: "
+        f"{max(int(np.count_nonzero(part)) for part in parts)}"
+    ]
+
+
+def _find_moves(problem: Problem, analysis: Analysis, assumed: BoolArray) -> list[str]:
+    """Find the estimates that move without the assumed samples (n,), and describe the moves."""
     if (
         analysis.residuals_and_sensitivities is None
         or analysis.linear_model is None
@@ -59,25 +85,12 @@ def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
         return []  # the time is over
     if not all(isinstance(initial, EstimatedInitial) for initial in problem.model.initial):
         return []  # a fixed start carries the effect of the assumption into the other samples
-    parts = find_assumed_samples(problem, analysis)
-    assumed = np.concatenate(parts)[problem.scored_rows]
-    count = int(np.count_nonzero(assumed))
-    left = assumed.size - count
-    if not count or left <= _MIN_SAMPLES_PER_PARAMETER * len(problem.free_parameters):
+    left = np.count_nonzero(~assumed)
+    if not assumed.any() or left <= _MIN_SAMPLES_PER_PARAMETER * len(problem.free_parameters):
         return []
     if not _would_move(problem, analysis, assumed):
         return []
-    moves = _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
-    if not moves:
-        return []
-    subject, pronoun = (
-        ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
-    )
-    return [
-        f"{subject} an input from before the record, which was not recorded. Its first value is "
-        f"assumed there. Without {pronoun} {', '.join(moves)}. {_ADVICE} skip: "
-        f"{max(int(np.count_nonzero(part)) for part in parts)}"
-    ]
+    return _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
 
 
 def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
@@ -197,11 +210,14 @@ def _release_initial_states(problem: Problem) -> dict[str, dict[str, Any]]:
 
 
 class RecordedComparison(NamedTuple):
-    """Minima compared where the input is recorded, the simulations spent, and a warning."""
+    """Minima compared where the input is recorded, and the simulations spent.
+
+    `is_contradicted`: the data contradict the input that is assumed before the record.
+    """
 
     minima: tuple[Minimum, ...] = ()
     evaluations: int = 0
-    warnings: tuple[str, ...] = ()
+    is_contradicted: bool = False
 
 
 def compare_where_recorded(
@@ -242,14 +258,10 @@ def compare_where_recorded(
 
     kept = [Fit(one.theta, one.rms) for one in scanned.ends if reaches_back(one.theta) <= reach]
     since = _find_recorded_starts(problem, reach)[0] - problem.records[0].start
-    count = max(map(np.count_nonzero, find_assumed_samples(problem, analysis)))
     return RecordedComparison(
         collect_minima(others, kept, recorded_from=since),
         end.evaluations + scanned.evaluations,
-        (
-            "the data contradict the input that is assumed before the record, its first value. "
-            f"{_ADVICE} skip: {count}",
-        ),
+        is_contradicted=True,
     )
 
 

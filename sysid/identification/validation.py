@@ -33,6 +33,11 @@ class Validation(NamedTuple):
     spread: float
     is_still: bool
 
+    @property
+    def is_refuted(self) -> bool:
+        """Whether their own mean fits the data better; False if the fit % is undefined."""
+        return self.metrics.fit_percent < 0.0
+
 
 def validate_estimates(
     validation: Problem,
@@ -119,6 +124,34 @@ def warn_still_validation(
         f", that of the estimation data {problem.output_scale:.3g}{unit}. So their fit % says "
         f"nothing. Compare the RMS: {validated.metrics.rms:.3g}{unit} in validation, "
         f"{metrics.rms:.3g}{unit} in estimation."
+    ]
+
+
+def mark_refuted(
+    estimates: tuple[Estimate, ...], validated: Validation | None
+) -> tuple[Estimate, ...]:
+    """Mark the identified estimates of a model that does not predict its validation data."""
+    if validated is None or not validated.is_refuted:
+        return estimates
+    reason = "the model predicts the validation data worse than their mean"
+    return tuple(
+        replace(estimate, status="not validated", reason=reason)
+        if estimate.status == "identified"
+        else estimate
+        for estimate in estimates
+    )
+
+
+def warn_refuted(metrics: Metrics, validated: Validation | None) -> list[str]:
+    """Warn about a model that predicts its validation data worse than their mean."""
+    if validated is None or not validated.is_refuted:
+        return []
+    unit = format_unit(metrics.unit)
+    return [
+        "the model predicts the validation data worse than their mean: RMS "
+        f"{validated.metrics.rms:.3g}{unit} against {validated.spread:.3g}{unit}, and "
+        f"{metrics.rms:.3g}{unit} in estimation. Do not rely on it. Dynamics or a disturbance are "
+        "missing from the model, or the estimation data do not determine what validation needs."
     ]
 
 

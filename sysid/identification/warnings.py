@@ -55,8 +55,13 @@ def collect_warnings(
     simulated: FloatArray,
     rms: float,
     tests: ResidualTests | None = None,
+    *,
+    is_contradicted: bool = False,
 ) -> tuple[str, ...]:
-    """Collect all warnings, the most important first; `tests` are those of the residuals."""
+    """Collect all warnings, the most important first; `tests` are those of the residuals.
+
+    `is_contradicted`: the data contradict the input that is assumed before the record.
+    """
     messages = []
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
@@ -70,7 +75,9 @@ def collect_warnings(
     messages += _warn_constant_outputs(problem)
     messages += _warn_worse_than_line(problem, simulated)
     messages += _warn_constant_inputs(problem, analysis.estimates)
-    messages += _warn_early_response(problem) or warn_unrecorded_input(problem, analysis)
+    messages += _warn_early_response(problem) or warn_unrecorded_input(
+        problem, analysis, is_contradicted=is_contradicted
+    )
     messages += [text for estimate in analysis.estimates if (text := _warn_unidentified(estimate))]
     delay_names = find_delay_parameters(problem)
     if analysis.uncertainty is not None:

@@ -48,6 +48,8 @@ class RestartCounts(NamedTuple):
         Restarts near the champion, and how many of them led back.
     has_discontinuities : bool
         Whether an island with the best champion has met jumps of the fitness.
+    is_explained : bool
+        Whether the residuals of the best champion look like noise.
     """
 
     independent: int
@@ -55,13 +57,15 @@ class RestartCounts(NamedTuple):
     hops: int
     returned: int
     has_discontinuities: bool
+    is_explained: bool
 
 
 @jit_compile
 def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
     """Count the restarts of islands from their champions' RMS (I,) and search records (I,)."""
     independent = confirmed = hops = returned = 0
-    has_discontinuities, largest_rms = False, np.min(rms) * (1.0 + SAME_OPTIMUM)
+    has_discontinuities, is_explained = False, False
+    largest_rms = np.min(rms) * (1.0 + SAME_OPTIMUM)
     for i in range(rms.size):
         independent += search[i].random_starts
         if rms[i] <= largest_rms:
@@ -69,7 +73,8 @@ def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
             hops += search[i].hop_count
             returned += search[i].returned_hops
             has_discontinuities |= search[i].champion_discontinuities > 0
-    return RestartCounts(independent, confirmed, hops, returned, has_discontinuities)
+            is_explained |= search[i].champion_explained > 0
+    return RestartCounts(independent, confirmed, hops, returned, has_discontinuities, is_explained)
 
 
 @jit_compile
@@ -100,6 +105,9 @@ def _restarts_agree(settled: int, is_warm: bool, restarts: RestartCounts, is_old
     So restarts that led to worse optima do not count against the best, unless they are the
     majority.
 
+    Smooth fitness, and residuals of the best that look like noise: nothing is left to explain. A
+    better optimum could only fit the noise. So nearby restarts alone are enough.
+
     Fitness with jumps: a better optimum nearby may attract few restarts, next to a wide one that
     attracts many. Then nearly all restarts must agree.
 
@@ -125,6 +133,8 @@ def _restarts_agree(settled: int, is_warm: bool, restarts: RestartCounts, is_old
             settled, _CONFIRMED_SHARE_ROUGH * restarts.independent
         )
     agreed, enough = restarts.confirmed + restarts.returned, settled + _EXTRA_AGREEMENTS
+    if restarts.is_explained and restarts.returned >= max(enough, _MIN_SHARE * restarts.hops):
+        return True
     if min(restarts.confirmed, restarts.returned) < -(-settled // _PARTS_OF_EACH):
         return False
     is_confirmed = restarts.confirmed >= max(enough, _CONFIRMED_SHARE * restarts.independent)

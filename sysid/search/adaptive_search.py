@@ -22,6 +22,7 @@ from sysid.search.basin_hopping import (
     hop_from_champion,
     is_behind_champion,
     is_champion_coloured,
+    is_champion_explained,
 )
 from sysid.search.levenberg_marquardt import factor_damped, write_damped_step, write_spread_place
 from sysid.search.operators import (
@@ -227,6 +228,12 @@ def _scatter_population(
 
 
 @jit_compile
+def has_returned(search: SearchRecord, champion: float) -> bool:
+    """Return whether a local search ended at the optimum of the champion, by its fitness."""
+    return bool(abs(search.reached_fitness - champion) <= champion * SAME_OPTIMUM)
+
+
+@jit_compile
 def _extend_horizon(search: SearchRecord, champion: float) -> None:
     """Extend the part of the record that is fitted; at its end, end the local search.
 
@@ -242,7 +249,7 @@ def _extend_horizon(search: SearchRecord, champion: float) -> None:
         search.champion_converged = 1
     if search.hop_kind & COUNTED_HOP:
         search.hop_count += 1
-        search.returned_hops += abs(search.reached_fitness - champion) <= champion * SAME_OPTIMUM
+        search.returned_hops += has_returned(search, champion)
     if search.from_random_start:
         search.random_starts += 1
         search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME_OPTIMUM)
@@ -261,6 +268,9 @@ def _finish_part(
     has_ended = search.in_sequence_search == 0 and np.isfinite(search.reached_fitness)
     if has_ended and search.from_random_start:
         archive_end(island.archive, island.point, search.reached_fitness)
+    is_smooth_hop = search.hop_kind & COUNTED_HOP and search.fitness_discontinuities == 0
+    if has_ended and is_smooth_hop and has_returned(search, island.fitness[0]):
+        search.champion_explained = is_champion_explained(evaluator, plan, island)
 
 
 @jit_compile

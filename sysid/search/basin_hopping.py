@@ -191,6 +191,8 @@ def _probe_discontinuities(
 
 
 COLOUR_THRESHOLD = 0.5  # correlation of neighbouring residuals: noise has 0, a wrong response 1
+NOISE_LAGS = 10  # of the autocorrelation
+NOISE_LIMIT = 29.6  # of Box and Pierce's statistic: noise exceeds it with a probability of 0.1 %
 
 
 @jit_compile
@@ -204,20 +206,50 @@ def _predict_champion(
 
 
 @jit_compile
+def _compute_champion_errors(
+    evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
+) -> FloatArray:
+    """Compute the champion's weighted residuals (M,), scored ones only; takes one simulation."""
+    predicted = _predict_champion(evaluator, plan, island, 1.0)[:, 0]
+    errors = evaluator.weight * (predicted - evaluator.measured)
+    return np.asarray(errors[evaluator.weight != 0.0])
+
+
+@jit_compile
+def _sum_lagged(errors: FloatArray, lag: int) -> float:
+    """Sum the products of residuals (M,) and those `lag` places before them."""
+    total = 0.0
+    for m in range(lag, errors.size):
+        total += errors[m] * errors[m - lag]
+    return total
+
+
+@jit_compile
 def is_champion_coloured(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
     """Return whether the champion's residuals are autocorrelated; takes one simulation.
 
     If so, the residuals are more than noise. Neighbours are consecutive measured values.
     """
-    predicted = _predict_champion(evaluator, plan, island, 1.0)
-    products, squares, last = 0.0, 0.0, 0.0
-    for m in range(predicted.shape[0]):
-        if evaluator.weight[m] != 0.0:
-            error = evaluator.weight[m] * (predicted[m, 0] - evaluator.measured[m])
-            products += error * last
-            squares += error * error
-            last = error
-    return bool(products > COLOUR_THRESHOLD * squares)
+    errors = _compute_champion_errors(evaluator, plan, island)
+    return _sum_lagged(errors, 1) > COLOUR_THRESHOLD * _sum_lagged(errors, 0)
+
+
+@jit_compile
+def is_champion_explained(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
+    """Return whether the champion's residuals look like noise; takes one simulation.
+
+    It is the portmanteau test of Box and Pierce. A false minimum leaves a part of the response in
+    its residuals. False at the end of the budget, and for residuals that are too few.
+    """
+    if island.search.evaluations >= plan.most_evaluations:
+        return False
+    errors = _compute_champion_errors(evaluator, plan, island)
+    squares, statistic = _sum_lagged(errors, 0), 0.0
+    if errors.size < 2 * NOISE_LAGS or not 0.0 < squares < np.inf:
+        return False
+    for lag in range(1, NOISE_LAGS + 1):
+        statistic += errors.size * (_sum_lagged(errors, lag) / squares) ** 2
+    return bool(statistic < NOISE_LIMIT)
 
 
 @jit_compile

@@ -253,7 +253,7 @@ def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
     """Reset the evidence for the champion if the new one is another optimum."""
     if rms < before * (1.0 - SAME_OPTIMUM):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
-        search.hop_count, search.returned_hops = 0, 0
+        search.hop_count, search.returned_hops, search.champion_explained = 0, 0, 0
 
 
 @jit_compile

@@ -66,6 +66,7 @@ class SearchRecord(Protocol):
     hop_count: int  # ended hops
     returned_hops: int  # of these, those that led back to the champion
     champion_discontinuities: int  # lines through this champion on which the fitness jumps
+    champion_explained: int  # its residuals were noise when a hop last returned to it
     is_warm_start: int
     fitness_discontinuities: int  # the same for any champion, and for those of neighbours
     wide_differences: int  # slopes are taken over random distances

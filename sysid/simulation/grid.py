@@ -18,7 +18,7 @@ MAX_STEPS = 20_000_000
 
 _JITTER = 0.05  # of a sampling period: tolerated by a recursion
 _POINTS_PER_SAMPLE = 4  # grid points in the median distance of irregular samples
-_GRID_TOLERANCE = 0.01  # of a grid step: a nearer sample counts as on the point
+GRID_TOLERANCE = 0.01  # of a grid step: a nearer sample counts as on the point
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,7 @@ class Grid:
         """Convert times to positions in grid steps; whole numbers where they are on the grid."""
         positions = (times - self.start) / self.step
         whole = np.round(positions)
-        snapped: FloatArray = np.where(
-            np.abs(positions - whole) < _GRID_TOLERANCE, whole, positions
-        )
+        snapped: FloatArray = np.where(np.abs(positions - whole) < GRID_TOLERANCE, whole, positions)
         return np.clip(snapped, 0.0, self.points - 1.0)
 
 
@@ -78,7 +76,7 @@ def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel
     end = max(float(channel.times[-1]) for channel in outputs)
     _check_length((end - begin) / step * model.solver.substeps)
     start = first - ceil((first - begin) / step - 1e-6) * step
-    points = ceil((end - start) / step - _GRID_TOLERANCE) + 1
+    points = ceil((end - start) / step - GRID_TOLERANCE) + 1
     return Grid(start, step, points, model.solver.substeps)
 
 

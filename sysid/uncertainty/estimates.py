@@ -10,6 +10,7 @@ NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
 EstimateStatus = Literal[
     "identified",
     "not settled",
+    "not validated",
     "ambiguous",
     "group",
     "at bound",

@@ -1,11 +1,12 @@
 """Estimates of free, fixed and tied parameters from the local analysis."""
 
-from dataclasses import dataclass
-from math import sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import log, sqrt
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray
+from sysid.core.types import BoolArray, FloatArray, Interval
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.tree import Expression
@@ -16,6 +17,7 @@ from sysid.uncertainty.estimates import Estimate, EstimateStatus
 _TIE_STEP = 1e-6  # of the range: slopes of ties
 _NULL_SHARE = 1e-4  # share of a tie's slope along directions that have no effect
 _MAX_NAMED_GROUPS = 4  # groups that a reason names
+_POOR_SHARE = 1 / 3  # of a range: an interval around 0 that covers more says little
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +59,47 @@ def make_estimates(problem: Problem, statistics: LocalStatistics) -> tuple[Estim
     free = {
         p.name: _make_free_estimate(p, statistics, d) for d, p in enumerate(problem.free_parameters)
     }
-    return tuple(
-        free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
-        for p in problem.all_parameters
+    return mark_poor_intervals(
+        problem.free_parameters,
+        tuple(
+            free.get(p.name) or _make_fixed_or_tied_estimate(problem, statistics, p)
+            for p in problem.all_parameters
+        ),
     )
+
+
+def mark_poor_intervals(
+    parameters: Sequence[Parameter], estimates: Sequence[Estimate]
+) -> tuple[Estimate, ...]:
+    """Mark the identified estimates whose 95 % interval says little more than their bounds.
+
+    It is wider than the range, or it contains 0 and more than a third of the range.
+    """
+    by_name = {parameter.name: parameter for parameter in parameters}
+    marked = []
+    for estimate in estimates:
+        if estimate.status == "identified" and estimate.interval95 is not None:
+            reason = _explain_poor_interval(by_name[estimate.name], estimate.interval95)
+            if reason:
+                estimate = replace(estimate, status="unidentifiable", reason=reason)
+        marked.append(estimate)
+    return tuple(marked)
+
+
+def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:
+    """Explain how an interval says too little; empty if it says enough."""
+    lower, upper = parameter.lower, parameter.upper
+    poorly = "these data determine it poorly: its 95 % interval"
+    if interval[1] - interval[0] >= upper - lower:
+        return f"{poorly} is wider than its range"
+    low, high = max(interval[0], lower), min(interval[1], upper)
+    if parameter.scale == "log":
+        share = log(high / low) / log(upper / lower)
+    else:
+        share = (high - low) / (upper - lower)
+    if interval[0] <= 0.0 <= interval[1] and share > _POOR_SHARE:
+        return f"{poorly} contains 0, and {100 * share:.0f} % of its range"
+    return ""
 
 
 def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: int) -> Estimate:
@@ -71,10 +110,6 @@ def _make_free_estimate(parameter: Parameter, statistics: LocalStatistics, d: in
     )
     error = None if lacks_stderr else sqrt(max(float(statistics.covariance[d, d]), 0.0))
     quantile = float(statistics.t_quantile[d])
-    is_wide = error is not None and 2.0 * quantile * error >= parameter.upper - parameter.lower
-    if status == "identified" and is_wide:
-        status = "unidentifiable"
-        reason = "these data determine it poorly: its 95 % interval is wider than its range"
     return _make_estimate(parameter, value, error, quantile, status, reason)
 
 

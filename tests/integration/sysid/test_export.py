@@ -187,6 +187,8 @@ WRITTEN: dict[str, tuple[Model, Case]] = {
     "semi_implicit": (written(TWO, method="semi-implicit", history="zero", step=0.03), _TWO),
     "steady": (starting(RESTING, "steady"), _RESTING),
     "steady_substeps": (starting(RESTING, "steady", substeps=2), _RESTING),
+    "steady_own_step": (starting(RESTING, "steady", step=0.017), _RESTING),
+    "steady_off_samples": (starting(RESTING, "steady", step=0.0171), _RESTING),
     "start_of_recursion": (starting(RECURSION, {"x": "d*u0 - L", "w": "u0/d"}), _RECURSION),
     "selected": (selected(), Case({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
     "recursion": (written(RECURSION), _RECURSION),

@@ -155,8 +155,8 @@ def test_the_start_of_another_record_is_estimated_on_its_first_part_only() -> No
     np.testing.assert_allclose(simulated, other.outputs[0].values, atol=5e-3)
 
 
-def heated(last: float) -> tuple[Identification, float]:
-    """A first-order plant whose input stands still in the last 30 %, 0.02 of noise."""
+def heated(last: float, sign: float = 1.0) -> tuple[Identification, float]:
+    """A first-order plant, 0.02 of noise; input and output are scaled in the last 30 %."""
     rng, times = np.random.default_rng(2), 0.1 * np.arange(300)
     u = np.repeat(rng.uniform(-1, 1, 30), 10)
     u[180:] *= last
@@ -165,6 +165,7 @@ def heated(last: float) -> tuple[Identification, float]:
     [y] = simulate(
         model, [command], {"K": 2, "T": 0.5, "L": 0.33, "y0": 0, "x(0)": 0}, times=times
     ).channels
+    y.values[210:] *= sign
     record = Record((command,), (replace(y, values=y.values + 0.02 * rng.normal(size=300)),))
     bounds = {"L": {"upper": 2}}
     found = identify(model, record, parameters=bounds, validation_fraction=FRACTION)
@@ -182,8 +183,19 @@ def test_a_part_that_hardly_moves_has_an_rms_and_no_fit() -> None:
     assert f"their standard deviation is {spread:.3g}, " in note
 
 
+def test_a_model_that_predicts_worse_than_the_mean_is_not_validated() -> None:
+    found, spread = heated(1.0, -1.0)
+    assert found.fit_percent > 95
+    assert found.rms_validation is not None
+    assert found.rms_validation > spread
+    assert {one.status for one in found.estimates} == {"not validated"}
+    assert "the model predicts the validation data worse than their mean" in found.warnings[0]
+    assert f"RMS {found.rms_validation:.3g} against {spread:.3g}, " in found.warnings[0]
+
+
 def test_a_part_that_moves_less_than_the_rest_keeps_its_fit() -> None:
     found, _ = heated(0.25)
+    assert {one.status for one in found.estimates} == {"identified"}
     assert found.fit_percent_validation is not None
     assert found.fit_percent_validation > 80
     assert not any("hardly move" in one for one in found.warnings)

@@ -10,7 +10,7 @@ from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.records import Channel, Record
 from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.identify import identify
-from sysid.models.model import FixedInitial, Model
+from sysid.models.model import FixedInitial, MeasuredInitial, Model
 from sysid.models.parse import parse_model
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -104,6 +104,27 @@ def test_of_a_right_start_nothing_is_reported_whatever_the_noise() -> None:
     for seed in draw_seeds(gate=8, night=200):
         for colour in (0.0, 0.9):
             assert notes(Problem.build(FIRST_ORDER, [measured(seed, 0.0, colour=colour)])) == []
+
+
+def test_the_noise_of_a_measured_start_is_reported_where_it_moves_an_estimate() -> None:
+    tank = replace(TANK, initial=(MeasuredInitial(),))
+    records = [measured(seed, 2.0, TANK, noise=0.2) for seed in range(4)]
+    found = [notes(Problem.build(tank, [record])) for record in records]
+    assert sum(map(len, found)) >= 2
+    [note] = next(one for one in found if one)
+    value, stderr = note.split("The data give x(0) = ")[1].split(" V.")[0].split(" ± ")
+    assert note.startswith("the record does not start at the first measured x.")
+    assert abs(float(value) - 2.0) < 4 * float(stderr) < 0.2
+    assert "With it free K is 2.0" in note or "With it free K is 1.99" in note
+
+
+def test_a_measured_start_that_moves_no_estimate_is_not_reported() -> None:
+    plant = replace(FIRST_ORDER, initial=(MeasuredInitial(),))
+    record = measured(0, 2.0)
+    [y] = record.outputs
+    y.values[0] += 3.0
+    known = {"K": {"fixed": 2.0}, "T": {"fixed": 1.5}}
+    assert notes(Problem.build(plant, [record], parameters=known)) == []
 
 
 def test_a_start_that_moves_the_output_by_rounding_is_not_named() -> None:

@@ -21,6 +21,7 @@ from sysid.identification.local_minima import (
 from sysid.identification.minima import scan_parameters
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
+from sysid.models.parameters import Parameter
 from sysid.search.archive import read_archive
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
@@ -210,6 +211,7 @@ def test_without_a_budget_nothing_is_simulated() -> None:
 
 
 SAME = np.ones(1)
+A = Parameter("a", 0.0, 5.0, "1")
 ONE = Estimate("a", "1", 2.0, 0.0, 5.0, 0.1, (1.8, 2.2), "identified", "")
 
 
@@ -220,33 +222,38 @@ def test_an_interval_holds_the_values_of_minima_that_the_data_do_not_rule_out(
     n = 50
     rms = np.array([1.0, np.exp(ratio / (2 * n))])
     found = LocalMinima(None, np.array([[2.0], [1.6]]), rms, 0)
-    wide = widen_intervals((ONE,), ("a",), n, found, SAME)[0]
+    wide = widen_intervals((ONE,), (A,), n, found, SAME)[0]
     assert wide == replace(ONE, interval95=wide.interval95)
     assert wide.interval95 == pytest.approx((low, 2.2))
+
+
+def test_an_interval_that_other_minima_widen_to_much_of_the_range_says_little() -> None:
+    found = LocalMinima(None, np.array([[2.0], [0.0]]), np.array([1.0, 1.0]), 0)
+    wide = widen_intervals((ONE,), (A,), 50, found, SAME)[0]
+    assert wide.status == "unidentifiable"
+    assert wide.reason.endswith("its 95 % interval contains 0, and 44 % of its range")
 
 
 def test_of_coloured_residuals_a_minimum_is_as_likely_as_their_variance_says() -> None:
     n, share = 50, np.array([0.25])  # standard errors twice those of white residuals
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, np.exp(8.0 / (2 * n))]), 0)
-    white = widen_intervals((ONE,), ("a",), n, found, SAME)[0]
+    white = widen_intervals((ONE,), (A,), n, found, SAME)[0]
     assert white.interval95 == pytest.approx((1.8, 2.2))
-    wide = widen_intervals((ONE,), ("a",), n, found, share)[0]
+    wide = widen_intervals((ONE,), (A,), n, found, share)[0]
     assert wide.interval95 == pytest.approx((1.6 - 0.1 * np.sqrt(2.0), 2.2))
 
 
 def test_the_interval_of_a_parameter_on_a_plateau_stays_around_its_middle() -> None:
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, 1.0]), 0)
-    assert widen_intervals((ONE,), ("a",), 50, found, np.array([np.nan])) == (ONE,)
+    assert widen_intervals((ONE,), (A,), 50, found, np.array([np.nan])) == (ONE,)
 
 
 def test_an_estimate_without_a_standard_error_gets_none_by_its_neighbours() -> None:
     blind = replace(ONE, stderr=None, interval95=None)
     found = LocalMinima(None, np.array([[2.0]]), np.array([1.0]), 0)
-    assert widen_intervals((blind,), ("a",), 50, found, SAME) == (blind,)
+    assert widen_intervals((blind,), (A,), 50, found, SAME) == (blind,)
 
 
 def test_beside_a_perfect_fit_nothing_else_is_likely() -> None:
     found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
-    assert widen_intervals((ONE,), ("a",), 50, found, SAME)[0].interval95 == pytest.approx(
-        (1.8, 2.2)
-    )
+    assert widen_intervals((ONE,), (A,), 50, found, SAME)[0].interval95 == pytest.approx((1.8, 2.2))

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.traps import CHATTER
 from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
-from sysid.core.settings import SearchMethod
+from sysid.core.settings import Loss, SearchMethod
 from sysid.core.types import FloatArray
 from sysid.identification.conclude import conclude_run
 from sysid.identification.minima import (
@@ -142,9 +142,19 @@ def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart
     found = identify(lag_model(), record(periodic(500), 200), seed=3)
     assert status(found, "L") == "ambiguous"
     assert "where the input is recorded" in reason(found, "L")
-    assert any("the data contradict the input that is assumed" in text for text in found.warnings)
+    (told,) = (text for text in found.warnings if "from before the record" in text)
+    assert "Its first value is assumed there, and the data contradict it." in told
+    assert sum("assumed" in text for text in found.warnings) == 1
     compared = [one for one in found.search.minima if one.recorded_from is not None]
     assert len([one for one in compared if one.is_compatible]) == 3
+
+
+def test_a_noise_model_does_not_hide_that_the_data_contradict_the_assumed_input() -> None:
+    loss = Loss(noise_model="ar1")
+    found = identify(lag_model(), record(periodic(500), 200), seed=3, loss=loss)
+    assert found.noise_model == "ar1"
+    assert status(found, "L") == "ambiguous"
+    assert any("and the data contradict it" in text for text in found.warnings)
 
 
 def test_a_record_that_begins_at_rest_tells_lags_a_period_apart() -> None:

@@ -152,6 +152,7 @@ def test_a_better_champion_has_to_be_confirmed_again_and_another_one_stays_confi
         "hop_count": 2,
         "returned_hops": 1,
         "champion_discontinuities": 1,
+        "champion_explained": 1,
     }
     before = tuple(with_search(island, **evidence) for island in islands())
     after, _ = migrate(before, (24,) * 4, Migration(topology="fully-connected"), 0)

@@ -30,7 +30,14 @@ def make_search(islands: int = 1, generation: int = 2, **fields: object) -> Sear
 
 
 def ends(
-    again: int, tried: int, returned: int, hops: int, *, is_warm: bool = False, jumps: bool = False
+    again: int,
+    tried: int,
+    returned: int,
+    hops: int,
+    *,
+    is_warm: bool = False,
+    jumps: bool = False,
+    is_explained: bool = False,
 ) -> bool:
     """Whether a run ends at its second border, its searches as told."""
     search = make_search(
@@ -39,6 +46,7 @@ def ends(
         returned_hops=returned,
         hop_count=hops,
         champion_discontinuities=int(jumps),
+        champion_explained=int(is_explained),
     )
     rule = make_stopping_rule(ALONE, is_warm=is_warm)
     return bool(has_search_ended(rule, 2, np.array([0.5]), search, False))
@@ -84,6 +92,17 @@ def test_where_the_fitness_jumps_nearly_all_searches_must_agree(
     assert ends(again, tried, returned, hops, jumps=True) is enough
 
 
+@pytest.mark.parametrize(
+    ("returned", "hops", "enough"), [(8, 24, True), (7, 7, False), (8, 25, False)]
+)
+def test_where_only_noise_is_left_searches_from_near_it_are_enough(
+    returned: int, hops: int, enough: bool
+) -> None:
+    assert ends(0, 12, returned, hops, is_explained=True) is enough
+    assert not ends(0, 12, returned, hops)
+    assert not ends(0, 12, returned, hops, is_explained=True, jumps=True)
+
+
 def test_searches_for_a_worse_champion_confirm_none_but_count_as_tried() -> None:
     search = make_search(
         3,
@@ -92,9 +111,10 @@ def test_searches_for_a_worse_champion_confirm_none_but_count_as_tried() -> None
         hop_count=[3, 9, 2],
         returned_hops=[2, 8, 1],
         champion_discontinuities=[0, 1, 0],
+        champion_explained=[0, 1, 0],
     )
     found = count_restarts(np.array([0.5, 0.6, 0.5 * (1 + 5e-5)]), search)
-    assert tuple(found) == (14, 5, 5, 3, False)
+    assert tuple(found) == (14, 5, 5, 3, False, False)
 
 
 def test_the_best_champion_decides_whether_the_target_is_reached() -> None:

@@ -9,14 +9,20 @@ from sysid.core.settings import GeneticAlgorithm, Migration, Stop
 from sysid.identification.run import advance_run, begin_run
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.migration import migrate
+from sysid.models.catalogue.load import load_model
 from sysid.search.adaptive_search import start_local_search
-from sysid.search.basin_hopping import is_behind_champion, is_champion_coloured
+from sysid.search.basin_hopping import (
+    is_behind_champion,
+    is_champion_coloured,
+    is_champion_explained,
+)
 from sysid.search.island import Island
 from sysid.search.operators import encode
 from sysid.search.slopes import evaluate_partial_fitness
 from sysid.search.state import IslandPlan
 from sysid.simulation.evaluator import predict_partially
-from tests.searching import COULOMB, example
+from sysid.simulation.problem import Problem
+from tests.searching import COULOMB, example, noisy, record
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 PROBLEM = example("coulomb-eq16")
@@ -44,6 +50,29 @@ def test_errors_are_coloured_where_the_response_is_wrong(
     before = island.evaluations
     assert is_champion_coloured(PROBLEM.evaluator, plan(), island.arrays) == wanted
     assert island.evaluations == before + 1
+
+
+@pytest.mark.parametrize(("values", "wanted"), [(COULOMB, True), (FALSE, False)])
+def test_only_noise_is_left_where_the_response_is_right(
+    values: dict[str, float], wanted: bool
+) -> None:
+    island = island_at(values)
+    before = island.evaluations
+    assert is_champion_explained(PROBLEM.evaluator, plan(), island.arrays) == wanted
+    assert island.evaluations == before + 1
+    island.search["evaluations"] = plan().most_evaluations
+    assert not is_champion_explained(PROBLEM.evaluator, plan(), island.arrays)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_a_hop_that_returns_finds_out_whether_only_noise_is_left(coloured: bool) -> None:
+    values = noisy(n=200) + (0.05 * np.sin(np.arange(200)) if coloured else 0.0)
+    problem = Problem.build(load_model("duffing-eq16"), [record(values)])
+    algorithm = GeneticAlgorithm(generations=60, stop=Stop(settled=None))
+    state = advance_run(problem, algorithm, begin_run(problem, algorithm, 1))
+    returned = [island for island in state.islands if island.search["returned_hops"] > 0]
+    assert returned
+    assert {int(island.search["champion_explained"]) for island in returned} == {int(not coloured)}
 
 
 def test_a_part_is_lost_where_the_champion_fits_it_better() -> None:

@@ -1,0 +1,52 @@
+"""When an interval says little more than the bounds of its parameter."""
+
+from dataclasses import replace
+
+import pytest
+
+from sysid.core.types import Interval
+from sysid.uncertainty.analysis import analyse_estimate
+from sysid.uncertainty.intervals import mark_poor_intervals
+from tests.searching import example
+
+PROBLEM = example(n=80)
+ESTIMATE = replace(
+    analyse_estimate(
+        PROBLEM,
+        PROBLEM.evaluator.lower + 0.4 * (PROBLEM.evaluator.upper - PROBLEM.evaluator.lower),
+    ).estimates[0],
+    status="identified",
+    reason="",
+)
+
+
+def scaled(lower: float, upper: float, scale: str, interval: Interval) -> tuple[str, str]:
+    """Status and reason of an estimate with these bounds and this interval."""
+    bounds = {"lower": lower, "upper": upper, "scale": scale}
+    problem = PROBLEM.rebuild(parameters={ESTIMATE.name: bounds})
+    marked, other = mark_poor_intervals(
+        problem.free_parameters,
+        (replace(ESTIMATE, interval95=interval), replace(ESTIMATE, interval95=None)),
+    )
+    assert other.status == "identified"
+    return marked.status, marked.reason.removeprefix("these data determine it poorly: ")
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "scale", "interval", "reason"),
+    [
+        (0.0, 30.0, "linear", (-4.0, 16.0), "its 95 % interval contains 0, and 53 % of its range"),
+        (-40.0, 40.0, "linear", (-14.0, 20.0), "its 95 % interval contains 0, and 42 % of its"),
+        (5.0, 15.0, "linear", (2.0, 12.5), "its 95 % interval is wider than its range"),
+        (0.01, 100.0, "log", (-1.0, 1.0), "its 95 % interval contains 0, and 50 % of its range"),
+        (0.0, 60.0, "linear", (-4.0, 16.0), ""),  # less than a third of it
+        (5.0, 15.0, "linear", (6.0, 14.0), ""),  # its size is known
+        (0.01, 100.0, "log", (-1.0, 0.1), ""),
+    ],
+)
+def test_an_interval_around_zero_that_covers_much_of_the_range_says_little(
+    lower: float, upper: float, scale: str, interval: Interval, reason: str
+) -> None:
+    status, found = scaled(lower, upper, scale, interval)
+    assert status == ("unidentifiable" if reason else "identified")
+    assert found.startswith(reason) if reason else not found
