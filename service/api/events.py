@@ -19,7 +19,13 @@ KEEP_ALIVE_S = 15.0
 NO_BUFFER = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 
 
-@router.get("/{job_id}/events", response_class=StreamingResponse)
+class EventStreamResponse(StreamingResponse):
+    """Events of a job, as they happen."""
+
+    media_type = "text/event-stream"
+
+
+@router.get("/{job_id}/events", response_class=EventStreamResponse)
 async def stream_events(
     job_id: str, parts: PartsDep, last_event_id: Annotated[str | None, Header()] = None
 ) -> Response:
@@ -30,7 +36,7 @@ async def stream_events(
         return Response(status_code=204)  # an EventSource then does not reconnect
     parts.feed.check_room()
     stream = _stream_events(parts, job_id, last)
-    return StreamingResponse(stream, media_type="text/event-stream", headers=NO_BUFFER)
+    return EventStreamResponse(stream, headers=NO_BUFFER)
 
 
 async def _stream_events(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
