@@ -212,12 +212,12 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
         simulate(64, lambda i: _sum(90, lambda j: f"tanh(x{i})*exp(-a*x{j % 64})*sin({j}*a)")),
         "422",
     ),
-    "the largest model that is accepted, about": (
+    "9,800 nodes, nearly the largest model": (
         simulate(11, lambda i: _sum(64, lambda j: f"tanh(x{j % 11})*exp(-x{i}*a)*sin({j}*a)")),
         "201|422",
     ),
     "200 delays of one input": (
-        simulate(1, lambda _: _sum(200, lambda j: f"u(t-L*{j + 1}.5)")),
+        simulate(1, lambda _: _sum(200, lambda j: f"u(t-L*0.{j:03}1)")),
         "422",
     ),
     "twelve dense equations at rest": (
@@ -237,8 +237,8 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
         ),
         "200, valid: False",
     ),
-    "300,000 unknown fields, 4 MB": (
-        send_job(**{f"k{n:07}": 1 for n in range(290_000)}),
+    "250,000 unknown fields, 4 MB": (
+        send_job(**{f"k{n:07}": 1 for n in range(250_000)}),
         "422",
     ),
     "body of 31 MB": (send_job(name="x" * 31 * MEGABYTE), "413"),
