@@ -57,6 +57,9 @@ def list_parts(seed: int) -> dict[str, Part]:
         "traps": program("benchmarks.traps"),
         "coverage": program("benchmarks.coverage", "--jobs", "2"),
         "torture": program("benchmarks.torture", "--seed", str(seed)),
+        "fuzz": program("benchmarks.fuzz", "--seed", str(seed)),
+        "attacks": program("benchmarks.attacks"),
+        "libraries": program("benchmarks.dependencies"),
         "measured data": program("benchmarks.real_data.all"),
     }
 
@@ -92,7 +95,17 @@ def summarize(part: Part, log: Path) -> tuple[str, int]:
         return ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common()), 0
     missed = [row["name"] for row in rows if not row["holds"]]
     text = f"{len(rows) - len(missed)} of {len(rows)} bars hold"
-    return f"{text}. Missed: {'; '.join(missed)}" if missed else text, len(missed)
+    if missed:
+        text += f". Missed: {'; '.join(missed)}"
+    return text + _summarize_skipped(target.with_suffix(".md")), len(missed)
+
+
+def _summarize_skipped(table: Path) -> str:
+    """Say what a program could not measure here, and why."""
+    lines = table.read_text(encoding="utf-8").splitlines() if table.exists() else []
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "|" in line]
+    left = [f"{row[0]} ({row[-1]})" for row in cells if len(row) == 5 and row[1] == "skipped"]
+    return f". Skipped: {'; '.join(left)}" if left else ""
 
 
 def _has_json(part: Part) -> bool:

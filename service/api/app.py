@@ -22,6 +22,7 @@ from service.api import (
 from service.api.dependencies import Parts
 from service.api.html import PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
+from service.api.openapi import DocumentedApp
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
@@ -40,7 +41,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     `app.state.parts` holds both while the application runs.
     """
     chosen = settings or Settings()
-    app = FastAPI(
+    app = DocumentedApp(
         title="lagid",
         version=version("lagid"),
         description=DESCRIPTION,

@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
@@ -42,7 +43,24 @@ CROSS_ORIGIN = {
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
     "Cross-Origin-Resource-Policy": "cross-origin",
 }
+FILE_ANSWERS: dict[int | str, dict[str, Any]] = {
+    206: {"description": "The requested range of bytes"},
+    304: {"description": "The content is what the request's ETag names"},
+}
+"""Further statuses of an answer with a file, for the OpenAPI document."""
 _RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+
+
+class McapResponse(StreamingResponse):
+    """A recording, or a part of it."""
+
+    media_type = MCAP_TYPE
+
+
+class CsvResponse(StreamingResponse):
+    """A table that is sent while it is made."""
+
+    media_type = "text/csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +117,7 @@ def content_response(
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MCAP_TYPE)
     blocks = store.get_stream(sha256, file.start + wanted.start, wanted.stop - wanted.start)
-    return StreamingResponse(blocks, status, headers, MCAP_TYPE)
+    return McapResponse(blocks, status, headers)
 
 
 def preflight_response() -> Response:

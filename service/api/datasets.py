@@ -5,10 +5,17 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import StreamingResponse
 
 from service.api.bodies import JsonRoute
-from service.api.content import CROSS_ORIGIN, content_response, preflight_response, receive_upload
+from service.api.content import (
+    CROSS_ORIGIN,
+    FILE_ANSWERS,
+    CsvResponse,
+    McapResponse,
+    content_response,
+    preflight_response,
+    receive_upload,
+)
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
 from service.core.wire import Page
 from service.datasets import datasets, simulated
@@ -116,7 +123,7 @@ def read_lineage(dataset_id: str, session: ReadSession) -> LineageOut:
 
 
 @router.head("/datasets/{dataset_id}/content", include_in_schema=False)
-@router.get("/datasets/{dataset_id}/content")
+@router.get("/datasets/{dataset_id}/content", response_class=McapResponse, responses=FILE_ANSWERS)
 def read_content(
     dataset_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
@@ -131,13 +138,13 @@ def allow_cross_origin(dataset_id: str) -> Response:
     return preflight_response()
 
 
-@router.get("/datasets/{dataset_id}/content.csv", response_class=StreamingResponse)
-def read_content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> StreamingResponse:
+@router.get("/datasets/{dataset_id}/content.csv", response_class=CsvResponse)
+def read_content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> CsvResponse:
     """Download the recording as CSV."""
     row = DatasetRepository(session).get(dataset_id)
     rows: Iterator[str] = generate_csv(load_recording(parts.store, row.sha256))
     headers = {**CROSS_ORIGIN, "Content-Disposition": f'attachment; filename="{row.id}.csv"'}
-    return StreamingResponse(rows, media_type="text/csv; charset=utf-8", headers=headers)
+    return CsvResponse(rows, headers=headers)
 
 
 def _dataset_response(

@@ -59,23 +59,20 @@ class EventFeed:
         self._poller: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
 
-    def check_room(self) -> None:
-        """Check that one more stream may be opened.
+    @asynccontextmanager
+    async def watch_job(self, job_id: str) -> AsyncIterator[None]:
+        """Look for news of a job during the block.
 
         Raises
         ------
         ServiceBusy
-            If there are as many as this process allows.
+            If there are as many streams as this process allows.
         """
         if self._streams.total() >= self._max_streams:
             raise ServiceBusy(
                 f"{self._max_streams} event streams are open; at most so many are allowed "
                 "(LAGID_MAX_STREAMS). Ask for the job instead, or try again."
             )
-
-    @asynccontextmanager
-    async def watch_job(self, job_id: str) -> AsyncIterator[None]:
-        """Look for news of a job during the block."""
         self._streams[job_id] += 1
         try:
             yield

@@ -2,10 +2,12 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
 from typing import Annotated
 
 from fastapi import APIRouter, Header
 from fastapi.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from service.api.dependencies import Parts, PartsDep
 from service.api.event_feed import EventBatch
@@ -19,7 +21,31 @@ KEEP_ALIVE_S = 15.0
 NO_BUFFER = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 
 
-@router.get("/{job_id}/events", response_class=StreamingResponse)
+class EventStreamResponse(StreamingResponse):
+    """Events of a job, as they happen.
+
+    Its place among the streams is taken before its head is sent, and held to its end. So streams
+    that are opened at once cannot pass the limit together.
+    """
+
+    media_type = "text/event-stream"
+
+    def __init__(
+        self,
+        events: AsyncIterator[str],
+        watching: AbstractAsyncContextManager[None],
+        status_code: int = 200,  # FastAPI looks for it
+    ) -> None:
+        super().__init__(events, status_code, NO_BUFFER)
+        self._watching = watching
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the events."""
+        async with self._watching:
+            await super().__call__(scope, receive, send)
+
+
+@router.get("/{job_id}/events", response_class=EventStreamResponse)
 async def stream_events(
     job_id: str, parts: PartsDep, last_event_id: Annotated[str | None, Header()] = None
 ) -> Response:
@@ -28,24 +54,20 @@ async def stream_events(
     batch = await parts.feed.read_after(job_id, last)
     if batch.is_over and not batch.text:
         return Response(status_code=204)  # an EventSource then does not reconnect
-    parts.feed.check_room()
-    stream = _stream_events(parts, job_id, last)
-    return StreamingResponse(stream, media_type="text/event-stream", headers=NO_BUFFER)
+    return EventStreamResponse(_stream_events(parts, job_id, last), parts.feed.watch_job(job_id))
 
 
 async def _stream_events(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
-    feed = parts.feed
-    async with feed.watch_job(job_id):
-        yield "retry: 1000\n\n"
-        while not parts.stopping.is_set():
-            batch = await _read_if_possible(parts, job_id, last)
-            last = batch.last
-            if batch.text:
-                yield batch.text
-            if batch.is_over and not batch.is_full:
-                return
-            if not batch.is_full and not await feed.wait_for_news(job_id, last, KEEP_ALIVE_S):
-                yield ": still here\n\n"
+    yield "retry: 1000\n\n"
+    while not parts.stopping.is_set():
+        batch = await _read_if_possible(parts, job_id, last)
+        last = batch.last
+        if batch.text:
+            yield batch.text
+        if batch.is_over and not batch.is_full:
+            return
+        if not batch.is_full and not await parts.feed.wait_for_news(job_id, last, KEEP_ALIVE_S):
+            yield ": still here\n\n"
 
 
 async def _read_if_possible(parts: Parts, job_id: str, last: int) -> EventBatch:

@@ -3,9 +3,9 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response, status
-from fastapi.responses import StreamingResponse
 
 from service.api.bodies import JsonRoute
+from service.api.content import CsvResponse
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.core.states import JobState
 from service.core.wire import Page
@@ -86,12 +86,12 @@ def clone_job(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     return _set_location(submit.clone_job(parts.database, job_id, parts.settings), response)
 
 
-@router.get("/{job_id}/runs.csv", response_class=StreamingResponse)
-def export_runs_csv(job_id: str, parts: PartsDep) -> StreamingResponse:
+@router.get("/{job_id}/runs.csv", response_class=CsvResponse)
+def export_runs_csv(job_id: str, parts: PartsDep) -> CsvResponse:
     """Export all runs of a job as CSV: a row per run, with cell, estimates and standard errors."""
     disposition = {"Content-Disposition": f'attachment; filename="{job_id}.csv"'}
     rows = table.stream_table(parts.database, job_id)
-    return StreamingResponse(rows, media_type="text/csv", headers=disposition)
+    return CsvResponse(rows, headers=disposition)
 
 
 @router.get("/{job_id}/runs")

@@ -5,7 +5,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from service.api.bodies import check_shape
+from service.api.bodies import check_counts, check_shape
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
 from service.core.documents import MAX_DOCUMENT_BYTES, parse_json, parse_yaml
 from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
@@ -75,6 +75,7 @@ async def _read_document(request: Request) -> Any:
         text += piece
         if len(text) > MAX_DOCUMENT_BYTES:
             raise TooLarge(f"the document has more than {MAX_DOCUMENT_BYTES} bytes")
+    await run_in_threadpool(check_counts, bytes(text))
     parse = parse_yaml if kind in YAML_TYPES else parse_json
     document = await run_in_threadpool(parse, bytes(text))
     await run_in_threadpool(check_shape, document)

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from service.api.bodies import JsonRoute
-from service.api.content import ByteRange, content_response
+from service.api.content import FILE_ANSWERS, ByteRange, McapResponse, content_response
 from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
@@ -105,7 +105,7 @@ def profile_run(
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)
-@router.get("/{run_id}/signals.mcap")
+@router.get("/{run_id}/signals.mcap", response_class=McapResponse, responses=FILE_ANSWERS)
 def read_run_signals(
     run_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:

@@ -19,7 +19,7 @@ from service.core.errors import Unavailable
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
-from sysid.core.child_processes import build_child_command, build_import_path
+from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.data.records import Recording
 
 FileKind = Literal["csv", "mcap"]
@@ -86,33 +86,22 @@ def read_untrusted(
 
 def _run_child(
     task: dict[str, Any], limits: UploadLimits, folder: str
-) -> "subprocess.CompletedProcess[str]":
-    # The child gets no secret of this process's environment.
-    environment = {
-        "PATH": os.environ.get("PATH", ""),
-        "PYTHONPATH": build_import_path(),
-        "OPENBLAS_NUM_THREADS": "1",  # its threads' stacks would count as memory
-        "PYTHONUTF8": "1",
-    }
+) -> "subprocess.CompletedProcess[bytes]":
     try:
-        return subprocess.run(
-            build_child_command("service.formats.sandbox_child"),
-            cwd=folder,
-            input=json.dumps(task),
-            capture_output=True,
-            text=True,
-            timeout=limits.seconds,
-            env=environment,
-            check=False,
+        return run_child(
+            "service.formats.sandbox_child",
+            json.dumps(task).encode(),
+            seconds=limits.seconds,
+            folder=folder,
         )
     except subprocess.TimeoutExpired:
         raise _build_timeout_error(limits) from None
 
 
 def _parse_answer(
-    child: "subprocess.CompletedProcess[str]", limits: UploadLimits
+    child: "subprocess.CompletedProcess[bytes]", limits: UploadLimits
 ) -> tuple[str, ...]:
-    if child.returncode == -24:  # SIGXCPU: the child reached its limit of processor time
+    if child.returncode == OUT_OF_PROCESSOR_TIME:
         raise _build_timeout_error(limits)
     try:
         answer = json.loads(child.stdout)
@@ -122,7 +111,8 @@ def _parse_answer(
             raise Unavailable(temporary_files.FULL_DISK_MESSAGE)
         return tuple(answer["notes"])
     except (json.JSONDecodeError, KeyError, TypeError):
-        reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
+        errors = child.stderr.decode(errors="replace")
+        reason = (errors.strip().splitlines() or ["no message"])[-1]
         if "MemoryError" in reason or child.returncode == -9:
             raise InvalidUpload(
                 f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"

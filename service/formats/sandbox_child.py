@@ -1,9 +1,7 @@
 """The child process of `service.formats.sandbox`: one task on stdin, one answer on stdout."""
 
 import json
-import resource
 import sys
-from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
 from service.formats.limits import MIB, UploadLimits
 from service.formats.mcap import read_mcap_with_notes, write_recording
+from sysid.core.child_processes import limit_resources
 from sysid.data.records import Recording
 
 
@@ -24,7 +23,11 @@ def main() -> int:
     """
     task = json.load(sys.stdin)
     limits = UploadLimits(**task["limits"])
-    _limit_resources(limits)
+    limit_resources(
+        seconds=limits.seconds,
+        memory_bytes=limits.memory_bytes,
+        file_bytes=limits.total_bytes,
+    )
     try:
         answer: dict[str, Any] = {"notes": _convert_file(task, limits)}
     except InvalidUpload as error:
@@ -37,19 +40,6 @@ def main() -> int:
         answer = {"error": {"what": _describe_memory_limit(limits)}}
     sys.stdout.write(json.dumps(answer))
     return 0
-
-
-def _limit_resources(limits: UploadLimits) -> None:
-    seconds = ceil(limits.seconds)
-    for limit, value in (
-        (resource.RLIMIT_AS, limits.memory_bytes),
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_FSIZE, limits.total_bytes),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        _, hard = resource.getrlimit(limit)
-        allowed = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(limit, (allowed, allowed if limit != resource.RLIMIT_CPU else hard))
 
 
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:

@@ -5,12 +5,18 @@ such as a `numpy.py`, would then be run instead of the real one.
 """
 
 import os
+import subprocess
 import sys
+from math import ceil
 from pathlib import Path
 
 SAFE_FOLDER = "/"
 """Working folder of children: always there, and only the administrator writes to it."""
+OUT_OF_PROCESSOR_TIME = -24
+"""Exit code of a child that has reached its limit of processor time (SIGXCPU)."""
 _ROOT = str(Path(__file__).resolve().parents[2])
+# Variables that an interpreter may need to start. Children get no secret of this process.
+_INHERITED_VARIABLES = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")
 
 
 def build_child_command(module: str, *arguments: str) -> list[str]:
@@ -33,3 +39,49 @@ def build_import_path() -> str:
     if _ROOT not in kept:
         kept.append(_ROOT)
     return os.pathsep.join(dict.fromkeys(kept))
+
+
+def run_child(
+    module: str, task: bytes, *, seconds: float, folder: str = SAFE_FOLDER
+) -> "subprocess.CompletedProcess[bytes]":
+    """Run a module of this package on one task: its input, for at most `seconds` of wall time.
+
+    The module limits itself by `limit_resources`.
+
+    Raises
+    ------
+    subprocess.TimeoutExpired
+        If it takes longer.
+    """
+    inherited = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
+    return subprocess.run(
+        build_child_command(module),
+        cwd=folder,
+        input=task,
+        capture_output=True,
+        timeout=seconds,
+        env={
+            **inherited,
+            "PYTHONPATH": build_import_path(),
+            "OPENBLAS_NUM_THREADS": "1",  # its threads' stacks would count as memory
+            "PYTHONUTF8": "1",
+        },
+        check=False,
+    )
+
+
+def limit_resources(*, seconds: float, memory_bytes: int, file_bytes: int) -> None:
+    """Limit processor time, address space and files of this process, where the system can."""
+    if os.name != "posix":
+        return
+    import resource
+
+    for limit, value in (
+        (resource.RLIMIT_AS, memory_bytes),
+        (resource.RLIMIT_CPU, ceil(seconds)),
+        (resource.RLIMIT_FSIZE, file_bytes),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        _, hard = resource.getrlimit(limit)
+        allowed = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        resource.setrlimit(limit, (allowed, allowed if limit != resource.RLIMIT_CPU else hard))

@@ -16,9 +16,6 @@ IntArray: TypeAlias = NDArray[np.int64]
 WordArray: TypeAlias = NDArray[np.uint32]
 """Chromosomes: one unsigned word for each free parameter; `bits` bits of it are used."""
 
-Interval: TypeAlias = tuple[float, float]
-"""Lower and upper end."""
-
 RANK_TOLERANCE = 1e-7  # of the largest singular value: below, the differences are rounding
 
 

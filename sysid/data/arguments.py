@@ -1,7 +1,7 @@
 """Arguments of a derivation step; each fault is reported with its JSON pointer."""
 
+import sys
 from collections.abc import Mapping
-from math import isfinite
 from typing import Any, NoReturn, TypeVar
 
 from sysid.core.errors import InvalidSettings, join_pointer, suggest_name
@@ -54,7 +54,8 @@ class StepArguments:
         value = self._arguments.get(name, default)
         if value is None:
             self.fail(name, "is missing; need a number")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not abs(value) <= sys.float_info.max:
             self.fail(name, f"found {value!r}; need a finite number")
         return float(value)
 

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray, Interval
+from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
+from sysid.language.functions import Interval
 from sysid.models.parameters import Parameter
 from sysid.simulation.scaling import is_at_bounds
 

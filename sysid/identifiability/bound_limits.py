@@ -7,7 +7,7 @@ keep the sign that the bounds imply; a time constant, for example, stays positiv
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
-from sysid.core.types import Interval
+from sysid.language.functions import Interval
 from sysid.language.intervals import bound_expression
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, walk
 from sysid.models.delays import compute_longest_delay, list_past_values

@@ -22,11 +22,12 @@ from scipy.special import fdtrc
 
 from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import compute_truncated_svd
-from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray, Interval
+from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.minima import Fit, collect_minima, scan_parameters
 from sysid.identification.result import Minimum
 from sysid.kernels.reads import list_delayed_values
+from sysid.language.functions import Interval
 from sysid.models.delays import compute_longest_delay, list_past_values
 from sysid.models.model import EstimatedInitial
 from sysid.search.refine import RefinedCandidate, refine_candidates

@@ -1,4 +1,8 @@
-"""Building of kernels: compiled once on each machine, loaded once in each process."""
+"""Building of kernels: compiled once on each machine, loaded once in each process.
+
+A model that cannot be compiled is refused at once when a process meets it again: the runs of a
+sweep share their model.
+"""
 
 import hashlib
 from dataclasses import replace
@@ -6,25 +10,44 @@ from functools import cache
 from pathlib import Path
 
 from sysid.core.code_cache import digest_files, load_code, store_code
+from sysid.core.errors import InvalidModel
 from sysid.core.memo import cache_by_identity
-from sysid.kernels.kernel import KERNEL_NAME, emit_kernel
+from sysid.kernels.compilation import compile_kernel
+from sysid.kernels.kernel import KERNEL_NAME
 from sysid.kernels.layout import KernelVariant
-from sysid.kernels.machine_code import compile_bounded, describe_machine, load_object_code
+from sysid.kernels.machine_code import describe_machine, load_object_code
 from sysid.models.model import DerivedInitial, Model
 
 _kernel_addresses: dict[str, int] = {}
+_refused_kernels: dict[str, InvalidModel] = {}
 
 
 def get_kernel_address(model: Model, variant: KernelVariant) -> int:
-    """Return the address of a model's kernel, for `sysid.kernels.abi.call_kernel`."""
+    """Return the address of a model's kernel, for `sysid.kernels.calls.call_kernel`.
+
+    Raises
+    ------
+    InvalidModel
+        If compiling it needs more time or memory than one model may take.
+    """
     key = compute_kernel_key(model, variant)
     if key not in _kernel_addresses:
         code = load_code(key)
         if code is None:
-            code = compile_bounded(emit_kernel(model, variant))
+            code = _compile_once(key, model, variant)
             store_code(key, code)
         _kernel_addresses[key] = load_object_code(code, KERNEL_NAME)
     return _kernel_addresses[key]
+
+
+def _compile_once(key: str, model: Model, variant: KernelVariant) -> bytes:
+    if key in _refused_kernels:
+        raise InvalidModel(_refused_kernels[key].faults)
+    try:
+        return compile_kernel(model, variant)
+    except InvalidModel as error:
+        _refused_kernels[key] = error
+        raise
 
 
 @cache_by_identity  # hashing a model is slow, and many runs share one

@@ -1,21 +1,11 @@
-"""Compiling of LLVM assembly to object code, and loading of object code.
+"""Compiling of LLVM assembly to object code, and loading of object code."""
 
-LLVM's passes leave about 0.3 MB of each module in memory until the process ends. A service that
-receives new models for weeks would grow by it. So a process that has compiled many kernels uses
-subprocesses. Machine code itself is small.
-"""
-
-import logging
-import os
-import subprocess
-import sys
 from functools import cache
 from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
 
-from sysid.core.child_processes import SAFE_FOLDER, build_child_command, build_import_path
 from sysid.kernels.vectors import load_vector_functions
 
 _OPTIMIZATION_LEVEL = 3
@@ -69,44 +59,3 @@ def load_object_code(code: bytes, function: str) -> int:
     engine.finalize_object()
     _engines.append(engine)
     return int(engine.get_function_address(function))
-
-
-MAX_OWN_COMPILATIONS = 64
-"""Kernels that a process compiles itself, which saves half a second for each."""
-
-_TIMEOUT_SECONDS = 300.0
-# Variables that an interpreter may need to start.
-_INHERITED_VARIABLES = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")
-# One entry for each compilation: unlike += on a number, append is safe with threads.
-_own_compilations: list[None] = []
-_log = logging.getLogger(__name__)
-
-
-def compile_bounded(assembly: str) -> bytes:
-    """Compile assembly here or, after `MAX_OWN_COMPILATIONS` kernels, in another process."""
-    if len(_own_compilations) >= MAX_OWN_COMPILATIONS:
-        try:
-            return _compile_in_subprocess(assembly)
-        except (OSError, subprocess.SubprocessError) as error:
-            _log.warning(
-                "a kernel is compiled in this process, whose memory grows by it: %s", error
-            )
-    _own_compilations.append(None)
-    return compile_assembly(assembly)
-
-
-def _compile_in_subprocess(assembly: str) -> bytes:
-    inherited = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
-    return subprocess.run(
-        build_child_command("sysid.kernels.machine_code"),
-        input=assembly.encode(),
-        stdout=subprocess.PIPE,
-        timeout=_TIMEOUT_SECONDS,
-        env={**inherited, "PYTHONPATH": build_import_path()},
-        cwd=SAFE_FOLDER,
-        check=True,
-    ).stdout
-
-
-if __name__ == "__main__":
-    sys.stdout.buffer.write(compile_assembly(sys.stdin.buffer.read().decode()))

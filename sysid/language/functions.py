@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from math import atan, exp, inf, log, pi, sqrt, tan, tanh
+from typing import TypeAlias
 
-from sysid.core.types import Interval
+Interval: TypeAlias = tuple[float, float]
+"""Lower and upper end."""
 
 REAL_LINE: Interval = (-inf, inf)
 

@@ -7,8 +7,7 @@ are computed with ordinary rounding, so an exact end may be off by the last bit.
 from collections.abc import Mapping
 from math import inf, isnan
 
-from sysid.core.types import Interval
-from sysid.language.functions import FUNCTIONS, OPERATORS, REAL_LINE
+from sysid.language.functions import FUNCTIONS, OPERATORS, REAL_LINE, Interval
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 

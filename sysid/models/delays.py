@@ -6,9 +6,9 @@ A setting without effect is refused, since it is usually a mistake.
 from collections.abc import Mapping, Sequence
 
 from sysid.core.errors import Fault, InvalidSettings, RecordTooShort
-from sysid.core.types import Interval
 from sysid.core.units import format_unit
 from sysid.language.delays import collect_past_values
+from sysid.language.functions import Interval
 from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.tree import PastValue

@@ -13,6 +13,8 @@ import yaml
 from sysid.core.errors import Fault, InvalidModel, join_pointer, suggest_name
 
 MAX_DOCUMENT_CHARACTERS = 262_144
+MAX_EXPRESSION_CHARACTERS = 100_000
+"""Of all expressions of a model; reading them takes seconds."""
 _MAX_DEPTH, _MAX_NODES = 20, 20_000
 
 _BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
@@ -128,6 +130,7 @@ class DocumentReader:
 
     def __init__(self) -> None:
         self._faults: list[Fault] = []
+        self._expression_characters = 0
 
     def add_fault(self, place: str, detail: str, column: int | None = None) -> None:
         """Record a fault; `place` is its JSON pointer."""
@@ -246,7 +249,10 @@ class DocumentReader:
         return options[0]
 
     def read_expression(self, value: object, place: str) -> str:
-        """Read the text of an expression; a bare number is one, too."""
+        """Read the text of an expression; a bare number is one, too.
+
+        Beyond `MAX_EXPRESSION_CHARACTERS` of the whole document, texts count as 0.
+        """
         if isinstance(value, int | float) and not isinstance(value, bool):
             return repr(self.read_number(value, place))
         if not isinstance(value, str):
@@ -254,4 +260,14 @@ class DocumentReader:
                 place, f"{quote_value(value)} is not an expression; write a text such as 'a*x'"
             )
             return "0"
-        return value
+        before = self._expression_characters
+        self._expression_characters += len(value)
+        if self._expression_characters <= MAX_EXPRESSION_CHARACTERS:
+            return value
+        if before <= MAX_EXPRESSION_CHARACTERS:
+            self.add_fault(
+                place,
+                "from here on, the expressions of the model have more than "
+                f"{MAX_EXPRESSION_CHARACTERS} characters together; write fewer or shorter ones",
+            )
+        return "0"

@@ -1,6 +1,6 @@
 """Equations and outputs of a document: their trees, order of computation and memory."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from sysid.core.errors import join_pointer, suggest_name
@@ -8,10 +8,13 @@ from sysid.language.checker import CheckedExpression, check_expression
 from sysid.language.delays import collect_past_values
 from sysid.language.intervals import bound_expression
 from sysid.language.scope import Scope
-from sysid.language.tree import Expression, Number, PastValue
+from sysid.language.tree import Expression, Number, PastValue, walk
 from sysid.models.documents import DocumentReader
 from sysid.models.model import ModelSignal, Output
 from sysid.models.sections import MAX_EQUATIONS
+
+MAX_NODES = 10_000
+"""Numbers, names, operators and functions of a model; compiling takes milliseconds for each."""
 
 _ZERO = Number(0.0)
 
@@ -74,6 +77,17 @@ def read_outputs(
         texts.append(written.expression)
         outputs.append(Output(name, tree, written.unit or state_unit or "1"))
     return tuple(texts), tuple(outputs)
+
+
+def check_size(reader: DocumentReader, trees: Iterable[Expression], place: str) -> None:
+    """Add a fault if the trees of a model have more nodes together than are compiled."""
+    nodes = sum(1 for tree in trees for _ in walk(tree))
+    if nodes > MAX_NODES:
+        detail = (
+            f"the model has {nodes} numbers, names, operators and functions; at most {MAX_NODES} "
+            "are compiled. Write fewer or shorter expressions"
+        )
+        reader.add_fault(place, detail)
 
 
 def order_states(

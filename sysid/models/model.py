@@ -1,5 +1,6 @@
 """A checked model: equations as trees, parameters, initial states, solver, polynomial terms."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -24,9 +25,7 @@ class Term(NamedTuple):
         """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
         if not self.factors:
             return "1"
-        powers = {format_expression(factor).replace(" ", ""): 0 for factor in self.factors}
-        for factor in self.factors:
-            powers[format_expression(factor).replace(" ", "")] += 1
+        powers = Counter(format_expression(factor).replace(" ", "") for factor in self.factors)
         return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
 
     @property

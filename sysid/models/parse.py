@@ -86,6 +86,7 @@ def parse_model(document: object) -> Model:
         if form == "polynomial"
         else _read_equation_model(reader, fields)
     )
+    _check_size(reader, model)
     check_delay_units(reader, model)
     _check_bounds_rules(reader, model)
     reader.raise_faults()
@@ -102,6 +103,13 @@ def keep_terms(model: Model, labels: Sequence[str]) -> Model:
     listed = [label for label in labels if label != "1"]
     document = {**model.document, "terms": listed, "constant": "1" in labels}
     return parse_model(document)
+
+
+def _check_size(reader: DocumentReader, model: Model) -> None:
+    starts = (start.expression for start in model.initial if isinstance(start, DerivedInitial))
+    outputs = (output.expression for output in model.outputs)
+    place = "/terms" if model.form == "polynomial" else "/equations"
+    equations.check_size(reader, (*model.equations, *outputs, *starts), place)
 
 
 def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:

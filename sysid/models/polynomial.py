@@ -243,7 +243,7 @@ def _reject_present(reader: DocumentReader, value: PastValue, place: str) -> Pas
 def _read_listed_terms(
     reader: DocumentReader, written: Sequence[object], scope: Scope, where: str, most: int
 ) -> tuple[Term, ...]:
-    terms: list[Term] = []
+    terms: dict[str, Term] = {}
     if not written:
         reader.add_fault(where, "the list is empty; name at least one term, such as y(k-1)")
     if len(written) > most:
@@ -255,32 +255,34 @@ def _read_listed_terms(
         if checked.tree is None or reader.count_faults() > faults_before:
             continue
         factors = _split_factors(checked.tree)
+        term = Term(_sort_factors(factors or ()))
         if factors is None:
             detail = "a term is a product of past values, such as y(k-1)*u(k-1-dk)**2"
             reader.add_fault(place, detail)
-        elif Term(factors).label in {term.label for term in terms}:
-            reader.add_fault(place, f"{Term(factors).label} is listed twice")
+        elif (label := term.label) in terms:
+            reader.add_fault(place, f"{label} is listed twice")
         elif all(_reject_present(reader, value, place) for value in factors):
-            terms.append(Term(factors))
-    return tuple(terms)
+            terms[label] = term
+    return tuple(terms.values())
 
 
 def _split_factors(tree: Expression) -> tuple[PastValue, ...] | None:
-    """Split a product into its past values, states first; None if it is not such a product."""
+    """Split a product into its past values; None if it is not such a product."""
     match tree:
         case PastValue():
             return (tree,)
         case Binary("*", left, right):
             first, second = _split_factors(left), _split_factors(right)
-            if first is None or second is None:
-                return None
-            return tuple(
-                sorted(first + second, key=lambda v: (v.kind == "input", format_expression(v)))
-            )
+            return None if first is None or second is None else first + second
         case Binary("**", PastValue() as base, Number(power)) if power in range(1, _MAX_DEGREE + 1):
             return (base,) * int(power)
         case _:
             return None
+
+
+def _sort_factors(factors: Sequence[PastValue]) -> tuple[PastValue, ...]:
+    """Sort factors by their texts, states first."""
+    return tuple(sorted(factors, key=lambda v: (v.kind == "input", format_expression(v))))
 
 
 def _read_coefficients(

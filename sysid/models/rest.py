@@ -29,7 +29,8 @@ _ZERO, _ONE = Number(0.0), Number(1.0)
 _POINTS = 5  # inside the bounds, at which a coefficient must vanish to be zero
 _GOLDEN_SHARE = 0.6180339887498949
 _ROUNDING = 1e-10  # of the parts of a difference
-_MAX_NODES = 20_000  # of a solution
+_MAX_NODES = 100_000
+"""Nodes of all expressions that are made on the way; substitution can square their lengths."""
 
 
 class NoRestError(Exception):
@@ -113,6 +114,7 @@ class _RestSolver:
         self, names: tuple[str, ...], intervals: Mapping[str, tuple[float, float]]
     ) -> None:
         self._names = names
+        self._nodes = 0
         self._points = [
             {
                 name: lower + (upper - lower) * ((i + 1) * _GOLDEN_SHARE + 0.37 * point) % 1.0
@@ -128,13 +130,33 @@ class _RestSolver:
             row, name, value = single
             del rows[row]
             solved[name] = value
-            rows = {other: _substitute_states(tree, {name: value}) for other, tree in rows.items()}
+            rows = {other: self._substitute(tree, {name: value}) for other, tree in rows.items()}
         rest = self._eliminate({row: self._expand(tree) for row, tree in rows.items()})
-        solved = {name: _substitute_states(tree, rest) for name, tree in solved.items()} | rest
-        for name, tree in solved.items():
-            if sum(1 for _ in walk(tree)) > _MAX_NODES:
-                raise NoRestError(f"the expression for {name} is too long")
-        return solved
+        return {name: self._substitute(tree, rest) for name, tree in solved.items()} | rest
+
+    def _substitute(self, tree: Expression, values: Mapping[str, Expression]) -> Expression:
+        """Replace states by their values."""
+
+        def find_value(node: Expression) -> Expression | None:
+            is_state = isinstance(node, PastValue) and node.kind == "state"
+            return values.get(node.name) if is_state else None  # type: ignore[union-attr]
+
+        inserted = (value for node in walk(tree) if (value := find_value(node)) is not None)
+        self._count(tree, *inserted)
+        return _fold(substitute(tree, find_value))
+
+    def _count(self, *trees: Expression) -> None:
+        """Count the nodes of trees that become part of another one.
+
+        Raises
+        ------
+        NoRestError
+            If there are too many by now.
+        """
+        for tree in trees:
+            self._nodes += _count_nodes(tree)
+            if self._nodes > _MAX_NODES:
+                raise NoRestError("the expressions that solve for it are too long")
 
     def _find_single(self, rows: Mapping[str, Expression]) -> tuple[str, str, Expression] | None:
         """Find a row that determines one state: the row, the state and its value."""
@@ -234,6 +256,7 @@ class _RestSolver:
         """Add two expressions; the sum is zero if it vanishes at all points."""
         if _ZERO in (first, second):
             return second if first == _ZERO else first
+        self._count(first, second)
         total = _fold(Binary("+", first, second))
         return _ZERO if all(self._cancel(first, second, point) for point in self._points) else total
 
@@ -255,14 +278,6 @@ def _evaluate(tree: Expression, point: Mapping[str, float]) -> float:
                 return None
 
     return evaluate_expression(substitute(tree, number), point)
-
-
-def _substitute_states(tree: Expression, values: Mapping[str, Expression]) -> Expression:
-    def find(node: Expression) -> Expression | None:
-        is_state = isinstance(node, PastValue) and node.kind == "state"
-        return values.get(node.name) if is_state else None  # type: ignore[union-attr]
-
-    return _fold(substitute(tree, find))
 
 
 def _fold(tree: Expression) -> Expression:

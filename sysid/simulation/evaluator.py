@@ -11,7 +11,8 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray
-from sysid.kernels.abi import NARROW_LANES, call_kernel
+from sysid.kernels.abi import NARROW_LANES
+from sysid.kernels.calls import call_kernel
 from sysid.kernels.layout import HEAD_FIELDS
 
 

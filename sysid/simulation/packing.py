@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.core.types import FloatArray, IntArray, Interval
+from sysid.core.types import FloatArray, IntArray
 from sysid.data.interpolation import FineInput, interpolate_input
 from sysid.data.records import Channel
 from sysid.kernels.abi import LANES
@@ -19,6 +19,7 @@ from sysid.kernels.reads import (
     list_delayed_values,
     list_stored_histories,
 )
+from sysid.language.functions import Interval
 from sysid.language.intervals import bound_expression
 from sysid.models.delays import check_record_length
 from sysid.models.model import Model

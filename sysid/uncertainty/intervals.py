@@ -6,9 +6,10 @@ from math import log, sqrt
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray, Interval
+from sysid.core.types import BoolArray, FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 from sysid.language.evaluation import evaluate_expression
+from sysid.language.functions import Interval
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem

@@ -11,9 +11,11 @@ import pytest
 from service.core.states import JobState
 from service.formats.sandbox import read_untrusted
 from sysid.core.child_processes import build_child_command, build_import_path
-from sysid.kernels.machine_code import _compile_in_subprocess
+from sysid.kernels.compilation import compile_kernel
+from sysid.kernels.layout import KernelVariant
 from tests.commands import check_refusal, run_lagid
 from tests.foreign_modules import ForeignFolder
+from tests.models import duffing
 from tests.repository import ROOT
 from tests.standing import Service
 from workers.ray_folders import get_inner_folder
@@ -39,7 +41,7 @@ def test_the_reader_of_uploads_and_the_compiler_run_no_module_of_the_working_fol
     with chdir(foreign.path):
         monkeypatch.setattr(sys, "path", ["", str(foreign.path), ".", *sys.path])
         assert read_untrusted(file, "csv").recording.channels[0].values.tolist() == [1.0, 2.0]
-        assert _compile_in_subprocess("define double @f() {\n ret double 0.0\n}\n")
+        assert compile_kernel(duffing(), KernelVariant())
     assert foreign.list_imported() == []
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import collect, real_data
+from benchmarks import collect, dependencies, night, real_data
 from benchmarks.real_data import all as every
 from benchmarks.table import Row, Skipped, parser, report
 
@@ -58,3 +58,46 @@ def test_every_program_on_measured_records_is_part_of_all_of_them() -> None:
     programs = [import_module(f"{real_data.__name__}.{one.stem}") for one in folder.glob("*.py")]
     own = {one.measure for one in programs if hasattr(one, "measure")} - {every.measure}
     assert own == set(every.PROGRAMS.values())
+
+
+def test_the_night_says_what_a_program_could_not_measure(tmp_path):
+    file = tmp_path / "one.json"
+    ended(
+        [HOLDS], [Skipped("known vulnerabilities", "not reached: no answer")], "--json", str(file)
+    )
+    summary, misses = night.summarize(night.Part(["--json", str(file)]), tmp_path / "one.log")
+    assert misses == 0
+    assert summary == ("1 of 1 bars hold. Skipped: known vulnerabilities (not reached: no answer)")
+
+
+@pytest.mark.parametrize(
+    ("output", "errors", "expected"),
+    [
+        ('{"dependencies": [{"name": "a", "version": "1", "vulns": []}]}', "", []),
+        (
+            '{"dependencies": [{"name": "a", "version": "1", "vulns": [{"id": "X-1"}]}]}',
+            "",
+            ["a 1: X-1"],
+        ),
+        ("", "python: No module named pip_audit", "not reached: pip install -r "),
+        ("", "WARNING: x\nConnectionError: no route", "not reached: ConnectionError: no route"),
+        ("", "", "not reached: no answer"),
+    ],
+)
+def test_an_audit_lists_vulnerabilities_or_says_that_it_reached_nobody(output, errors, expected):
+    found = dependencies.read_audit(output, errors)
+    is_text = isinstance(expected, str)
+    assert found.startswith(expected) if is_text else found == expected
+
+
+def test_libraries_have_permissive_licences():
+    names = dependencies.list_locked()
+    assert {"numpy", "ray", "psycopg"} <= set(names)
+    assert dependencies.find_licence_faults(names)[0] == []
+
+
+def test_a_licence_that_is_not_permissive_is_named(monkeypatch):
+    monkeypatch.setattr(dependencies, "LINKED_FREELY", ())
+    faults, absent = dependencies.find_licence_faults(["psycopg", "no-such-package"])
+    assert faults == ["psycopg: LGPL-3.0-only"]
+    assert absent == ["no-such-package"]

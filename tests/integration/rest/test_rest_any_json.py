@@ -32,6 +32,13 @@ AXES = [
     {"path": "/seed", "range": [0, 3]},
     {"path": "/datasets", "values": [["steps"], ["x"]], "labels": [{"n": 1}, {"n": 2}]},
 ]
+STEPS = [
+    {"trim": {"start": 1, "stop": 20}},
+    {"clip": {"channels": ["y"], "lower": -1, "upper": 3}},
+    {"noise": {"sigma": 0.1, "channels": ["y"], "seed": 1}},
+    {"resample": {"sample_time": 0.2}},
+    {"select": {"segments": [0, 1]}},
+]
 BODIES: list[tuple[str, dict[str, Any]]] = [
     (
         "/v1/jobs",
@@ -67,6 +74,7 @@ BODIES: list[tuple[str, dict[str, Any]]] = [
         },
     ),
     ("/v1/models:check", OWN),
+    ("/v1/datasets/{dataset}:derive", {"steps": STEPS}),
     ("/v1/datasets:simulate", {"model": "fopdt", **TRUTH}),
 ]
 NAMES = [
@@ -132,7 +140,9 @@ def test_any_value_anywhere_is_taken_or_refused_with_a_sentence(
         known = [*places(made), ("another",)]
         made = changed(made, data.draw(st.sampled_from(known)), data.draw(VALUES))
     answer = server.post(
-        path, content=json.dumps(made), headers={"content-type": "application/json"}
+        path.format(dataset=dataset),
+        content=json.dumps(made),
+        headers={"content-type": "application/json"},
     )
     assert answer.status_code < 500, answer.text
     if answer.is_error:

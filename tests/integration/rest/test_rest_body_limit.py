@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 from service.api import bodies
 from service.api.app import create_app
 from service.api.middleware import BodyLimit
-from service.core.errors import TooLarge
+from service.core.errors import InvalidRequest, TooLarge
 from service.core.settings import Settings
 from tests.rest import CSV, awaited, recording, refused, settings_of
 
@@ -170,3 +170,32 @@ def test_long_bodies_are_read_outside_the_event_loop(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(bodies, "_read_body", read)
     loop = awaited(play)
     assert [thread == loop for thread in threads] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("document", "told"),
+    [
+        ({"model": [{}] * 100_000}, "100002 lists and objects with 1 fields"),
+        ({"model": [{f"k{n}": n for n in range(9000)}] * 23}, "25 lists and objects with 207001 "),
+    ],
+)
+def test_objects_and_fields_are_counted_before_anything_is_made_of_them(
+    own: TestClient, monkeypatch: pytest.MonkeyPatch, document: Any, told: str
+) -> None:
+    monkeypatch.setattr(bodies, "check_shape", None)  # what would follow
+    content = json.dumps(document, separators=(",", ":")).encode()
+    for path in ("/v1/jobs", "/v1/models"):
+        [fault] = refused(own.post(path, content=content, headers=JSON), 422, "invalid")
+        assert told in fault["detail"]
+
+
+def test_brackets_and_colons_inside_texts_do_not_count() -> None:
+    text = "[{:" * bodies.MAX_CONTAINERS + '\\"[{'
+    bodies.check_counts(json.dumps({text: [text, 1]}).encode())
+
+
+def test_quotes_without_an_end_are_counted_at_once() -> None:
+    """Each quote would else search to the end of the body: hours for a body of 4 MB."""
+    torn = b"[{" * bodies.MAX_CONTAINERS + b'"' + b'\\"' * 300_000
+    with pytest.raises(InvalidRequest):
+        bodies.check_counts(torn)

@@ -52,6 +52,27 @@ async def open_streams(
     yield tasks
 
 
+def test_streams_that_are_opened_at_once_do_not_pass_the_limit_together(
+    served: tuple[httpx.Client, str, Database],
+) -> None:
+    plain, job, _ = served
+
+    async def play() -> list[int]:
+        limits = httpx.Limits(max_connections=2 * STREAMS)
+        async with httpx.AsyncClient(base_url=plain.base_url, timeout=60, limits=limits) as client:
+            opened: asyncio.Queue[int] = asyncio.Queue()
+            path = f"/v1/jobs/{job}/events"
+            tasks = [
+                asyncio.create_task(read_stream(client, path, opened)) for _ in range(2 * STREAMS)
+            ]
+            statuses = [await opened.get() for _ in tasks]
+            await client.post(f"/v1/jobs/{job}:cancel")
+            await asyncio.gather(*tasks)
+            return statuses
+
+    assert sorted(awaited(play)) == [200] * STREAMS + [503] * STREAMS
+
+
 def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
     served: tuple[httpx.Client, str, Database],
 ) -> None:

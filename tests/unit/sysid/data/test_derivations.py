@@ -357,3 +357,10 @@ def test_a_bad_condition_is_told_with_its_pointer(condition: dict[str, Any], poi
     with pytest.raises(InvalidSettings) as caught:
         derive_recording(repeats(), [{"select": condition}])
     assert caught.value.pointer == pointer
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**400), float("inf"), float("nan"), True])
+def test_a_number_is_finite(number: float) -> None:
+    with pytest.raises(InvalidSettings, match="need a finite number") as caught:
+        derive_recording(recording(), [{"trim": {"start": 0, "stop": number}}])
+    assert caught.value.pointer == "/steps/0/trim/stop"

@@ -6,7 +6,8 @@ import pytest
 
 from sysid.core.errors import InvalidModel
 from sysid.language.tree import PastValue
-from sysid.models.documents import parse_yaml
+from sysid.models.documents import MAX_EXPRESSION_CHARACTERS, parse_yaml
+from sysid.models.equations import MAX_NODES
 from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, ModelSignal, Solver
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.parse import parse_model
@@ -312,3 +313,43 @@ def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
 def test_a_tab_that_indents_is_called_that() -> None:
     with pytest.raises(InvalidModel, match=r"line 2, column 1: .* indent with spaces, not tabs"):
         parse_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")
+
+
+@pytest.mark.parametrize("part", ["equations", "outputs", "initial"])
+def test_all_expressions_of_a_model_count_together(part: str) -> None:
+    """Each is within the limits of one expression, but all are compiled into one kernel."""
+    states = [f"x{n}" for n in range(1 + MAX_NODES // 2000)]
+    document: dict[str, Any] = {
+        "name": "wide",
+        "form": "differential",
+        "states": dict.fromkeys(states, "m"),
+        "parameters": {"c": {"lower": 0, "upper": 1}},
+        "equations": dict.fromkeys(states, "c"),
+        "outputs": dict.fromkeys([f"y{n}" for n in range(len(states))], "c"),
+        "initial": dict.fromkeys(states, "c"),
+    }
+    parse_model(document)
+    told = faults(document, **{part: dict.fromkeys(document[part], "+".join(["c"] * 1000))})
+    assert list(told) == ["/equations"]
+    assert f"at most {MAX_NODES} are compiled" in told["/equations"]
+
+
+def test_the_terms_of_a_polynomial_count_too() -> None:
+    terms = [f"y(k-{n})**9*y(k-{n + 1})**9*y(k-{n + 2})**9" for n in range(1, 250)]
+    fields = {"form": "polynomial", "output": "y", "terms": terms}
+    told = faults({"name": "many", **fields, "coefficients": {"lower": -1, "upper": 1}})
+    assert list(told) == ["/terms"]
+    assert "are compiled" in told["/terms"]
+
+
+def test_the_texts_of_all_expressions_are_bounded_before_they_are_parsed() -> None:
+    texts = {f"x{n}": "c" + " " * 3000 for n in range(60)}
+    told = faults(
+        {"name": "long", "form": "differential", "states": dict.fromkeys(texts, "m")},
+        parameters={"c": {"lower": 0, "upper": 1}},
+        equations=texts,
+        outputs={"y": "x0"},
+    )
+    assert list(told) == [f"/equations/x{MAX_EXPRESSION_CHARACTERS // 3001}"]
+    (detail,) = told.values()
+    assert f"more than {MAX_EXPRESSION_CHARACTERS} characters together" in detail

@@ -16,7 +16,7 @@ from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from tests import reference
-from tests.models import ARX
+from tests.models import ARX, differential
 
 TIMES = 0.1 * np.arange(120)
 NAMES = ("K", "T", "L", "a", "b", "g")
@@ -202,3 +202,12 @@ def test_a_start_takes_part_in_the_scaling_of_hidden_states() -> None:
     assert isinstance(steady.initial[0], DerivedInitial)
     fixed = parse_model({**written, "initial": {"w": 1, "x": 1}})
     assert [find_scalings(m, m.parameters).shape[0] for m in (steady, fixed)] == [1, 0]
+
+
+def test_a_rest_whose_expressions_grow_without_end_is_refused() -> None:
+    """Each state is the square of the one before: 2⁶³ factors in the last."""
+    squares = {f"x{n}": f"x{n - 1}*x{n - 1} - x{n}" for n in range(1, 64)}
+    with pytest.raises(InvalidModel, match="the expressions that solve for it are too long"):
+        differential(
+            {"x0": "c - x0", **squares}, "x0", initial=dict.fromkeys(["x0", *squares], "steady")
+        )

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from sysid.core.types import Interval
+from sysid.language.functions import Interval
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.intervals import mark_poor_intervals
 from tests.searching import example

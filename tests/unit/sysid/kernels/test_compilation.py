@@ -1,0 +1,88 @@
+"""Kernels are compiled in a child with limits: the same code, and a clear error beyond them."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from sysid.core.errors import InvalidModel
+from sysid.kernels import build, compilation
+from sysid.kernels.compilation import compile_kernel
+from sysid.kernels.compile_task import CompileTask, decode_task, encode_task
+from sysid.kernels.kernel import emit_kernel
+from sysid.kernels.layout import KernelVariant
+from sysid.kernels.machine_code import compile_assembly
+from sysid.models.catalogue.load import catalogue, load_model
+from sysid.models.model import Model
+from tests.models import differential, duffing
+
+VARIANT = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
+
+
+def long_model() -> Model:
+    """A model that takes seconds to compile."""
+    terms = "+".join(f"tanh(y)*exp(-y*b)*sin({n}*b)" for n in range(90))
+    bounds = {"b": {"lower": 0, "upper": 1}}
+    return differential({"y": terms}, "y", parameters=bounds)
+
+
+@pytest.fixture
+def foreign_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "llvmlite.py").write_text("raise SystemExit(3)")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+
+
+@pytest.mark.usefixtures("foreign_working_folder")
+def test_the_child_compiles_the_same_code_and_imports_nothing_of_the_working_folder() -> None:
+    assert compile_kernel(duffing(), VARIANT) == compile_assembly(emit_kernel(duffing(), VARIANT))
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_the_task_of_the_child_has_all_that_a_kernel_depends_on(name: str) -> None:
+    model = load_model(name)
+    task = decode_task(encode_task(CompileTask(model, VARIANT, 1.5, 7)))
+    assert (task.variant, task.seconds, task.memory_bytes) == (VARIANT, 1.5, 7)
+    assert emit_kernel(task.model, task.variant) == emit_kernel(model, VARIANT)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "told"),
+    [
+        ("PROCESSOR_SECONDS", 1.0, "more than 1 s of processor time"),
+        ("MEMORY_BYTES", 200 * 1024**2, "more than 200 MiB of memory"),
+        ("_WALL_SECONDS", 0.3, "more than 0.3 s;"),
+    ],
+)
+def test_a_model_beyond_a_limit_is_refused_with_the_limit(
+    monkeypatch: pytest.MonkeyPatch, limit: str, value: float, told: str
+) -> None:
+    monkeypatch.setattr(compilation, limit, value)
+    with pytest.raises(InvalidModel) as refused:
+        compile_kernel(long_model(), VARIANT)
+    (fault,) = refused.value.faults
+    assert fault.pointer == "/equations"
+    assert told in fault.detail
+
+
+def test_what_was_refused_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Model] = []
+
+    def refuse(model: Model, variant: KernelVariant) -> bytes:
+        calls.append(model)
+        raise compilation._build_error("1 s")
+
+    monkeypatch.setattr(build, "_refused_kernels", {})
+    monkeypatch.setattr(build, "load_code", lambda key: None)
+    monkeypatch.setattr(build, "_kernel_addresses", {})
+    monkeypatch.setattr(build, "compile_kernel", refuse)
+    for _ in range(2):
+        with pytest.raises(InvalidModel, match="needs more than 1 s"):
+            build.get_kernel_address(duffing(), VARIANT)
+    assert len(calls) == 1
+
+
+def test_an_error_of_the_child_is_no_fault_of_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "encode_task", lambda task: b"no task")
+    with pytest.raises(RuntimeError, match="JSONDecodeError"):
+        compile_kernel(duffing(), VARIANT)
