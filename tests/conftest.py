@@ -21,6 +21,7 @@ pytest_plugins = [
     "tests.profiles",
     "tests.database",
     "tests.cluster",
+    "tests.compiling",
     "tests.needs",
     "tests.standing",
 ]
