@@ -97,7 +97,16 @@ def guard_session(pytest: int, session: str) -> None:
             os.write(1, b"\n")
     end_processes(session, spared=pytest)
     for folder in folders:
+        unmount_below(folder)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def unmount_below(folder: str) -> None:
+    """Unmount what a test has mounted in a folder, such as a small disk."""
+    for line in Path("/proc/mounts").read_text().splitlines():
+        place = line.split()[1]
+        if place.startswith(f"{folder}/"):
+            subprocess.run(["umount", "-l", place], check=False, capture_output=True)
 
 
 def read_until_death(pytest: int) -> Iterator[str]:

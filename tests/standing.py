@@ -4,6 +4,7 @@ Web process, dispatcher and Ray stand from the first test that asks for them to 
 session. Each test leaves the service at work.
 """
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -109,7 +110,8 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         "LAGID_WORKER_MEMORY_MB": "512",
     }
     foreign = ForeignFolder(folder)
-    with small_disk(folder / "disk", DISK_MEGABYTES) as disk:
+    # In the folder of the session, whose guard unmounts it if pytest is killed.
+    with small_disk(Path(tempfile.mkdtemp()), DISK_MEGABYTES) as disk:
         stand = Stand(
             (disk or folder) / "data",
             cpus=1,  # each fault starts a worker for each core, for seconds of computing

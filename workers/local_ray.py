@@ -16,7 +16,15 @@ from typing import Any
 from sysid.core.child_processes import build_import_path
 from workers.cluster_address import explain_failure
 from workers.errors import ClusterUnavailable
-from workers.ray_folders import clear_dead_dispatchers, get_inner_folder, get_ray_folder
+from workers.ray_folders import (
+    clear_dead_dispatchers,
+    find_folder_processes,
+    get_inner_folder,
+    get_ray_folder,
+    kill_processes,
+)
+
+_log = logging.getLogger(__name__)
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; Ray's default is 30 % of the memory."""
@@ -79,7 +87,7 @@ class LocalRay:
         if meanwhile is not None:
             meanwhile()
         try:
-            _start_ray(ray, cpus, self.folder)
+            _start_patiently(ray, cpus, self.folder)
         except INIT_ERRORS as error:
             self.remove_folder()
             raise ClusterUnavailable(explain_failure(None, error)) from error
@@ -115,7 +123,37 @@ def make_folder() -> Path:
     return folder
 
 
+def _start_patiently(ray: Any, cpus: int | None, folder: Path) -> None:
+    """Start Ray; once more after a timeout.
+
+    Ray gives up after 30 s, which may be too short on a busy machine, and has no setting for it.
+    The second time its programs and libraries are in memory.
+    """
+    try:
+        _start_ray(ray, cpus, folder)
+    except TimeoutError as error:
+        _log.warning("Ray has not started in time, and is started again: %s", error)
+        kill_processes(find_folder_processes(os.getpid()))
+        _start_ray(ray, cpus, folder)
+
+
 def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:
+    """Start Ray.
+
+    Raises
+    ------
+    TimeoutError
+        If it does not start within its limit. Ray raises a plain `Exception` then.
+    """
+    try:
+        _init_ray(ray, cpus, folder)
+    except Exception as error:
+        if type(error) is not Exception:
+            raise
+        raise TimeoutError(str(error)) from error
+
+
+def _init_ray(ray: Any, cpus: int | None, folder: Path) -> None:
     # Ray's workers import from the working folder first, so it is one without anybody's modules.
     with _skip_unused_programs(), chdir(folder):
         ray.init(

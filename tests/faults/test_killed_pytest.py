@@ -15,14 +15,17 @@ from tests.repository import ROOT
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.postgres, pytest.mark.timeout(300)]
 
 TESTS = """
-import os, subprocess, sys, time
+import os, subprocess, sys, tempfile, time
 from pathlib import Path
+from benchmarks.breaking.disks import small_disk
 from tests.database import postgres_url
 from tests.guard import SESSION_VARIABLE
 from workers.local_ray import LocalRay
 
 def test_waits(tmp_path):
     postgres_url()
+    disk = small_disk(Path(tempfile.mkdtemp()), 1)
+    disk.__enter__()  # where it can be mounted; the guard unmounts it
     ray = LocalRay(1).module
     ray.get(ray.remote(lambda: 1).remote())
     sleeping = [sys.executable, "-c", "import time; time.sleep(600)"]

@@ -1,0 +1,47 @@
+"""A start of Ray that a busy machine delays is tried once more; any other failure is told."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from workers import local_ray
+
+
+class UnwillingRay:
+    """Raises these errors when it is started, one after the other; then it starts."""
+
+    def __init__(self, *errors: Exception) -> None:
+        self.starts, self._errors = 0, list(errors)
+
+    def init(self, **settings: Any) -> SimpleNamespace:
+        self.starts += 1
+        if self._errors:
+            raise self._errors.pop(0)
+        return SimpleNamespace(**settings)
+
+
+def start(ray: UnwillingRay, folder: Path) -> None:
+    local_ray._start_patiently(ray, 1, folder)
+
+
+def test_a_start_that_took_too_long_is_tried_once_more(tmp_path: Path) -> None:
+    ray = UnwillingRay(Exception("The current node timed out during startup."))
+    start(ray, tmp_path)
+    assert ray.starts == 2
+
+
+def test_a_start_that_takes_too_long_twice_fails(tmp_path: Path) -> None:
+    late = Exception("The current node timed out during startup.")
+    ray = UnwillingRay(late, late)
+    with pytest.raises(local_ray.INIT_ERRORS, match="timed out during startup"):
+        start(ray, tmp_path)
+    assert ray.starts == 2
+
+
+def test_another_failure_is_not_tried_again(tmp_path: Path) -> None:
+    ray = UnwillingRay(ConnectionError("no port"))
+    with pytest.raises(ConnectionError, match="no port"):
+        start(ray, tmp_path)
+    assert ray.starts == 1
