@@ -35,7 +35,7 @@ _VAGUE_SHARE = 0.5  # of its value: standard error from which a group is practic
 _WHITENESS_LEVEL = (
     1e-3  # probability of such residuals under a true model, below which a warning is given
 )
-_ROUNDING_SHARE = 1e-9  # of the output: below, the residual is rounding and has no optimum
+_SOLVER_SHARE = 1e-5  # of the output: smaller residuals are the solver's, which has kinks
 
 _STDERR_MEANINGS: Mapping[NoiseColour, str] = {
     "white": "The standard errors are too small.",
@@ -93,9 +93,10 @@ def collect_warnings(
             "the time limit left no search for minima near the estimate. Where the loss is rough, "
             "the intervals are too narrow."
         )
-    if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING_SHARE * problem.output_scale:
+    is_of_the_solver = rms <= _SOLVER_SHARE * problem.output_scale
+    if analysis.possible_gain > _NOTABLE_GAIN and not is_of_the_solver:
         messages.append(_warn_not_optimal(algorithm, analysis.possible_gain))
-    elif tests is not None:
+    elif tests is not None and not is_of_the_solver:
         loss = problem.loss
         is_plain = loss.kind == "squares" and loss.noise_model != "ar1"
         messages += _warn_coloured_residuals(

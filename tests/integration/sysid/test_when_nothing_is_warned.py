@@ -44,6 +44,21 @@ def test_residuals_of_an_estimate_that_is_no_optimum_say_nothing_of_the_model() 
     assert not told(found, "not white")
 
 
+def test_residuals_of_the_solver_are_no_doubt_about_the_minimum() -> None:
+    """Where held input and time lag meet, the integration error has kinks: no optimum, no noise."""
+    t, lag, gain, time_constant = 0.1 * np.arange(600), 0.5, 2.0, 3.0
+    command = np.sign(np.sin(0.3 * t) + np.sin(0.17 * t))
+    read = np.concatenate([np.full(5, command[0]), command[:-5]])  # the lag is five samples
+    y, decay = np.full(t.size, gain * command[0]), np.exp(-0.1 / time_constant)
+    for i in range(t.size - 1):
+        y[i + 1] = decay * y[i] + (1 - decay) * gain * read[i]
+    found = identify(FOPDT, Record((Channel("u", t, command),), (Channel("y", t, y),)))
+    values = {estimate.name: estimate.value for estimate in found.estimates}
+    assert values["L"] == pytest.approx(lag, abs=1e-4)
+    assert not told(found, "not a local optimum")
+    assert not told(found, "white")
+
+
 def test_an_input_that_is_constant_in_one_record_only_is_not_told() -> None:
     at_rest = Record(
         (Channel("q", TIMES, 0.0 * TIMES, "N", hold="zero"),), (Channel("y", TIMES, noise(), "m"),)
