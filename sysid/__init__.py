@@ -52,6 +52,9 @@ __all__ = [
     "simulate",
 ]
 
+DISTRIBUTION = "lagid"
+"""Tells this package from others of the name; `lagid` looks at it."""
+
 _PUBLIC_NAMES = {
     "core.errors": ("SysidError",),
     "core.settings": (

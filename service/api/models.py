@@ -10,7 +10,7 @@ from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
 from service.core.documents import MAX_DOCUMENT_BYTES, parse_json, parse_yaml
 from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
 from service.core.wire import Page
-from service.models import models
+from service.models import catalogue, models
 from service.models.schemas import CheckOut, ModelOut
 
 router = APIRouter(prefix="/v1", tags=["models"])
@@ -63,7 +63,7 @@ async def check_model(request: Request) -> CheckOut:
         return CheckOut.model_validate(
             {"valid": False, "errors": [fault.to_dict() for fault in error.errors]}
         )
-    return await run_in_threadpool(models.check_model, document)
+    return await run_in_threadpool(catalogue.check_model, document)
 
 
 async def _read_document(request: Request) -> Any:

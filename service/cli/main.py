@@ -110,12 +110,13 @@ def _exit_with_message(message: str, code: int = 1) -> None:
 
 def _user_message(error: Exception) -> str | None:
     """Message of a user's mistake that the core, the storage or an encoding reports; else None."""
-    from service.storage.errors import StorageError
     from sysid.core.errors import SysidError
 
     if isinstance(error, UnicodeEncodeError) and error.reason == SURROGATE_REASON:
         return f"{error.object[:200]!r} is not UTF-8 text; encode it in UTF-8"
-    return str(error) if isinstance(error, SysidError | StorageError) else None
+    storage = sys.modules.get("service.storage.errors")  # the library alone has no storage
+    kinds = (SysidError,) if storage is None else (SysidError, storage.StorageError)
+    return str(error) if isinstance(error, kinds) else None
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def check_model(
     as_json: AsJson = False,
 ) -> None:
     """Check a model document; each error has its place and, in equations, its column."""
-    from service.models.models import check_model as checked
+    from service.models.catalogue import check_model as checked
 
     try:
         answer = checked(parse_yaml(read_file(file))).model_dump(mode="json")
@@ -130,6 +130,6 @@ def add_model(
 
 
 def _list_builtin_models() -> list[dict[str, Any]]:
-    from service.models.models import list_catalogue
+    from service.models.catalogue import list_catalogue
 
     return [model.model_dump(mode="json") for model in list_catalogue()]

@@ -18,6 +18,7 @@ import typer
 
 from service.cli.common import err, out
 from service.core.errors import Misconfigured, Unavailable
+from service.core.extras import check_extra
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -111,8 +112,10 @@ def load_settings(**options: Any) -> "Settings":
     Raises
     ------
     Misconfigured
-        If a setting is invalid; the message names its variable.
+        If a setting is invalid; the message names its variable. Or if lagid is installed without
+        the libraries of a server.
     """
+    check_extra("server", "this command")
     from pydantic import ValidationError
 
     from service.core.settings import Settings

@@ -1,4 +1,4 @@
-"""Use cases of models: the catalogue, user models with versions, and checks of documents.
+"""Use cases of models: the catalogue, and user models with versions.
 
 Estimates of different runs are comparable only if their models have the same equations.
 """
@@ -10,13 +10,14 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import InvalidRequest, NotFound, to_field_errors
-from service.core.wire import FaultOut, Page
-from service.models.schemas import CheckOut, ModelOut
+from service.core.errors import InvalidRequest, NotFound
+from service.core.wire import Page
+from service.models.catalogue import list_catalogue, to_builtin_out, to_model_out
+from service.models.schemas import ModelOut
 from service.repositories.models import ModelRepository
 from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
-from sysid.core.errors import SysidError, UnknownModel, suggest_name
+from sysid.core.errors import UnknownModel, suggest_name
 from sysid.models.catalogue import load
 from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
@@ -29,11 +30,6 @@ def list_models(session: Session, cursor: str | None, limit: int) -> Page[ModelO
     return Page(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
 
 
-def list_catalogue() -> list[ModelOut]:
-    """List the built-in models."""
-    return [_to_builtin_out(name) for name in load.catalogue()]
-
-
 def get_model(session: Session, reference: str) -> ModelOut:
     """Return a model by ``name`` or ``name@version``.
 
@@ -43,7 +39,7 @@ def get_model(session: Session, reference: str) -> ModelOut:
         With the most similar name.
     """
     if reference in load.catalogue():
-        return _to_builtin_out(reference, with_document=True)
+        return to_builtin_out(reference, with_document=True)
     return _to_own_out(_get_own_model(session, reference), with_document=True)
 
 
@@ -62,19 +58,6 @@ def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
         )
     stored = ModelRepository(session).add(model.name, dict(model.document))
     return _to_own_out(stored.model, with_document=True)
-
-
-def check_model(document: Any) -> CheckOut:
-    """Check a model document and report every fault in it."""
-    if not isinstance(document, Mapping):
-        message = f"found {document!r:.60}; need an object with 'equations' and other fields"
-        return CheckOut(valid=False, errors=[FaultOut(pointer="", detail=message)])
-    try:
-        model = parse_model(document)
-    except SysidError as error:
-        problems = [FaultOut(**fault.to_dict()) for fault in to_field_errors(error)]
-        return CheckOut(valid=False, errors=problems)
-    return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
 
 
 def resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
@@ -138,30 +121,9 @@ def _list_names(session: Session) -> set[str]:
     return {*load.catalogue(), *(row.name for row in stored)}
 
 
-def _to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
-    return _to_out(
-        load.load_model(name),
-        0,
-        load.copy_catalogue_document(name) if with_document else None,
-    )
-
-
 def _to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
     document = row.document if with_document else None
-    return _to_out(parse_model(row.document), row.version, document)
-
-
-def _to_out(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
-    fields = ("lower", "upper", "bounds", "unit", "scale", "fixed", "tied")
-    return ModelOut.from_source(
-        model,
-        version=version,
-        builtin=version == 0,
-        inputs={quantity.name: quantity.unit for quantity in model.inputs},
-        outputs={output.name: output.unit for output in model.outputs},
-        parameters={p.name: {name: getattr(p, name) for name in fields} for p in model.parameters},
-        document=document,
-    )
+    return to_model_out(parse_model(row.document), row.version, document)
 
 
 _IRRELEVANT_KEYS = ("name", "title", "description", "source", "parameters", "initial", "solver")

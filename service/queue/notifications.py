@@ -7,9 +7,8 @@ nothing.
 import threading
 import time
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Self, final
+from typing import TYPE_CHECKING, NamedTuple, Self, final
 
-import psycopg
 from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
@@ -18,6 +17,9 @@ from service.queue.admission import Admission
 from service.repositories.jobs import QUEUE_CHANNEL
 from service.storage.sessions import Database
 from service.storage.tables import Job
+
+if TYPE_CHECKING:
+    import psycopg
 
 POLL_SECONDS = 1.0
 _FILE_POLL_SECONDS = 0.05
@@ -93,13 +95,15 @@ class _PostgresqlNotifier(Notifier):
         self._connection: psycopg.Connection | None = None
 
     def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
+        from psycopg import OperationalError
+
         deadline = time.monotonic() + seconds
         try:
             if self._connection is None:
                 self._open_connection()
                 return True  # jobs queued before it listened were not notified
             return self._wait_for_notification(self._connection, deadline)
-        except psycopg.OperationalError:
+        except OperationalError:
             self.close()
             return self._stop.wait(max(deadline - time.monotonic(), 0.0))
 
@@ -108,7 +112,7 @@ class _PostgresqlNotifier(Notifier):
             self._connection.close()
             self._connection = None
 
-    def _wait_for_notification(self, connection: psycopg.Connection, deadline: float) -> bool:
+    def _wait_for_notification(self, connection: "psycopg.Connection", deadline: float) -> bool:
         while not self._stop.is_set() and (left := deadline - time.monotonic()) > 0:
             notifications = connection.notifies(timeout=min(left, 0.2), stop_after=1)
             if any(True for _ in notifications):
@@ -118,7 +122,9 @@ class _PostgresqlNotifier(Notifier):
     def _open_connection(self) -> None:
         url = self._database.engine.url.set(drivername="postgresql")
         address = url.render_as_string(hide_password=False)
-        self._connection = psycopg.connect(address, autocommit=True)
+        from psycopg import connect
+
+        self._connection = connect(address, autocommit=True)
         self._connection.execute(f"LISTEN {QUEUE_CHANNEL}")
 
 

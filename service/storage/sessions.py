@@ -12,6 +12,7 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from service.core.extras import check_extra
 from service.storage.columns import to_json
 
 BUSY_SECONDS = 30.0
@@ -85,6 +86,8 @@ def _create_engine(url: str, **options: Any) -> Engine:
         return engine
     if address.drivername == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
+    if address.drivername == "postgresql+psycopg":
+        check_extra("postgres", "a database on PostgreSQL")
     # A pooled connection may have died with a restarted server: ask before use.
     settings = {"connect_timeout": CONNECT_SECONDS}
     engine = create_engine(

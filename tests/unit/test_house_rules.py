@@ -9,7 +9,7 @@ import pytest
 from tests.repository import ROOT
 from tests.sources import list_modules, read_facts
 
-CODE = ("sysid", "workers", "service", "migrations", "tests", "benchmarks")
+CODE = ("lagid", "sysid", "workers", "service", "migrations", "tests", "benchmarks")
 MACHINE = re.compile(
     r"py[p]i\.org|python[h]osted|npm[j]s\.|deb\.[d]ebian|/wor[k]/|/far[m]/|/roo[t]/"
 )
@@ -33,7 +33,7 @@ def test_the_formatter_has_no_exceptions() -> None:
 PARTICIPLE = re.compile(
     r"^_*(?:told|kept|found|known|given|dealt|held|made|built|sent|[a-z]{2,}(?<!e)ed)(?:_|$)"
 )
-PRODUCT = ("sysid", "workers", "service", "migrations")
+PRODUCT = ("lagid", "sysid", "workers", "service", "migrations")
 
 
 def test_no_function_is_named_by_a_participle() -> None:

@@ -1,0 +1,157 @@
+"""Identification of nonlinear systems with unknown time delays.
+
+The face of the library and of the service's client. Each name is loaded on first use, so
+`import lagid` is fast.
+
+Examples
+--------
+>>> import numpy as np
+>>> from lagid import Channel, Record, identify, load_model
+>>> t = np.arange(60) * 0.1  # s
+>>> u = Channel("u", t, np.where(t < 1.0, 0.0, 1.0))
+>>> y = Channel("y", t, 2.0 * (1.0 - np.exp(-np.maximum(t - 1.8, 0.0) / 0.5)))
+>>> found = identify(load_model("fopdt"), Record((u,), (y,)))
+>>> round(next(estimate.value for estimate in found.estimates if estimate.name == "L"), 2)
+0.8
+"""
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from service.formats.recordings import (  # type: ignore[import-untyped, unused-ignore]
+        read_recording,
+    )
+
+    from service.client import (
+        AsyncClient,
+        Client,
+        ClientError,
+        NotFinite,
+        ProblemError,
+        ServerUnreachable,
+    )
+    from sysid import (
+        Channel,
+        Estimate,
+        GeneticAlgorithm,
+        History,
+        Identification,
+        IslandChange,
+        Loss,
+        Migration,
+        Noise,
+        Parameter,
+        Problem,
+        Record,
+        Recording,
+        SequenceSearch,
+        Stop,
+        SysidError,
+        catalogue,
+        export_model,
+        identify,
+        load_model,
+        simulate,
+    )
+
+__all__ = [
+    "AsyncClient",
+    "Channel",
+    "Client",
+    "ClientError",
+    "Estimate",
+    "GeneticAlgorithm",
+    "History",
+    "Identification",
+    "IslandChange",
+    "Loss",
+    "Migration",
+    "Noise",
+    "NotFinite",
+    "Parameter",
+    "Problem",
+    "ProblemError",
+    "Record",
+    "Recording",
+    "SequenceSearch",
+    "ServerUnreachable",
+    "Stop",
+    "SysidError",
+    "catalogue",
+    "export_model",
+    "identify",
+    "load_model",
+    "read_recording",
+    "simulate",
+]
+
+__version__ = "0.1.0"
+
+_DISTRIBUTION = "lagid"
+
+_OTHER_MODULES = {
+    **dict.fromkeys(
+        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
+        "service.client",
+    ),
+    "read_recording": "service.formats.recordings",
+}
+"""Modules of the names that are not those of `sysid`."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_OTHER_MODULES.get(name, "sysid")), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
+def main() -> None:
+    """Run the command line."""
+    from service.cli.main import main as run_command_line
+
+    run_command_line()
+
+
+def _describe_clash() -> str | None:
+    """Describe which package of another origin has the name of one of lagid's; None if none.
+
+    Another distribution may install a package of the same name, into the same folder or into one
+    that Python searches first. So may a folder of the user's own.
+    """
+    for package in ("sysid", "service"):
+        try:
+            module = import_module(package)
+        except Exception as error:  # noqa: BLE001 - whatever a foreign package does when loaded
+            return f"lagid cannot load its package {package!r} ({error}). {_advise(package)}"
+        if getattr(module, "DISTRIBUTION", None) != _DISTRIBUTION:
+            place = getattr(module, "__file__", None) or next(iter(module.__path__), "nowhere")
+            return f"{place} is not the package {package!r} of lagid. {_advise(package)}"
+    return None
+
+
+def _advise(package: str) -> str:
+    from importlib.metadata import packages_distributions
+
+    others = sorted({*packages_distributions().get(package, ())} - {_DISTRIBUTION})
+    if not others:
+        return "Rename or move what is there, or start Python in another folder."
+    names = " ".join(others)
+    return (
+        f"It comes from {names}. Run `pip uninstall {names}`, then `pip install "
+        "--force-reinstall --no-deps lagid`. Or keep each in an environment of its own."
+    )
+
+
+if (_clash := _describe_clash()) is not None:
+    if [Path(word).stem for word in sys.argv[:1]] == [__name__]:  # the command: no traceback
+        sys.exit(f"lagid: {_clash}")
+    raise ImportError(_clash)

@@ -1,0 +1,47 @@
+"""Parts of the installation that a user chooses: `pip install 'lagid[server]'`."""
+
+import re
+from importlib.metadata import PackageNotFoundError, distribution, requires
+
+from service.core.errors import Misconfigured
+
+_OF_AN_EXTRA = re.compile(r"(?P<name>[\w.-]+)[^;]*;.*\bextra == ['\"](?P<extra>[\w-]+)['\"]")
+
+
+def check_extra(extra: str, purpose: str) -> None:
+    """Check that the libraries of an extra are installed, before a command needs one of them.
+
+    Parameters
+    ----------
+    purpose : str
+        What needs it, as the subject of the message.
+
+    Raises
+    ------
+    Misconfigured
+        If one is missing; the message has the command that installs it.
+    """
+    missing = [name for name in _list_libraries(extra) if not _is_installed(name)]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise Misconfigured(
+            f"{purpose} needs {missing[0]}{more}, not installed here: pip install 'lagid[{extra}]'"
+        )
+
+
+def _list_libraries(extra: str) -> list[str]:
+    """List the libraries of an extra; none for a checkout that is not installed."""
+    try:
+        lines = requires("lagid") or []
+    except PackageNotFoundError:
+        return []
+    found = [match for line in lines if (match := _OF_AN_EXTRA.match(line))]
+    return [match["name"] for match in found if match["extra"] == extra]
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        distribution(name)
+    except PackageNotFoundError:
+        return False
+    return True

@@ -1,0 +1,53 @@
+"""The built-in models, and checks of model documents: all that needs no database."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from service.core.errors import to_field_errors
+from service.core.wire import FaultOut
+from service.models.schemas import CheckOut, ModelOut
+from sysid.core.errors import SysidError
+from sysid.models.catalogue import load
+from sysid.models.model import Model
+from sysid.models.parse import parse_model
+
+
+def list_catalogue() -> list[ModelOut]:
+    """List the built-in models."""
+    return [to_builtin_out(name) for name in load.catalogue()]
+
+
+def check_model(document: Any) -> CheckOut:
+    """Check a model document and report every fault in it."""
+    if not isinstance(document, Mapping):
+        message = f"found {document!r:.60}; need an object with 'equations' and other fields"
+        return CheckOut(valid=False, errors=[FaultOut(pointer="", detail=message)])
+    try:
+        model = parse_model(document)
+    except SysidError as error:
+        problems = [FaultOut(**fault.to_dict()) for fault in to_field_errors(error)]
+        return CheckOut(valid=False, errors=problems)
+    return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
+
+
+def to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
+    """Convert a built-in model to an answer."""
+    return to_model_out(
+        load.load_model(name),
+        0,
+        load.copy_catalogue_document(name) if with_document else None,
+    )
+
+
+def to_model_out(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
+    """Convert a model to an answer; built-in models have version 0."""
+    fields = ("lower", "upper", "bounds", "unit", "scale", "fixed", "tied")
+    return ModelOut.from_source(
+        model,
+        version=version,
+        builtin=version == 0,
+        inputs={quantity.name: quantity.unit for quantity in model.inputs},
+        outputs={output.name: output.unit for output in model.outputs},
+        parameters={p.name: {name: getattr(p, name) for name in fields} for p in model.parameters},
+        document=document,
+    )
