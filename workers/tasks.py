@@ -2,13 +2,13 @@
 
 import json
 import logging
-import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 from sysid.core.errors import SysidError
+from sysid.core.jit import read_clock
 from sysid.data.noise import Noise
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import (
@@ -65,15 +65,15 @@ def process_pack(
         Separate arguments, so that Ray makes one copy per machine.
     """
     records = dict(zip(keys, shared, strict=True))
-    begun = time.perf_counter()
+    begun = read_clock()
     done: list[ItemResult] = []
     for item in pack:
-        started = time.perf_counter()
+        started = read_clock()
         if done and started - begun > PACK_LIMIT_SECONDS:
             done.append(ItemResult(item.run, None, 0.0))
             continue
         outcome = _process_item(item, records)
-        done.append(ItemResult(item.run, outcome, time.perf_counter() - started))
+        done.append(ItemResult(item.run, outcome, read_clock() - started))
     return tuple(done)
 
 
@@ -142,10 +142,10 @@ def _evolve_item(item: EvolveIsland, problem: Problem) -> Island:
     island, cost = item.island, CALL_SECONDS
     while island.generation < item.target:
         count = max(1, min(item.target - island.generation, int(CALL_SECONDS / cost)))
-        started = time.perf_counter()
+        started = read_clock()
         before = island.generation
         island = advance_island(problem, item.spec.algorithm, island, count)
-        cost = max((time.perf_counter() - started) / count, 1e-9)
+        cost = max((read_clock() - started) / count, 1e-9)
         if island.generation < before + count:
             return island  # it rests
     return island

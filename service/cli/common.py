@@ -12,13 +12,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
+from service.client.calls import DEFAULT_URL, MCAP_MAGIC, NotFinite, ProblemError
 from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import DASH, format_value, plain_estimate
@@ -31,12 +32,45 @@ if TYPE_CHECKING:
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
+STANDARD_INPUT = Path("-")
+LISTED_ENTRIES = 50
+"""Entries of a table, if the user names no other number."""
+COUNTED_ENTRIES = 500
+"""Entries beyond those shown that are counted."""
 out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
+"""For notes and progress; ``--quiet`` silences it."""
+_errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
-Url = Annotated[str, typer.Option("--url", envvar="LAGID_URL", help="Address of the server.")]
+
+def _silence_notes(context: typer.Context, is_quiet: bool) -> bool:
+    if is_quiet:
+        err.quiet = True
+        context.call_on_close(_restore_notes)
+    return is_quiet
+
+
+def _restore_notes() -> None:
+    err.quiet = False
+
+
+DOCUMENT_HELP = "YAML or JSON file with the body of the request; - for standard input."
+SERVER_PANEL, OUTPUT_PANEL = "Server", "Output"
+Url = Annotated[
+    str,
+    typer.Option(
+        "--url", envvar="LAGID_URL", help="Address of the server.", rich_help_panel=SERVER_PANEL
+    ),
+]
 Key = Annotated[
-    str | None, typer.Option("--key", envvar="LAGID_KEY", help="API key.", show_default=False)
+    str | None,
+    typer.Option(
+        "--key",
+        envvar="LAGID_KEY",
+        help="API key.",
+        show_default=False,
+        rich_help_panel=SERVER_PANEL,
+    ),
 ]
 Segments = Annotated[
     str | None, typer.Option(help="CSV label columns that divide the rows into segments: col,col.")
@@ -44,12 +78,44 @@ Segments = Annotated[
 SampleTime = Annotated[
     float | None, typer.Option(help="Sampling period in s, for a CSV without a time column.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+AsJson = Annotated[
+    bool,
+    typer.Option("--json", help="Print JSON on standard output.", rich_help_panel=OUTPUT_PANEL),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet",
+        "-q",
+        callback=_silence_notes,
+        help="Print results and errors only: no progress, no notes.",
+        rich_help_panel=OUTPUT_PANEL,
+    ),
+]
+"""Takes effect by its callback; a command need not look at its value."""
+Limit = Annotated[
+    int | None,
+    typer.Option(
+        "--limit",
+        "-n",
+        min=0,
+        help=f"Most entries, 0 for all (default: {LISTED_ENTRIES}; with --json all).",
+        show_default=False,
+        rich_help_panel=OUTPUT_PANEL,
+    ),
+]
+Force = Annotated[
+    bool,
+    typer.Option("--force", "-f", help="Overwrite the file.", rich_help_panel=OUTPUT_PANEL),
+]
 
 __all__ = [
     "DEFAULT_URL",
     "AsJson",
+    "Force",
     "Key",
+    "Limit",
+    "Quiet",
     "SampleTime",
     "Segments",
     "Url",
@@ -58,6 +124,12 @@ __all__ = [
     "out",
     "print_json",
 ]
+
+
+def show_examples(*commands: str) -> str:
+    """Return the end of a command's help: examples that can be copied."""
+    lines = (f"[dim]$[/] {command.replace('[', chr(92) + '[')}" for command in commands)
+    return "\n\n".join(("[bold]Examples[/]", *lines))
 
 
 @contextmanager
@@ -77,7 +149,7 @@ def fail(message: str, code: int = 1) -> NoReturn:
 
 def print_error(message: str) -> None:
     """Print an error as one line on stderr."""
-    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+    _errors.print(f"lagid: {' '.join(message.split())}", markup=False)
 
 
 def check_succeeded(job: dict[str, Any]) -> None:
@@ -120,6 +192,12 @@ def print_line(text: str) -> None:
     out.print(text, markup=False, soft_wrap=True)
 
 
+def print_note(text: str) -> None:
+    """Print a note among the results; ``--quiet`` hides it."""
+    if not err.quiet:
+        print_line(f"note: {text}")
+
+
 def print_job(job: dict[str, Any]) -> None:
     """Print a submitted job."""
     n_runs = job["progress"]["runs"]
@@ -147,8 +225,52 @@ def print_table(
         out.print(empty)
 
 
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Entries of a list on the server that are shown, and how many more there are.
+
+    Attributes
+    ----------
+    entries : list of dict
+    more : int
+    has_more_than_counted : bool
+        Whether `more` is where counting stopped.
+    """
+
+    entries: list[dict[str, Any]]
+    more: int = 0
+    has_more_than_counted: bool = False
+
+    def describe_rest(self) -> str | None:
+        """Describe what is not shown, in one line; None if all is."""
+        if not self.more:
+            return None
+        count = f"{self.more} or more others" if self.has_more_than_counted else f"{self.more} more"
+        return f"… and {count}; --limit 0 lists all"
+
+
+def fetch_listing(
+    fetch: Callable[[int | None], list[dict[str, Any]]], limit: int | None, as_json: bool
+) -> Listing:
+    """Fetch the entries of a list that ``--limit`` asks for.
+
+    Parameters
+    ----------
+    fetch : callable
+        Returns at most so many entries; all for None.
+    limit : int or None
+        None: `LISTED_ENTRIES` for a table, all for JSON. 0: all.
+    """
+    most = limit if limit is not None or as_json else LISTED_ENTRIES
+    if not most:
+        return Listing(fetch(None))
+    entries = fetch(most + COUNTED_ENTRIES)
+    more = max(0, len(entries) - most)
+    return Listing(entries[:most], more, more == COUNTED_ENTRIES)
+
+
 def print_listing(
-    entries: list[dict[str, Any]],
+    listing: Listing,
     as_json: bool,
     headings: Sequence[str],
     row: Callable[[dict[str, Any]], Sequence[object]],
@@ -157,9 +279,19 @@ def print_listing(
 ) -> None:
     """Print a server's listing as JSON, or as a table with one `row` per entry."""
     if as_json:
-        print_json(entries)
+        print_json(listing.entries)
     else:
-        print_table(headings, map(row, entries), empty=empty)
+        print_table(headings, map(row, listing.entries), empty=empty)
+    print_rest(listing, as_json)
+
+
+def print_rest(listing: Listing, as_json: bool) -> None:
+    """Print how many entries are not shown; beside JSON on stderr."""
+    rest = listing.describe_rest()
+    if rest is not None and as_json:
+        err.print(rest, markup=False)
+    elif rest is not None:
+        print_line(rest)
 
 
 def format_cell(value: object) -> str:
@@ -184,11 +316,32 @@ def describe_status(estimate: dict[str, Any]) -> str:
 
 
 def read_file(path: Path) -> bytes:
-    """Read a file that the user names; end the command if this fails."""
+    """Read a file that the user names, or standard input for ``-``; end the command on failure."""
     try:
-        return path.read_bytes()
+        return sys.stdin.buffer.read() if path == STANDARD_INPUT else path.read_bytes()
     except OSError as error:
-        fail(f"{path} cannot be read: {error.strerror}")
+        fail(f"{name_file(path)} cannot be read: {error.strerror}")
+
+
+def name_file(path: Path) -> str:
+    """Name a file in a message."""
+    return "standard input" if path == STANDARD_INPUT else str(path)
+
+
+@contextmanager
+def open_recording(path: Path) -> Iterator[Path]:
+    """Give the path of a recording: the user's file, or a temporary one with standard input."""
+    if path != STANDARD_INPUT:
+        yield path
+        return
+    content = read_file(path)
+    if not content:
+        fail("standard input is empty; need a recording, such as < recording.csv")
+    suffix = ".mcap" if content.startswith(MCAP_MAGIC) else ".csv"
+    with TemporaryDirectory(prefix="lagid-") as folder:
+        copy = Path(folder) / f"stdin{suffix}"
+        copy.write_bytes(content)
+        yield copy
 
 
 def read_document(path: Path) -> Any:
@@ -196,14 +349,14 @@ def read_document(path: Path) -> Any:
     try:
         return parse_yaml(read_file(path))
     except InvalidRequest as error:
-        fail(f"{path}: {error}")
+        fail(f"{name_file(path)}: {error}")
 
 
 def read_object(path: Path, form: str = "an object (name: value)") -> dict[str, Any]:
     """Read an object from a YAML or JSON file; end the command if it holds something else."""
     document = read_document(path)
     if not isinstance(document, dict):
-        fail(f"{path} does not hold {form}")
+        fail(f"{name_file(path)} does not hold {form}")
     return document
 
 
@@ -218,6 +371,23 @@ def write_file(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         fail(f"{path} cannot be written: {error.strerror}")
+
+
+def protect_file(path: Path, force: bool) -> None:
+    """Ask before a file is overwritten; end the command where nobody can answer."""
+    if not force and path.exists():
+        ask_to_go_on(
+            f"{path} exists. Overwrite it?",
+            f"{path} exists, and nothing was written. Add --force, or name another by --output",
+        )
+
+
+def ask_to_go_on(question: str, refusal: str) -> None:
+    """Ask on the terminal; end the command at a no, and with `refusal` where there is none."""
+    if not sys.stdin.isatty():
+        fail(refusal)
+    if not typer.confirm(question, err=True):
+        raise typer.Exit(1)
 
 
 def split_names(text: str | None) -> list[str]:
@@ -319,9 +489,9 @@ class FieldOrigins:
         return f"{origin}{column}: {detail}" if origin else detail
 
 
-def file_origins(name: object) -> FieldOrigins:
-    """Return the origins of a body that is read from a file."""
-    return FieldOrigins(rest=f"{name} …")
+def file_origins(path: Path, options: Mapping[str, str] | None = None) -> FieldOrigins:
+    """Return the origins of a body that is read from a file, except fields that options set."""
+    return FieldOrigins(options or {}, rest=f"{name_file(path)} …")
 
 
 @contextmanager

@@ -1,43 +1,69 @@
 """`lagid datasets` and `lagid dataset …`."""
 
+import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
 import typer
 
 from service.cli.common import (
+    DOCUMENT_HELP,
+    STANDARD_INPUT,
     AsJson,
     FieldOrigins,
+    Force,
     Key,
+    Limit,
+    Quiet,
     SampleTime,
     Segments,
     Url,
     connect_client,
     fail,
+    fail_usage,
+    fetch_listing,
+    file_origins,
+    name_file,
     parse_number,
     parse_pairs,
     print_json,
     print_line,
     print_listing,
+    print_note,
+    print_table,
+    protect_file,
     read_document,
+    read_file,
     read_object,
     report_faults,
+    show_examples,
 )
 from service.client.calls import DEFAULT_URL
 from service.core.text import append_unit
+from sysid.core.errors import suggest_name
 
-app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from service.client.client import Client
+
+
+app = typer.Typer(help="Add, show, download, simulate and derive recordings.", no_args_is_help=True)
 
 UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
-DOCUMENT_HELP = "YAML or JSON file with the body of the request."
+DATASET_ID = "ds_"
 
 
-def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
-    """List the recordings of the server."""
+DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help="Id or name of a dataset.")]
+
+
+def list_datasets(
+    url: Url = DEFAULT_URL, key: Key = None, limit: Limit = None, as_json: AsJson = False
+) -> None:
+    """List the recordings of the server, latest first."""
     with connect_client(url, key) as client:
-        datasets = client.datasets()
+        listing = fetch_listing(client.datasets, limit, as_json)
     print_listing(
-        datasets,
+        listing,
         as_json,
         ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
         lambda dataset: (
@@ -52,28 +78,102 @@ def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = Fal
     )
 
 
-@app.command("add")
+@app.command(
+    "add",
+    epilog=show_examples(
+        "lagid dataset add recording.csv",
+        "zcat recording.csv.gz | lagid dataset add - --name recording",
+    ),
+)
 def add_dataset(
-    file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
+    file: Annotated[Path, typer.Argument(help="CSV or MCAP file; - for standard input.")],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Store a recording."""
-    if not file.is_file():
+    if file != STANDARD_INPUT and not file.is_file():
         fail(f"there is no file {file}")
+    source = read_file(file) if file == STANDARD_INPUT else file
     with (
         connect_client(url, key) as client,
-        report_faults(FieldOrigins(UPLOAD_OPTIONS, rest=str(file))),
+        report_faults(FieldOrigins(UPLOAD_OPTIONS, rest=name_file(file))),
     ):
-        stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
+        stored = client.add_dataset(source, name, segments=segments, sample_time=sample_time)
     _print_dataset(stored, as_json)
 
 
-@app.command("simulate")
+@app.command("show", epilog=show_examples("lagid dataset show recording"))
+def show_dataset(
+    dataset: DatasetName,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Show one recording: its samples and its channels."""
+    with connect_client(url, key) as client:
+        found = _find_dataset(client, dataset)
+    _print_dataset(found, as_json)
+    if not as_json:
+        rows = [
+            [channel[field] for field in ("name", "unit", "samples", "missing", "hold")]
+            for channel in found["channels"]
+        ]
+        print_table(("channel", "unit", ">samples", ">missing", "hold"), rows, empty="none")
+
+
+@app.command(
+    "download",
+    epilog=show_examples(
+        "lagid dataset download recording",
+        "lagid dataset download recording --format csv --output - | head",
+    ),
+)
+def download_dataset(
+    dataset: DatasetName,
+    file: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="File to write (default: name of the dataset); - for stdout."
+        ),
+    ] = None,
+    format: Annotated[
+        Literal["mcap", "csv"], typer.Option(help="MCAP keeps units, holds and segments.")
+    ] = "mcap",
+    force: Force = False,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Download a recording."""
+    with connect_client(url, key) as client:
+        found = _find_dataset(client, dataset)
+        if file == STANDARD_INPUT:
+            _write_pieces(client.download(found["id"], format), sys.stdout.buffer)
+            return
+        target = file or Path(f"{found['name'].replace('/', '_')}.{format}")
+        protect_file(target, force)
+        part = target.with_name(f"{target.name}.part")
+        try:
+            with part.open("wb") as sink:
+                _write_pieces(client.download(found["id"], format), sink)
+            part.replace(target)
+        except OSError as error:
+            fail(f"{target} cannot be written: {error.strerror}")
+    print_line(str(target))
+
+
+@app.command(
+    "simulate",
+    epilog=show_examples(
+        "lagid dataset simulate --plant tube --set length_m=30 --name tube-30m",
+        "lagid dataset simulate simulation.yaml",
+    ),
+)
 def simulate_dataset(
     file: Annotated[Path | None, typer.Argument(help=DOCUMENT_HELP)] = None,
     plant: Annotated[
@@ -87,6 +187,7 @@ def simulate_dataset(
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate a recording from a model or a reference plant, parameters, inputs and noise.
 
@@ -111,27 +212,54 @@ def simulate_dataset(
     _print_dataset(stored, as_json)
 
 
-@app.command("derive")
+@app.command(
+    "derive", epilog=show_examples("lagid dataset derive recording steps.yaml --name trimmed")
+)
 def derive_dataset(
     dataset: Annotated[str, typer.Argument(help="Id or name of the parent.")],
-    file: Annotated[Path, typer.Argument(help="YAML or JSON file with the list of steps.")],
+    file: Annotated[
+        Path,
+        typer.Argument(help="YAML or JSON file with the list of steps; - for standard input."),
+    ],
     name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Derive a recording from another: add noise, resample, trim, select, pool etc."""
     steps = read_document(file)
     if isinstance(steps, dict):
         steps = steps.get("steps")
     if not isinstance(steps, list):
-        fail(f"{file} has no list of steps, such as - detrend: {{}}")
+        fail(f"{name_file(file)} has no list of steps, such as - detrend: {{}}")
     with (
         connect_client(url, key) as client,
-        report_faults(FieldOrigins({"/name": "--name"}, rest=f"{file} …")),
+        report_faults(file_origins(file, {"/name": "--name"})),
     ):
         stored = client.derive(dataset, steps, name)
     _print_dataset(stored, as_json)
+
+
+def _find_dataset(client: "Client", name: str) -> dict[str, Any]:
+    """Find a dataset by its id or name; end the command if none or several have it."""
+    if name.startswith(DATASET_ID):
+        return client.dataset(name)
+    datasets = client.datasets()
+    found = [dataset for dataset in datasets if dataset["name"] == name]
+    if not found:
+        hint = suggest_name(name, {dataset["name"] for dataset in datasets})
+        fail(f"there is no dataset {name!r}{hint}")
+    if len(found) > 1:
+        ids = ", ".join(dataset["id"] for dataset in found)
+        fail_usage(f"{len(found)} datasets are named {name!r}; choose one by its id: {ids}")
+    return found[0]
+
+
+def _write_pieces(pieces: Iterable[bytes], sink: BinaryIO) -> None:
+    for piece in pieces:
+        sink.write(piece)
+    sink.flush()
 
 
 def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
@@ -143,7 +271,7 @@ def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
         pointer: option.format(pointer.rpartition("/")[2]) for pointer, option in pointers.items()
     }
     options = {"/plant": "--plant", "/name": "--name", **named}
-    return FieldOrigins(options, rest="--set {}" if file is None else f"{file} …")
+    return FieldOrigins(options) if file is None else file_origins(file, options)
 
 
 def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
@@ -159,7 +287,7 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
         f"channels {_format_channels(stored)}"
     )
     for warning in stored["warnings"]:
-        print_line(f"note: {warning}")
+        print_note(warning)
 
 
 def _format_channels(dataset: dict[str, Any]) -> str:

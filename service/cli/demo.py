@@ -1,6 +1,9 @@
 """`lagid demo`: run the paper's Example 1 through the whole service and compare with Table 1."""
 
 import os
+import shlex
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from service.cli.common import format_estimate
+from service.cli.server import load_settings
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
 
@@ -31,12 +35,21 @@ PAPER_SIMPLE = {"c": 0.143109, "L": 0.393939, "b": 5.171065, "a": 1.018573}
 PAPER_PROPOSED = {"c": 0.195112, "L": 0.497556, "b": 5.004888, "a": 1.012708}
 
 
-def run_demo(data_dir: Path, console: Console) -> None:
-    """Start a service, identify Example 1 with three methods, print the table, stop the service."""
+FOLDER = Path("lagid-demo")
+
+
+def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
+    """Start a service, identify Example 1 with three methods, print the table, stop the service.
+
+    Without a folder or a port, those of the settings are used, else `FOLDER` and a free port.
+    """
+    settings = load_settings(data_dir=data_dir, port=port)
+    data_dir = settings.data_dir if "data_dir" in settings.model_fields_set else FOLDER
+    own_port = settings.port if "port" in settings.model_fields_set else None
     console.print(
         "[bold]lagid[/] starts: web process, dispatcher, local Ray, SQLite", highlight=False
     )
-    with run_embedded_service(data_dir, cpus=os.cpu_count()) as url:
+    with run_embedded_service(data_dir, port=own_port, cpus=settings.cpus or os.cpu_count()) as url:
         console.print(f"service ready on {url}", highlight=False)
         with Client(url) as client:
             dataset = client.simulate_dataset(DATASET_BODY)
@@ -57,6 +70,19 @@ def run_demo(data_dir: Path, console: Console) -> None:
             report = data_dir / "report.html"
             report.write_text(client.report(job["id"]), encoding="utf-8")
     _print_locations(console, data_dir, report)
+    command = [_name_program(), "serve", "--data-dir", str(data_dir)]
+    command += [] if port is None else ["--port", str(port)]
+    console.print(
+        f"Look at it again: {shlex.join(command)}, then open http://{settings.host}:{settings.port}/",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _name_program() -> str:
+    """Name the program as this user can type it."""
+    return "lagid" if shutil.which("lagid") else sys.argv[0]
 
 
 def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
@@ -121,4 +147,3 @@ def _print_locations(console: Console, data_dir: Path, report: Path) -> None:
     console.print(f"report    {report.resolve()}", highlight=False, soft_wrap=True)
     console.print(f"MCAP      {folder / 'objects'}", highlight=False, soft_wrap=True)
     console.print(f"database  {folder / 'lagid.db'}", highlight=False, soft_wrap=True)
-    console.print("To keep the service running: make serve, then open http://127.0.0.1:8000/")

@@ -1,6 +1,6 @@
 """`lagid identify`: one identification in this process, without a server."""
 
-import time
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +12,10 @@ import typer
 
 from service.cli.common import (
     MODEL_SUFFIXES,
+    OUTPUT_PANEL,
+    AsJson,
     FieldOrigins,
+    Quiet,
     SampleTime,
     Segments,
     apply_setting,
@@ -21,6 +24,7 @@ from service.cli.common import (
     fail,
     fail_usage,
     format_estimate,
+    open_recording,
     out,
     parse_channels,
     print_json,
@@ -62,6 +66,18 @@ FIELD_ORIGINS = FieldOrigins(
 )
 
 
+ResultFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="Write the result as JSON.",
+        rich_help_panel=OUTPUT_PANEL,
+    ),
+]
+
+
 @dataclass(frozen=True, slots=True)
 class CsvOptions:
     """Options for reading CSV files."""
@@ -71,7 +87,10 @@ class CsvOptions:
 
 
 def identify(
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Recording, CSV or MCAP.")],
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="Recording, CSV or MCAP; - for standard input."),
+    ],
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     changes: Annotated[
         list[str] | None,
@@ -101,9 +120,9 @@ def identify(
     ] = False,
     segments: Segments = None,
     sample_time: SampleTime = None,
-    json_file: Annotated[
-        str | None, typer.Option("--json", metavar="FILE", help="Write the result; - for stdout.")
-    ] = None,
+    output: ResultFile = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Identify a model's parameters and time lags from a recording, in this process."""
     changes = list(changes or ())
@@ -114,7 +133,8 @@ def identify(
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = CsvOptions(sample_time, tuple(split_names(segments)))
-    recording = read_recording(data, reading)
+    with open_recording(data) as path:
+        recording = read_recording(path, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     records = _extract_records(recording, data, loaded, body)
     validation_records = []
@@ -122,12 +142,12 @@ def identify(
         validation_records = _extract_records(
             read_recording(validation, reading), validation, loaded, body
         )
-    begun = time.perf_counter()
-    with _report_core_faults():
-        result = _run_identification(
-            loaded, records, validation_records, body, quiet=json_file == "-"
-        )
-    print_result(loaded, result, time.perf_counter() - begun, json_file)
+    from sysid.core.jit import announce_compilation, read_clock
+
+    begun = read_clock()
+    with _report_core_faults(), announce_compilation(err.print):
+        result = _run_identification(loaded, records, validation_records, body, quiet=as_json)
+    print_result(loaded, result, read_clock() - begun, output, as_json=as_json)
 
 
 def _build_body(
@@ -236,19 +256,22 @@ def read_recording(path: Path, reading: CsvOptions) -> "Recording":
 
 
 def print_result(
-    model: "Model", result: "Identification", seconds: float, json_file: str | None
+    model: "Model",
+    result: "Identification",
+    seconds: float,
+    output: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
-    """Print the estimates, or write the result as JSON, or both."""
+    """Print the estimates, as tables or as JSON; `output` is a file of the JSON."""
     from service.runs.result import to_result_document
 
     document = to_result_document(result, seconds)
-    if json_file == "-":
+    if output is not None:
+        write_file(output, json.dumps(document, indent=2))
+    if as_json:
         print_json(document)
         return
-    if json_file is not None:
-        import json
-
-        write_file(Path(json_file), json.dumps(document, indent=2))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
         (
@@ -365,7 +388,9 @@ def _run_identification(
         TimeElapsedColumn(),
     )
     console = Console(stderr=True, highlight=False)
-    quiet = quiet or not console.is_terminal  # in a file a finished bar is an empty line
+    quiet = (
+        quiet or err.quiet or not console.is_terminal
+    )  # in a file a finished bar is an empty line
     with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
         bar = progress.add_task("", total=algorithm.generations, rms="–")
 

@@ -9,21 +9,29 @@ from service.cli.common import (
     DATA_SUFFIXES,
     MODEL_SUFFIXES,
     AsJson,
+    Force,
     Key,
+    Limit,
+    Listing,
+    Quiet,
     Url,
     check_succeeded,
     connect_client,
     fail,
+    fetch_listing,
     file_origins,
     format_decimals,
     format_estimate,
     format_moment,
+    name_file,
     out,
     print_job,
     print_json,
-    print_line,
     print_listing,
+    print_note,
+    print_rest,
     print_table,
+    protect_file,
     read_document,
     read_object,
     report_faults,
@@ -49,7 +57,10 @@ JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 
 
 def submit_job(
-    file: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON.")],
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON; - for standard input."),
+    ],
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     idempotency_key: Annotated[
         str | None, typer.Option(help="The same key returns the same job.")
@@ -57,6 +68,7 @@ def submit_job(
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Submit a job."""
     body = read_job(file)
@@ -73,7 +85,11 @@ def submit_job(
 
 
 def watch_job(
-    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+    job: JobName,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Show a job's progress and RMS until it ends, then its estimates."""
     with connect_client(url, key) as client:
@@ -86,13 +102,14 @@ def list_jobs(
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
+    limit: Limit = None,
     as_json: AsJson = False,
 ) -> None:
     """List the jobs of the server, latest first."""
     with connect_client(url, key) as client:
-        jobs = client.jobs(state=state or None)
+        listing = fetch_listing(lambda most: client.jobs(most, state=state or None), limit, as_json)
     print_listing(
-        jobs,
+        listing,
         as_json,
         ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
         lambda job: (
@@ -117,7 +134,9 @@ def list_runs(
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
+    limit: Limit = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """List the runs of a job with their estimates, or show one run."""
     with connect_client(url, key) as client:
@@ -125,25 +144,38 @@ def list_runs(
             print_run(client.run(job), as_json)
             return
         about = client.job(job or _find_latest_job(client))
-        runs = client.runs(about["id"])
+        most = limit if limit is not None or as_json else MAX_PRINTED
+        runs = client.runs(about["id"], at_most=most or None)
+    others = about["progress"]["runs"] - len(runs) if len(runs) == most else 0
     if as_json:
         print_json(runs)
     else:
         print_runs(runs, about["rms_unit"])
+    print_rest(Listing(runs, others), as_json)
 
 
-def cancel_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+def cancel_job(
+    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+) -> None:
     """Cancel a job; results so far are kept."""
     with connect_client(url, key) as client:
         answer = client.cancel(job)
+    if as_json:
+        print_json(answer)
+        return
     asked = "will be cancelled" if answer["state"] == "running" else f"is {answer['state']}"
     out.print(f"{answer['id']} {asked}", markup=False)
 
 
-def resume_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+def resume_job(
+    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+) -> None:
     """Queue a failed or cancelled job again; it continues where it stopped."""
     with connect_client(url, key) as client:
         answer = client.resume(job)
+    if as_json:
+        print_json(answer)
+        return
     out.print(f"{answer['id']} is {answer['state']}", markup=False)
 
 
@@ -152,10 +184,12 @@ def write_report(
     file: Annotated[Path, typer.Option("--output", "--out", "-o", help="File to write.")] = Path(
         "report.html"
     ),
+    force: Force = False,
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
     """Write the report of a job as one HTML file."""
+    protect_file(file, force)
     with connect_client(url, key) as client:
         text = client.report(job)
     write_file(file, text)
@@ -171,8 +205,8 @@ def read_job(file: Path) -> dict[str, Any]:
     for dataset in body.get("datasets") or []:
         if isinstance(dataset, str) and dataset.endswith(DATA_SUFFIXES):
             fail(
-                f"{file}: datasets must be ids or names on the server, but {dataset!r} is a file. "
-                f"Add it first: lagid dataset add {dataset}"
+                f"{name_file(file)}: datasets must be ids or names on the server, but "
+                f"{dataset!r} is a file. Add it first: lagid dataset add {dataset}"
             )
     return body
 
@@ -222,7 +256,7 @@ def _print_end(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     else:
         print_runs(runs, job["rms_unit"])
         for warning in dict.fromkeys(w for run in runs for w in run.get("warnings", [])):
-            print_line(f"note: {warning}")
+            print_note(warning)
     if not as_json:
         print_reuse_note(job, runs, "reuse: false in the job")
     check_succeeded(job)

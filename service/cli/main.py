@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,9 +12,7 @@ from typer.exceptions import TyperException
 
 from service.cli import datasets, jobs, models, runs, server, sweeps
 from service.cli import reidentify as references
-from service.cli import runs as exporting
-from service.cli import server as upkeep
-from service.cli.common import out, print_error
+from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
 from service.cli.paper import reproduce_paper
 from service.cli.reidentify import reidentify
@@ -24,43 +24,120 @@ SURROGATE_REASON = "surrogates not allowed"
 """Python's reason for an argument or a file name in another encoding."""
 app = typer.Typer(
     name="lagid",
-    help="Identification of nonlinear systems with unknown time lags.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    epilog=show_examples("lagid demo", "lagid identify recording.csv --model fopdt"),
 )
 
-app.command("serve")(server.serve)
-app.command("dispatcher")(server.run_dispatcher)
-app.command("identify")(identify)
-app.command("paper")(reproduce_paper)
-app.command("submit")(jobs.submit_job)
-app.command("watch")(jobs.watch_job)
-app.command("jobs")(jobs.list_jobs)
-app.add_typer(runs.app, name="runs")
-app.command("export")(exporting.export_model)
-app.command("cancel")(jobs.cancel_job)
-app.command("resume")(jobs.resume_job)
-app.command("report")(jobs.write_report)
-app.command("datasets")(datasets.list_datasets)
-app.add_typer(datasets.app, name="dataset")
-app.add_typer(models.app, name="models")
-app.add_typer(sweeps.app, name="sweep")
-app.command("reidentify")(reidentify)
-app.add_typer(references.app, name="references")
-app.add_typer(upkeep.database_app, name="db")
-app.command("doctor")(upkeep.check_installation)
+
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        print_line(f"lagid {version('lagid')}")
+        raise typer.Exit
 
 
-@app.command("demo")
+@app.callback()
+def describe_program(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", "-V", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Identification of nonlinear systems with unknown time delays.
+
+    Exit code 0: success, 1: the work failed, 2: wrong arguments. LAGID_URL names a server.
+    """
+
+
+class _HelpPanel:
+    """A group of commands in the help, in the order in which they are added."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def add(self, name: str, command: Callable[..., Any], *examples: str) -> None:
+        """Add a command with examples that can be copied."""
+        app.command(name, rich_help_panel=self.name, epilog=show_examples(*examples))(command)
+
+    def add_group(self, name: str, group: typer.Typer) -> None:
+        """Add a command that has commands."""
+        app.add_typer(group, name=name, rich_help_panel=self.name)
+
+
 def run_demo(
-    data_dir: Annotated[Path, typer.Option(help="Folder for its data.")] = Path("lagid-demo"),
+    data_dir: Annotated[
+        Path | None,
+        typer.Option(help="Folder for its data (default: LAGID_DATA_DIR, or lagid-demo)."),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port (default: LAGID_PORT, or any free one)."),
+    ] = None,
 ) -> None:
     """Run the paper's Example 1 through the whole service and print its Table 1."""
     from service.cli import demo
 
-    demo.run_demo(data_dir, out)
+    demo.run_demo(data_dir, port, out)
+
+
+first = _HelpPanel("Try it")
+first.add("demo", run_demo, "lagid demo", "lagid demo --data-dir /tmp/demo")
+first.add(
+    "identify",
+    identify,
+    "lagid identify recording.csv --model fopdt",
+    "lagid identify recording.csv --model mine.yaml --channels u=P1,y=P2",
+    "lagid identify recording.csv --model tube --set parameters.L.upper=0.5",
+    "lagid identify - --model fopdt --json < recording.csv",
+)
+first.add(
+    "paper",
+    reproduce_paper,
+    "lagid paper --quick",
+    "lagid paper --only table1,figure15 --output table1.html",
+)
+data = _HelpPanel("Data and models")
+data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --limit 5 --json")
+data.add_group("dataset", datasets.app)
+data.add_group("models", models.app)
+work = _HelpPanel("Jobs")
+work.add(
+    "submit",
+    jobs.submit_job,
+    "lagid submit job.yaml --wait",
+    "lagid submit - --json < job.yaml",
+)
+work.add("watch", jobs.watch_job, "lagid watch job_1", "lagid watch job_1 --quiet --json")
+work.add("jobs", jobs.list_jobs, "lagid jobs", "lagid jobs --state running --state queued")
+work.add("cancel", jobs.cancel_job, "lagid cancel job_1")
+work.add("resume", jobs.resume_job, "lagid resume job_1")
+work.add_group("sweep", sweeps.app)
+work.add(
+    "reidentify",
+    reidentify,
+    "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv 20=c.csv --wait",
+    "lagid reidentify --model tube --label length_m --reference tube 30=new.csv",
+)
+results = _HelpPanel("Results")
+results.add_group("runs", runs.app)
+results.add(
+    "export",
+    runs.export_model,
+    "lagid export run_1 --format c --output model.c",
+    "lagid export run_1 --json",
+)
+results.add("report", jobs.write_report, "lagid report job_1 --output tube.html")
+results.add_group("references", references.app)
+upkeep = _HelpPanel("Server")
+upkeep.add(
+    "serve", server.serve, "lagid serve", "lagid serve --port 8001 --data-dir measurements --cpus 4"
+)
+upkeep.add("dispatcher", server.run_dispatcher, "lagid dispatcher --cpus 8")
+upkeep.add_group("db", server.database_app)
+upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
 
 def main() -> None:

@@ -8,22 +8,31 @@ import typer
 from service.cli.common import (
     AsJson,
     Key,
+    Limit,
+    Listing,
     Url,
     connect_client,
     err,
+    fetch_listing,
     file_origins,
+    name_file,
     out,
     print_json,
     print_listing,
     read_file,
     read_object,
     report_faults,
+    show_examples,
 )
 from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
 
 app = typer.Typer(help="Built-in models and your own.", invoke_without_command=True)
+
+ModelFile = Annotated[
+    Path, typer.Argument(help="Model document, YAML or JSON; - for standard input.")
+]
 
 
 @app.callback()
@@ -33,22 +42,27 @@ def list_by_default(context: typer.Context) -> None:
         list_models()
 
 
-@app.command("list")
+@app.command(
+    "list", epilog=show_examples("lagid models", "lagid models list --url http://127.0.0.1:8000")
+)
 def list_models(
     url: Annotated[
         str | None,
         typer.Option("--url", envvar="LAGID_URL", help="Include the models of this server."),
     ] = None,
     key: Key = None,
+    limit: Limit = None,
     as_json: AsJson = False,
 ) -> None:
     """List built-in models; with --url also those of a server."""
-    models = _list_builtin_models()
-    if url is not None:
+    if url is None:
+        built_in = _list_builtin_models()
+        listing = Listing(built_in[: limit or None], len(built_in[limit:]) if limit else 0)
+    else:
         with connect_client(url, key) as client:
-            models = client.models()
+            listing = fetch_listing(client.models, limit, as_json)
     print_listing(
-        models,
+        listing,
         as_json,
         ("name", ">version", "form", "inputs", "outputs", "parameters", "title"),
         lambda model: (
@@ -64,7 +78,9 @@ def list_models(
     )
 
 
-@app.command("show")
+@app.command(
+    "show", epilog=show_examples("lagid models show tube > mine.yaml", "lagid models show mine@2")
+)
 def show_model(
     name: Annotated[str, typer.Argument(help="Name, or name@version of your own model.")],
     url: Annotated[
@@ -91,9 +107,12 @@ def show_model(
     out.print(text, markup=False, soft_wrap=True, end="")
 
 
-@app.command("check")
+@app.command(
+    "check",
+    epilog=show_examples("lagid models check mine.yaml", "lagid models check - < mine.yaml"),
+)
 def check_model(
-    file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
+    file: ModelFile,
     as_json: AsJson = False,
 ) -> None:
     """Check a model document; each error has its place and, in equations, its column."""
@@ -106,26 +125,32 @@ def check_model(
     if as_json:
         print_json(answer)
     elif answer["valid"]:
-        out.print(f"{file}: the model is valid", markup=False)
+        out.print(f"{name_file(file)}: the model is valid", markup=False)
     else:
         for fault in answer["errors"]:
             column = f", column {fault['column']}" if fault.get("column") else ""
             where = f"{fault['pointer'] or 'document'}{column}"
-            err.print(f"{file}: {where}: {fault['detail']}", markup=False)
+            err.print(f"{name_file(file)}: {where}: {fault['detail']}", markup=False)
     if not answer["valid"]:
         raise typer.Exit(1)
 
 
-@app.command("add")
+@app.command(
+    "add", epilog=show_examples("lagid models add mine.yaml", "lagid models add - < mine.yaml")
+)
 def add_model(
-    file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
+    file: ModelFile,
     url: Url = DEFAULT_URL,
     key: Key = None,
+    as_json: AsJson = False,
 ) -> None:
     """Store your own model on a server."""
     document = read_object(file, "a model (name, equations, …)")
     with connect_client(url, key) as client, report_faults(file_origins(file)):
         stored = client.add_model(document)
+    if as_json:
+        print_json(stored)
+        return
     out.print(f"{stored['name']}@{stored['version']}", markup=False)
 
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import Key, err, fail, out
+from service.cli.common import SERVER_PANEL, Key, Quiet, err, fail, out
+from service.core.extras import check_extra
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -27,11 +28,17 @@ def reproduce_paper(
     ] = None,
     url: Annotated[
         str | None,
-        typer.Option(help="Server that runs the jobs (default: start one).", show_default=False),
+        typer.Option(
+            help="Server that runs the jobs (default: start one).",
+            show_default=False,
+            rich_help_panel=SERVER_PANEL,
+        ),
     ] = None,
     key: Key = None,
+    quiet: Quiet = False,
 ) -> None:
     """Reproduce the paper's tables and figures with real jobs; print tables and write a report."""
+    check_extra("server", "this command")
     from service.paper.bench import StudyBench
     from service.paper.document import to_markdown
     from service.paper.report import render_report

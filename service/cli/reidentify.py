@@ -12,15 +12,19 @@ import typer
 
 from service.cli.common import (
     DATA_SUFFIXES,
+    OUTPUT_PANEL,
     AsJson,
     FieldOrigins,
     Key,
+    Limit,
+    Quiet,
     Url,
     apply_setting,
     check_succeeded,
     connect_client,
     fail,
     fail_usage,
+    fetch_listing,
     format_estimate,
     format_moment,
     out,
@@ -32,6 +36,7 @@ from service.cli.common import (
     print_table,
     read_model,
     report_faults,
+    show_examples,
     split_names,
     write_file,
 )
@@ -78,8 +83,15 @@ Accept = Annotated[
 AcceptRun = Annotated[
     str | None, typer.Option(metavar="X", help="Value of the label of the run to accept.")
 ]
-JsonFile = Annotated[
-    str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
+TrendFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="Wait, and write the trend as JSON.",
+        rich_help_panel=OUTPUT_PANEL,
+    ),
 ]
 
 
@@ -97,9 +109,11 @@ def reidentify(
     wait: Wait = False,
     accept: Accept = None,
     accept_run: AcceptRun = None,
-    json_file: JsonFile = None,
+    output: TrendFile = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Re-identify a model for several values of a label: estimates, trend, predictions, flags.
 
@@ -121,13 +135,13 @@ def reidentify(
         body["batch"] = _upload_batch(client, batch)
         with report_faults(_field_origins(experiments)):
             job = client.reidentify(body)
-        if not (wait or accept or json_file):
-            print_job(job)
+        if not (wait or accept or output):
+            (print_json if as_json else print_job)(job)
             return
-        ended = follow_job(client, job["id"], quiet=json_file == "-")
-        _print_outcome(client, ended, json_file)
+        ended = follow_job(client, job["id"], quiet=as_json)
+        _print_outcome(client, ended, output, as_json=as_json)
         if accept is not None:
-            _accept_run(client, ended, accept, label, chosen)
+            _accept_run(client, ended, accept, label, chosen, quiet=as_json)
 
 
 def _field_origins(experiments: list[str]) -> FieldOrigins:
@@ -148,15 +162,17 @@ def _field_origins(experiments: list[str]) -> FieldOrigins:
     )
 
 
-def _print_outcome(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
+def _print_outcome(
+    client: "Client", job: dict[str, Any], output: Path | None, *, as_json: bool
+) -> None:
     trend = client.trend(job["id"])
-    if json_file == "-":
+    if as_json:
         print_json(trend)
     else:
         print_trend(trend, FieldOrigins())
         print_reuse_note(job, (), "--set reuse=false")
-    if json_file not in (None, "-"):
-        write_file(Path(str(json_file)), json.dumps(trend, indent=2, ensure_ascii=False))
+    if output is not None:
+        write_file(output, json.dumps(trend, indent=2, ensure_ascii=False))
     check_succeeded(job)
 
 
@@ -184,10 +200,14 @@ def _choose_label_value(
     return x
 
 
-def _accept_run(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
+def _accept_run(
+    client: "Client", job: dict[str, Any], name: str, label: str, x: float, *, quiet: bool
+) -> None:
     """Accept a run of the batch as the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
-    _print_accepted(client.accept_reference(name, run["id"]))
+    accepted = client.accept_reference(name, run["id"])
+    if not quiet:
+        _print_accepted(accepted)
 
 
 def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
@@ -224,13 +244,15 @@ REFERENCE_ORIGINS = FieldOrigins(
 ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the reference.")]
 
 
-@app.command("list")
-def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+@app.command("list", epilog=show_examples("lagid references list"))
+def list_references(
+    url: Url = DEFAULT_URL, key: Key = None, limit: Limit = None, as_json: AsJson = False
+) -> None:
     """List the current references."""
     with connect_client(url, key) as client:
-        references = client.references()
+        listing = fetch_listing(client.references, limit, as_json)
     print_listing(
-        references,
+        listing,
         as_json,
         ("name", "run", "accepted", "by", "labels", "estimates"),
         lambda reference: (
@@ -245,7 +267,7 @@ def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = F
     )
 
 
-@app.command("show")
+@app.command("show", epilog=show_examples("lagid references show tube"))
 def show_reference(
     name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
@@ -265,7 +287,10 @@ def show_reference(
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
 
-@app.command("accept")
+@app.command(
+    "accept",
+    epilog=show_examples("lagid references accept tube run_1 --by 'A. Engineer' --note spring"),
+)
 def accept_reference(
     name: ReferenceName,
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],

@@ -11,18 +11,24 @@ import typer
 from typer.core import TyperGroup
 
 from service.cli.common import (
+    DOCUMENT_HELP,
     AsJson,
     FieldOrigins,
     Key,
+    Quiet,
     Url,
     connect_client,
+    fail_usage,
+    file_origins,
     format_decimals,
     format_estimate,
     out,
     print_json,
+    print_note,
     print_table,
     read_object,
     report_faults,
+    show_examples,
     write_file,
 )
 from service.cli.jobs import list_runs as listing
@@ -58,12 +64,18 @@ app = typer.Typer(
     help="List the runs of a job with their estimates: lagid runs [JOB]. Show one run: "
     "lagid runs RUN. Or analyse a run with one of the commands.",
 )
-app.command(LIST_COMMAND)(listing)
+app.command(
+    LIST_COMMAND, epilog=show_examples("lagid runs", "lagid runs job_1", "lagid runs run_1")
+)(listing)
 
 
-@app.command("residuals")
+@app.command("residuals", epilog=show_examples("lagid runs residuals run_1"))
 def show_residuals(
-    run: RunName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+    run: RunName,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Test whether a run's residuals are white and independent of the inputs."""
     with connect_client(url, key) as client:
@@ -86,21 +98,22 @@ def show_residuals(
     verdict = {True: "passed", False: "failed", None: "not tested"}[residuals["passed"]]
     out.print(f"residuals on {residuals['data']} data: {verdict}", markup=False)
     if residuals["note"]:
-        out.print(f"note: {residuals['note']}", markup=False, soft_wrap=True)
+        print_note(residuals["note"])
 
 
-@app.command("simulate")
+@app.command("simulate", epilog=show_examples("lagid runs simulate run_1 loop.yaml"))
 def simulate_run(
     run: RunName,
-    file: Annotated[Path, typer.Argument(help="YAML or JSON file with the body of the request.")],
+    file: Annotated[Path, typer.Argument(help=DOCUMENT_HELP)],
     max_points: Annotated[int, typer.Option(min=2, help="Most points per line.")] = 1000,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate the identified model on a new input or under P, PI or PID control."""
     body = read_object(file)
-    origins = FieldOrigins({"?max_points": "--max-points"}, rest=f"{file} …")
+    origins = file_origins(file, {"?max_points": "--max-points"})
     with connect_client(url, key) as client, report_faults(origins):
         simulation = client.simulate_run(run, body, max_points)
     if as_json:
@@ -117,12 +130,12 @@ def simulate_run(
     _print_step(simulation["metrics"])
     _print_controller(simulation["controller"], simulation["tuning"], simulation["margins"])
     for note in simulation["notes"]:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+        print_note(note)
     if simulation["dataset"]:
         out.print(f"stored as {simulation['dataset']['id']}", markup=False)
 
 
-@app.command("profile")
+@app.command("profile", epilog=show_examples("lagid runs profile run_1 L T --points 41"))
 def profile_run(
     run: RunName,
     parameters: Annotated[
@@ -152,12 +165,13 @@ def profile_run(
     print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
 
 
-@app.command("compare")
+@app.command("compare", epilog=show_examples("lagid runs compare run_1 run_2"))
 def compare_runs(
     runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare runs of several models on the same data."""
     with connect_client(url, key) as client, report_faults(FieldOrigins({"/runs": "RUN"})):
@@ -184,7 +198,7 @@ def compare_runs(
         empty="no runs",
     )
     for note in comparison["notes"]:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+        print_note(note)
 
 
 def _print_step(metrics: dict[str, Any] | None) -> None:
@@ -288,9 +302,11 @@ EXPORT_ORIGINS = FieldOrigins({"?format": "--format", "?pade_order": "--pade-ord
 def export_model(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")],
     format: Annotated[
-        Literal["json", "python", "c", "control"],
-        typer.Option(help="JSON document, Python or C99 source, or a script for python-control."),
-    ] = "json",
+        Literal["json", "python", "c", "control"] | None,
+        typer.Option(
+            help="JSON document (default), Python or C99 source, or a script for python-control."
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write (default: stdout).")
     ] = None,
@@ -302,12 +318,17 @@ def export_model(
     ] = 3,
     url: Url = DEFAULT_URL,
     key: Key = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write the identified model of a run for another program."""
+    if as_json and format not in (None, "json"):
+        fail_usage(f"--json prints the JSON document; leave out --format {format}")
     with connect_client(url, key) as client, report_faults(EXPORT_ORIGINS):
-        text = client.export(run, format, pade_order)
-    if output is None:
+        text = client.export(run, format or "json", pade_order)
+    if output is None or as_json:
         typer.echo(text, nl=False)
+    if output is None:
         return
     write_file(output, text)
-    out.print(str(output), markup=False)
+    if not as_json:
+        out.print(str(output), markup=False)

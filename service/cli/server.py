@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import err, out
+from service.cli.common import AsJson, ask_to_go_on, err, out, print_json, show_examples
 from service.core.errors import Misconfigured, Unavailable
-from service.core.extras import check_extra
+from service.core.extras import check_extra, list_missing
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -211,12 +211,13 @@ def _exit_on_signals() -> None:
 
 database_app = typer.Typer(help="Upgrade and check the database.", no_args_is_help=True)
 
-REQUIRED_PACKAGES = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", "mcap")
+LIBRARY_PACKAGES = ("numpy", "scipy", "numba", "mcap")
+SERVER_PACKAGES = ("ray", "fastapi", "sqlalchemy", "obstore")
 Fix = Annotated[bool, typer.Option("--fix", help="Delete objects that no row refers to.")]
 
 
-@database_app.command("upgrade")
-def upgrade_database(data_dir: DataDir = None) -> None:
+@database_app.command("upgrade", epilog=show_examples("lagid db upgrade"))
+def upgrade_database(data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Create the tables, or upgrade them to this version."""
     from service.storage import migrate
 
@@ -224,16 +225,15 @@ def upgrade_database(data_dir: DataDir = None) -> None:
     settings.prepare_data_folder()
     with open_database(settings) as database:
         migrate.upgrade_database(database)
-        out.print(
-            f"the database is at revision {migrate.read_current_revision(database)}", markup=False
-        )
+        _print_revision(migrate.read_current_revision(database), as_json)
 
 
-@database_app.command("downgrade")
+@database_app.command("downgrade", epilog=show_examples("lagid db downgrade 0001"))
 def downgrade_database(
     revision: Annotated[str, typer.Argument(help="Earlier revision, or base: no tables at all.")],
     data_dir: DataDir = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Go back to the tables of an earlier version; what only later ones can store is lost."""
     from service.storage import migrate
@@ -246,21 +246,22 @@ def downgrade_database(
         open_database(settings) as database,
     ):
         undone = migrate.list_undone_migrations(database, revision)
+        told = err if as_json else out
         for name, description in undone:
-            out.print(f"undoes {name}: {description}", markup=False)
+            told.print(f"undoes {name}: {description}", markup=False)
         lost = "all of its data" if revision == "base" else "what only these revisions store"
-        out.print(f"The database loses {lost}. Stop all dispatchers, and back it up first.")
+        told.print(f"The database loses {lost}. Stop all dispatchers, and back it up first.")
         if not yes:
-            _ask_to_go_on()
+            ask_to_go_on("Go on?", "nothing was done, because nobody can answer here; add --yes")
         migrate.downgrade_database(database, revision)
+        _print_revision(revision, as_json)
+
+
+def _print_revision(revision: str | None, as_json: bool) -> None:
+    if as_json:
+        print_json({"revision": revision})
+    else:
         out.print(f"the database is at revision {revision}", markup=False)
-
-
-def _ask_to_go_on() -> None:
-    if not sys.stdin.isatty():
-        raise Misconfigured("nothing was done, because nobody can answer here; add --yes")
-    if not typer.confirm("Go on?"):
-        raise typer.Exit(1)
 
 
 def _require_database(settings: "Settings") -> None:
@@ -271,8 +272,8 @@ def _require_database(settings: "Settings") -> None:
         )
 
 
-@database_app.command("check")
-def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
+@database_app.command("check", epilog=show_examples("lagid db check", "lagid db check --fix"))
+def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson = False) -> None:
     """Compare database and store: revision, lost objects, objects that no row refers to."""
     from service.storage import garbage, migrate
     from service.storage.objects import open_store
@@ -285,35 +286,55 @@ def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
         with database.read_session() as session:
             lost = garbage.find_lost_hashes(session, store)
             orphans = list(garbage.find_orphans(session, store))
+        n_deleted, freed = garbage.delete_orphans(database, store) if fix else (0, 0)
+    if as_json:
+        found = {"lost": sorted(lost), "without_row": len(orphans)}
+        print_json({**found, "deleted": n_deleted, "freed_bytes": freed})
+    else:
         if fix:
-            n_deleted, freed = garbage.delete_orphans(database, store)
             out.print(f"deleted {n_deleted} objects, {freed} bytes")
-    out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
-    for sha256 in sorted(lost):
-        err.print(f"lost: {sha256}", markup=False)
+        out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
+        for sha256 in sorted(lost):
+            err.print(f"lost: {sha256}", markup=False)
     if lost:
         raise typer.Exit(1)
 
 
-def check_installation(data_dir: DataDir = None) -> None:
+def check_installation(data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Check the installation: packages, kernels, data folder, port."""
-    settings = load_settings(data_dir=data_dir)
     checks: list[tuple[str, Callable[[], str]]] = [
         ("Python", _check_python),
-        ("packages", _check_packages),
+        ("packages", lambda: _list_versions(LIBRARY_PACKAGES)),
         ("kernels", _check_kernels),
-        ("data folder", lambda: _check_folder(settings)),
-        ("port", lambda: _check_port(settings)),
     ]
-    failed = False
+    if list_missing("server"):
+        checks.append(("server", lambda: "not installed: pip install 'lagid[server]' adds it"))
+    else:
+        settings = load_settings(data_dir=data_dir)
+        checks += [
+            ("server", lambda: _list_versions(SERVER_PACKAGES)),
+            ("data folder", lambda: _check_folder(settings)),
+            ("port", lambda: _check_port(settings)),
+        ]
+    found: list[dict[str, Any]] = []
     for name, look in checks:
         try:
-            out.print(f"ok      {name}: {look()}", markup=False, soft_wrap=True)
+            found.append({"check": name, "ok": True, "detail": look()})
         except (Misconfigured, ImportError, OSError, ArithmeticError) as error:
-            failed = True
-            err.print(f"failed  {name}: {error}", markup=False)
-    if failed:
+            found.append({"check": name, "ok": False, "detail": str(error)})
+        if not as_json:
+            _print_check(**found[-1])
+    if as_json:
+        print_json(found)
+    if not all(entry["ok"] for entry in found):
         raise typer.Exit(1)
+
+
+def _print_check(check: str, ok: bool, detail: str) -> None:
+    if ok:
+        out.print(f"ok      {check}: {detail}", markup=False, soft_wrap=True)
+    else:
+        err.print(f"failed  {check}: {detail}", markup=False)
 
 
 @contextmanager
@@ -343,8 +364,8 @@ def _check_python() -> str:
     return sys.version.split()[0]
 
 
-def _check_packages() -> str:
-    return ", ".join(f"{name} {version(name)}" for name in REQUIRED_PACKAGES)
+def _list_versions(packages: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} {version(name)}" for name in packages)
 
 
 def _check_kernels() -> str:

@@ -9,6 +9,7 @@ from service.cli.common import (
     AsJson,
     FieldOrigins,
     Key,
+    Quiet,
     Url,
     apply_setting,
     check_succeeded,
@@ -20,10 +21,11 @@ from service.cli.common import (
     parse_pairs,
     print_job,
     print_json,
-    print_line,
+    print_note,
     print_table,
     read_model,
     report_faults,
+    show_examples,
     split_names,
 )
 from service.cli.watch import follow_job
@@ -108,7 +110,14 @@ Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the tabl
 IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns the same job.")]
 
 
-@app.command("noise")
+@app.command(
+    "noise",
+    epilog=show_examples(
+        "lagid sweep noise --model fopdt --data recording --sigma 0:0.2:0.05 --wait",
+        "lagid sweep noise --model fopdt --true K=2 --true T=1 --true L=0.5 --true y0=0 "
+        "--input 'u=sin(t)' --samples 100 --sample-time 0.1 --sigma 0,0.1",
+    ),
+)
 def sweep_noise(
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     sigma: Sigma,
@@ -129,6 +138,7 @@ def sweep_noise(
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Identify under noise: σ × replicates × methods; errors and Cramér–Rao bounds.
 
@@ -283,7 +293,7 @@ def _print_sweep(
             print_table(headings, rows, empty="no runs")
             out.print()
         for note in [*summary["notes"], *([RELATIVE_NOTE] if is_relative else [])]:
-            print_line(f"note: {note}")
+            print_note(note)
         out.print(
             f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused", markup=False
         )

@@ -16,6 +16,7 @@ from service.cli.common import (
     out,
     print_json,
     print_line,
+    print_note,
     print_table,
 )
 from service.client.calls import ProblemError
@@ -68,9 +69,9 @@ def print_run(run: dict[str, Any], as_json: bool) -> None:
     if run["error"]:
         print_line(run["error"])
     if run["reused_from"]:
-        print_line(f"note: {REUSE_NOTE.format(run['reused_from'])}")
+        print_note(REUSE_NOTE.format(run["reused_from"]))
     for warning in run.get("warnings", []):
-        print_line(f"note: {warning}")
+        print_note(warning)
 
 
 def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
@@ -82,7 +83,7 @@ def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: 
         text = REUSE_NOTE.format(runs[0]["reused_from"])
     else:
         text = f"{reused} of {n_runs} runs were computed before; their results are shown"
-    print_line(f"note: {text}. To compute again: {cure}")
+    print_note(f"{text}. To compute again: {cure}")
 
 
 def _format_fit(run: dict[str, Any]) -> str:
@@ -220,4 +221,4 @@ def print_trend(trend: dict[str, Any], origins: FieldOrigins) -> None:
         text = f"compared with {trend['reference']}{named and ', '}{named}"
         print_line(text)
     for note in list_notes(trend):
-        print_line(f"note: {origins.rewrite_note(note)}")
+        print_note(origins.rewrite_note(note))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from service.cli.common import err
 from service.client.calls import TERMINAL_STATES
 from service.core.text import format_duration, format_value, plain_unit
 
@@ -37,8 +38,8 @@ Clock = Callable[[], float]
 
 
 def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
-    """Show a job until it ends; return its last state."""
-    if quiet:
+    """Show a job until it ends, unless told to be quiet; return its last state."""
+    if quiet or err.quiet:
         return client.wait(job_id)
     first = client.job(job_id)
     console = Console(stderr=True, highlight=False)

@@ -107,9 +107,9 @@ class AsyncClient:
         body = {"name": name, "steps": steps}
         return await self._fetch_document(calls.DERIVE(dataset, json=body))
 
-    async def datasets(self) -> list[Document]:
-        """List all datasets, newest first."""
-        return await self._fetch_list(calls.DATASETS())
+    async def datasets(self, limit: int | None = None) -> list[Document]:
+        """List datasets, newest first: all, or at most `limit`."""
+        return await self._fetch_list(calls.DATASETS(), limit)
 
     async def dataset(self, name: str) -> Document:
         """Fetch one dataset by its id."""
@@ -127,10 +127,17 @@ class AsyncClient:
         """Download a dataset as an MCAP file."""
         return (await self.send(calls.CONTENT(dataset))).content
 
+    async def download(self, dataset: str, format: str = "mcap") -> AsyncIterator[bytes]:
+        """Download a dataset piece by piece: mcap or csv."""
+        stream = await self.send(calls.build_download(dataset, format), stream=True)
+        async with aclosing(stream):
+            async for piece in stream.aiter_bytes():
+                yield piece
+
     # ---- models
-    async def models(self) -> list[Document]:
-        """List the built-in models and those of users."""
-        return await self._fetch_list(calls.MODELS())
+    async def models(self, limit: int | None = None) -> list[Document]:
+        """List the built-in models and those of users: all, or at most `limit`."""
+        return await self._fetch_list(calls.MODELS(), limit)
 
     async def model(self, name: str) -> Document:
         """Fetch one model with its document."""
@@ -288,9 +295,9 @@ class AsyncClient:
         return await self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    async def references(self) -> list[Document]:
-        """List the references in use, by name."""
-        return await self._fetch_list(calls.REFERENCES())
+    async def references(self, limit: int | None = None) -> list[Document]:
+        """List the references in use, by name: all, or at most `limit`."""
+        return await self._fetch_list(calls.REFERENCES(), limit)
 
     async def reference(self, name: str) -> Document:
         """Fetch one reference with its history."""

@@ -158,6 +158,7 @@ DATASET = Endpoint("GET", "datasets/{}")
 SIGNALS = Endpoint("GET", "datasets/{}/signals")
 LINEAGE = Endpoint("GET", "datasets/{}/lineage")
 CONTENT = Endpoint("GET", "datasets/{}/content")
+CONTENT_CSV = Endpoint("GET", "datasets/{}/content.csv")
 
 MODELS = Endpoint("GET", "models")
 MODEL = Endpoint("GET", "models/{}")
@@ -205,6 +206,11 @@ def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | Non
 def build_event_stream(job: str, after: str | None) -> RestCall:
     """Build the call for a job's events, or for those after an event."""
     return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
+
+
+def build_download(dataset: str, file_format: str) -> RestCall:
+    """Build the call that downloads a dataset as ``mcap`` or ``csv``."""
+    return (CONTENT_CSV if file_format == "csv" else CONTENT)(dataset)
 
 
 def build_upload(

@@ -123,9 +123,9 @@ class Client:
         body = {"name": name, "steps": steps}
         return self._fetch_document(calls.DERIVE(dataset, json=body))
 
-    def datasets(self) -> list[Document]:
-        """List all datasets, newest first."""
-        return self._fetch_list(calls.DATASETS())
+    def datasets(self, limit: int | None = None) -> list[Document]:
+        """List datasets, newest first: all, or at most `limit`."""
+        return self._fetch_list(calls.DATASETS(), limit)
 
     def dataset(self, name: str) -> Document:
         """Fetch one dataset by its id."""
@@ -143,10 +143,15 @@ class Client:
         """Download a dataset as an MCAP file."""
         return self.send(calls.CONTENT(dataset)).content
 
+    def download(self, dataset: str, format: str = "mcap") -> Iterator[bytes]:
+        """Download a dataset piece by piece: mcap or csv."""
+        with closing(self.send(calls.build_download(dataset, format), stream=True)) as stream:
+            yield from stream.iter_bytes()
+
     # ---- models
-    def models(self) -> list[Document]:
-        """List the built-in models and those of users."""
-        return self._fetch_list(calls.MODELS())
+    def models(self, limit: int | None = None) -> list[Document]:
+        """List the built-in models and those of users: all, or at most `limit`."""
+        return self._fetch_list(calls.MODELS(), limit)
 
     def model(self, name: str) -> Document:
         """Fetch one model with its document."""
@@ -290,9 +295,9 @@ class Client:
         return self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    def references(self) -> list[Document]:
-        """List the references in use, by name."""
-        return self._fetch_list(calls.REFERENCES())
+    def references(self, limit: int | None = None) -> list[Document]:
+        """List the references in use, by name: all, or at most `limit`."""
+        return self._fetch_list(calls.REFERENCES(), limit)
 
     def reference(self, name: str) -> Document:
         """Fetch one reference with its history."""

@@ -21,12 +21,17 @@ def check_extra(extra: str, purpose: str) -> None:
     Misconfigured
         If one is missing; the message has the command that installs it.
     """
-    missing = [name for name in _list_libraries(extra) if not _is_installed(name)]
+    missing = list_missing(extra)
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise Misconfigured(
             f"{purpose} needs {missing[0]}{more}, not installed here: pip install 'lagid[{extra}]'"
         )
+
+
+def list_missing(extra: str) -> list[str]:
+    """List the libraries of an extra that are not installed."""
+    return [name for name in _list_libraries(extra) if not _is_installed(name)]
 
 
 def _list_libraries(extra: str) -> list[str]:

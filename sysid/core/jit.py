@@ -8,15 +8,21 @@ written, with a digest.
 
 The cache uses internals of Numba. If these are not as expected, functions are compiled without a
 cache and a warning is logged.
+
+The search takes about a minute to compile, once after an installation. A line on stderr says so,
+and `read_clock` does not count it.
 """
 
 import pickle
 import re
 import sys
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
+from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
 
 import llvmlite
@@ -34,6 +40,8 @@ _SOURCE_PATTERNS = (
     "uncertainty/sensitivities.py",
 )
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
+_LONG_TO_COMPILE = ("sysid.search.", "sysid.islands.")
+COMPILATION_NOTE = "compiling the search, once after an installation: about a minute"
 _REDUCED_PARTS = 9  # of a compiled function; the last are environments
 _CACHE_ERRORS = (
     ArithmeticError,
@@ -142,6 +150,71 @@ def _digest_file(source: str) -> str | None:
         return None
 
 
+class CompilationWatch(threading.local):
+    """How long each thread has compiled functions, and a line where that takes long.
+
+    Attributes
+    ----------
+    begun : float or None
+        Reading of the clock when the present compilation began; None: nothing is compiled.
+    seconds : float
+        Duration of all compilations before.
+    """
+
+    def __init__(self, clock: Callable[[], float] = perf_counter) -> None:
+        self._clock = clock
+        self.begun: float | None = None
+        self.seconds = 0.0
+
+    def begin(self, module: str) -> None:
+        """Note that a function of a module is about to be compiled."""
+        if self.begun is None:
+            self.begun = self._clock()
+        if module.startswith(_LONG_TO_COMPILE):
+            _announce_once()
+
+    @contextmanager
+    def watch_function(self) -> Iterator[None]:
+        """Note the end of what is begun inside; functions that it calls are compiled meanwhile."""
+        is_outermost = self.begun is None
+        try:
+            yield
+        finally:  # also if the user interrupts it
+            if is_outermost and self.begun is not None:
+                self.seconds += self._clock() - self.begun
+                self.begun = None
+
+    def read_clock(self) -> float:
+        """Read a clock in seconds that stands still while this thread compiles functions."""
+        return (self._clock() if self.begun is None else self.begun) - self.seconds
+
+
+@cache
+def _announce_once() -> None:
+    _announce(COMPILATION_NOTE)
+
+
+def _print_on_stderr(line: str) -> None:
+    sys.stderr.write(f"{line}\n")
+    sys.stderr.flush()
+
+
+_announce: Callable[[str], object] = _print_on_stderr
+_watch = CompilationWatch()
+read_clock = _watch.read_clock
+
+
+@contextmanager
+def announce_compilation(write_line: Callable[[str], object]) -> Iterator[None]:
+    """Give the line that the search is compiled to `write_line` instead of stderr."""
+    global _announce
+    before, _announce = _announce, write_line
+    try:
+        yield
+    finally:
+        _announce = before
+
+
 class _FunctionCache:
     """Cache of one function, with the interface that Numba's dispatcher expects."""
 
@@ -155,12 +228,15 @@ class _FunctionCache:
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled function for a signature; None if no usable one is stored."""
+        function = None
         try:
             content = load_code(self._compute_key(sig, target_context), "loop")
-            return None if content is None else _rebuild_function(content, target_context)
+            function = None if content is None else _rebuild_function(content, target_context)
         except _CACHE_ERRORS as error:
             warn_not_cached(f"{self._name} is not loaded ({error!r})")
-            return None
+        if function is None:
+            _watch.begin(self._module)
+        return function
 
     def save_overload(self, sig: Any, compiled_: Any) -> None:
         """Store a compiled function, unless it contains addresses of this process.
@@ -254,6 +330,16 @@ def _link_module(library: Any, bitcode: bytes) -> Any:
     return library._shared_module
 
 
+def _watch_compilation(compile_signature: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Wrap the method of a function that loads or compiles it for a signature."""
+
+    def compile_watched(sig: Any) -> Any:
+        with _watch.watch_function():
+            return compile_signature(sig)
+
+    return compile_watched
+
+
 def jit_compile(function: _Function) -> _Function:
     """Compile with Numba: cached on disk, GIL released, IEEE 754 division.
 
@@ -262,6 +348,7 @@ def jit_compile(function: _Function) -> _Function:
     compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
     if hasattr(compiled, "_cache"):
         compiled._cache = _FunctionCache(function)
+        compiled.compile = _watch_compilation(compiled.compile)
     elif compiled is not function:  # they are the same if NUMBA_DISABLE_JIT is set
         warn_not_cached(f"Numba {numba.__version__} has no function cache in the expected place")
     return cast(_Function, compiled)

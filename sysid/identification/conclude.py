@@ -1,11 +1,11 @@
 """Conclude a search: refinement, uncertainty, validation, warnings."""
 
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
+from sysid.core.jit import read_clock
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
@@ -49,7 +49,7 @@ def conclude_run(
     algorithm: GeneticAlgorithm,
     state: RunState,
     validation: Problem | None = None,
-    clock: Clock = perf_counter,
+    clock: Clock = read_clock,
     *,
     posterior: bool = False,
 ) -> Identification:

@@ -1,7 +1,8 @@
 """Time limit of a run, for the steps that follow its search."""
 
 from collections.abc import Callable
-from time import perf_counter
+
+from sysid.core.jit import read_clock
 
 Clock = Callable[[], float]
 """Seconds since an arbitrary moment."""
@@ -25,7 +26,7 @@ class Deadline:
         Returns seconds.
     """
 
-    def __init__(self, limit: float | None, used: float, clock: Clock = perf_counter) -> None:
+    def __init__(self, limit: float | None, used: float, clock: Clock = read_clock) -> None:
         self._clock = clock
         self._is_limited = limit is not None
         limit = float("inf") if limit is None else limit

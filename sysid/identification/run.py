@@ -8,8 +8,8 @@ nowhere else in this package.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from time import perf_counter
 
+from sysid.core.jit import read_clock
 from sysid.core.settings import GeneticAlgorithm
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.evolve import (
@@ -171,7 +171,7 @@ class _CallBudget:
         should_stop: Callable[[], bool] | None,
         first: int,
     ) -> None:
-        self._start = self._last = perf_counter()
+        self._start = self._last = read_clock()
         self._before, self._should_stop, self._calls = before, should_stop, 0
         ends = [
             end for end in (seconds, None if limit is None else limit - before) if end is not None
@@ -181,7 +181,7 @@ class _CallBudget:
         self._generation_seconds = 0.0  # of one generation of one island, as measured
 
     def measure_used_seconds(self) -> float:
-        return self._before + perf_counter() - self._start
+        return self._before + read_clock() - self._start
 
     def is_over(self) -> bool:
         """Whether to stop; at least one call is always made, so every advance makes progress."""
@@ -207,6 +207,6 @@ class _CallBudget:
         )
 
     def record_call(self, count: int) -> None:
-        now = perf_counter()
+        now = read_clock()
         self._generation_seconds = max((now - self._last) / max(count, 1), 1e-9)
         self._last, self._calls = now, self._calls + 1

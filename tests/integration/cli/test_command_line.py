@@ -233,7 +233,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         "algorithm.generations=150",
         "--set",
         "validation.fraction=0.4",
-        "--json",
+        "--output",
         result,
     )
     assert done.code == 0, done.stderr
@@ -259,7 +259,7 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
     settings = ("noise.sigma=0.05", "algorithm.generations=20", "algorithm.stop.evaluations=6000")
     options = [word for setting in settings for word in ("--set", setting)]
     result = tmp_path / "out.json"
-    words = ("identify", data, "--model", "fopdt", *options, "--posterior", "--json", result)
+    words = ("identify", data, "--model", "fopdt", *options, "--posterior", "--output", result)
     done = run_lagid(*words)
     assert done.code == 0, done.stderr
     (heading,) = [line for line in done.stdout.splitlines() if line.startswith("posterior ")]

@@ -339,7 +339,7 @@ def test_the_command_uploads_prints_and_accepts(
         words.append(f"{x:g}={file}")
     out = tmp_path / "trend.json"
     told = command.invoke(
-        lagid, [*words, "--json", str(out), "--accept", "own", "--accept-run", "4"]
+        lagid, [*words, "--output", str(out), "--accept", "own", "--accept-run", "4"]
     )
     assert told.exit_code == 0, told.output
     assert "L = (" in told.output
