@@ -219,9 +219,9 @@ Fix = Annotated[bool, typer.Option("--fix", help="Delete objects that no row ref
 @database_app.command("upgrade", epilog=show_examples("lagid db upgrade"))
 def upgrade_database(data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Create the tables, or upgrade them to this version."""
+    settings = load_settings(data_dir=data_dir)
     from service.storage import migrate
 
-    settings = load_settings(data_dir=data_dir)
     settings.prepare_data_folder()
     with open_database(settings) as database:
         migrate.upgrade_database(database)
@@ -236,9 +236,9 @@ def downgrade_database(
     as_json: AsJson = False,
 ) -> None:
     """Go back to the tables of an earlier version; what only later ones can store is lost."""
+    settings = load_settings(data_dir=data_dir)
     from service.storage import migrate
 
-    settings = load_settings(data_dir=data_dir)
     _require_database(settings)
     settings.prepare_data_folder()
     with (
@@ -275,10 +275,10 @@ def _require_database(settings: "Settings") -> None:
 @database_app.command("check", epilog=show_examples("lagid db check", "lagid db check --fix"))
 def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson = False) -> None:
     """Compare database and store: revision, lost objects, objects that no row refers to."""
+    settings = load_settings(data_dir=data_dir)
     from service.storage import garbage, migrate
     from service.storage.objects import open_store
 
-    settings = load_settings(data_dir=data_dir)
     _require_database(settings)
     with open_database(settings) as database:
         migrate.check_revision(database)

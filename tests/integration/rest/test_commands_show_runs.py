@@ -133,7 +133,7 @@ def test_the_list_of_jobs_has_the_rms_of_a_single_run_with_its_unit(
     job = served.client.job(served.job)
     single = {**job, "progress": {**job["progress"], "runs": 1, "finished": 1}}
     waiting = {**single, "progress": {**single["progress"], "finished": 0, "best_rms": None}}
-    monkeypatch.setattr(served.client, "jobs", lambda **_: [single, waiting])
+    monkeypatch.setattr(served.client, "jobs", lambda *_, **__: [single, waiting])
     _, first, second = lagid("jobs").output.splitlines()
     assert f"{job['progress']['best_rms']:.6g}  m " in first
     assert "1/1 " in first

@@ -1,0 +1,210 @@
+"""The wheel: what is in it, and that it works on each Python, in an environment of its own."""
+
+import email
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import pytest
+
+from service.client.embedded import find_free_port
+from tests.needs import report_missing
+from tests.repository import ROOT
+from tests.rest import recording
+
+pytestmark = pytest.mark.slow  # it builds a wheel
+
+PYTHONS = ("3.11", "3.12", "3.13")
+LIMIT_SECONDS = 900.0  # libraries are fetched, and the search is compiled
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the tracked files, built by the tools that are here."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    listing = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    for name in filter(None, listing.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, source / name)
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
+    built = subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", *options, "-w", target, source],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stderr
+    (path,) = target.iterdir()
+    return path
+
+
+def test_the_wheel_holds_all_that_runs_and_no_tests(wheel: Path) -> None:
+    with ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    for part in ("lagid", "sysid", "workers", "service", "migrations"):
+        modules = {str(path.relative_to(ROOT)) for path in (ROOT / part).rglob("*.py")}
+        assert modules - names == set()
+    for pattern in (
+        "service/pages/templates/*",
+        "service/pages/static/*",
+        "sysid/models/catalogue/*.yaml",
+        "migrations/versions/*.py",
+        "migrations/script.py.mako",
+        "*/py.typed",
+    ):
+        files = {str(p.relative_to(ROOT)) for p in ROOT.glob(pattern) if p.is_file()}
+        assert files
+        assert files - names == set()
+    assert {f"{part}/py.typed" for part in ("lagid", "sysid", "workers", "service")} <= names
+    information = {name.rpartition("/")[2] for name in names if ".dist-info/" in name}
+    assert {"LICENSE", "METADATA", "entry_points.txt"} <= information
+    tops = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
+    assert tops == {"lagid", "sysid", "workers", "service", "migrations"}
+
+
+def test_the_wheel_names_its_version_licence_extras_and_command(wheel: Path) -> None:
+    import lagid
+
+    with ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        about = email.message_from_bytes(archive.read(name))
+        command = archive.read(name.replace("METADATA", "entry_points.txt")).decode()
+    assert about["Version"] == lagid.__version__
+    assert about["License-Expression"] == "Apache-2.0"
+    assert about["Requires-Python"] == ">=3.11"
+    assert {*about.get_all("Provides-Extra")} == {"server", "postgres", "notebook", "test"}
+    classifiers = about.get_all("Classifier")
+    assert {f"Programming Language :: Python :: {one}" for one in PYTHONS} <= {*classifiers}
+    assert "lagid = lagid:main" in command
+
+
+def find_python(version: str) -> Path:
+    """Find an interpreter of this version; without one the test is skipped."""
+    installed = Path.home() / ".pyenv" / "versions"
+    found = [shutil.which(f"python{version}"), *installed.glob(f"{version}.*/bin/python")]
+    for path in filter(None, found):
+        asked = "import sys; print('%d.%d' % sys.version_info[:2])"
+        done = subprocess.run([path, "-c", asked], capture_output=True, text=True, check=False)
+        if done.stdout.strip() == version:
+            return Path(path)
+    report_missing("python", f"Python {version} is absent")
+    raise AssertionError
+
+
+class Installation:
+    """An environment with the wheel in it, and a folder outside the checkout."""
+
+    def __init__(self, python: Path, folder: Path) -> None:
+        self.folder, self._bin = folder / "work", folder / "environment" / "bin"
+        self.folder.mkdir()
+        subprocess.run([python, "-m", "venv", self._bin.parent], check=True)
+        kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        self._environment = {
+            **{name: value for name, value in kept.items() if not name.startswith("LAGID_")},
+            "LAGID_CACHE_DIR": str(folder / "cache"),
+        }
+
+    def install(self, requirement: str) -> None:
+        words = ("install", "--quiet", "--disable-pip-version-check", requirement)
+        done = self.run("python", "-m", "pip", *words)
+        assert done.returncode == 0, done.stderr
+
+    def run(self, program: str, *words: object) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
+            self._build_command(program, words),
+            cwd=self.folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_SECONDS,
+            check=False,
+        )
+
+    def run_json(self, *words: object) -> Any:
+        done = self.run("lagid", *words, "--json")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    @contextmanager
+    def serve(self) -> Iterator[str]:
+        """Run `lagid serve` for the length of the block, at the address that is given."""
+        port = find_free_port()
+        words = ("serve", "--port", port, "--data-dir", self.folder / "data", "--cpus", 1)
+        child = subprocess.Popen(
+            self._build_command("lagid", words),
+            cwd=self.folder,
+            env=self._environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert child.stdout is not None
+            line = child.stdout.readline()
+            assert f":{port}/" in line
+            yield f"http://127.0.0.1:{port}"
+            child.send_signal(signal.SIGTERM)
+            assert child.wait(60) == 0
+        finally:
+            child.kill()
+            child.communicate()
+
+    def _build_command(self, program: str, words: Sequence[object]) -> list[str]:
+        return [str(self._bin / program), *map(str, words)]
+
+
+@pytest.mark.night
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("version", PYTHONS)
+def test_the_wheel_identifies_serves_and_runs_a_job(
+    version: str, wheel: Path, tmp_path: Path
+) -> None:
+    here = Installation(find_python(version), tmp_path)
+    (here.folder / "steps.csv").write_bytes(recording())
+    identify = ("identify", "steps.csv", "--model", "fopdt")
+
+    here.install(str(wheel))
+    import lagid
+
+    assert here.run("lagid", "--version").stdout == f"lagid {lagid.__version__}\n"
+    first = here.run("lagid", *identify, "--output", "found.json")
+    assert first.returncode == 0, first.stderr
+    assert first.stderr.startswith("compiling the search, once after an installation")
+    found = json.loads((here.folder / "found.json").read_text())
+    again = here.run("lagid", *identify, "--json")
+    assert "compiling" not in again.stderr
+    unlike = {"seconds"}
+    assert {
+        name: value for name, value in json.loads(again.stdout).items() if name not in unlike
+    } == {name: value for name, value in found.items() if name not in unlike}
+    assert found["seconds"] < 30  # the compilation takes a minute and more
+    assert "pip install 'lagid[server]'" in here.run("lagid", "serve").stderr
+    (here.folder / "face.py").write_text(
+        "import lagid\nprint(lagid.identify.__module__, lagid.Client.__module__)\n"
+    )
+    face = here.run("python", "face.py")
+    assert face.stdout == "sysid.identification.identify service.client.client\n", face.stderr
+
+    here.install(f"{wheel}[server]")
+    with here.serve() as url:
+        place = ("--url", url)
+        assert here.run_json("dataset", "add", "steps.csv", *place)["name"] == "steps"
+        (here.folder / "job.yaml").write_text("model: fopdt\ndatasets: [steps]\n")
+        job = here.run_json("submit", "job.yaml", "--wait", *place)
+        report = here.run("lagid", "report", job["id"], *place)
+        assert report.returncode == 0, report.stderr
+    assert job["state"] == "succeeded"
+    (run,) = job["runs"]
+    values = {parameter["name"]: parameter["value"] for parameter in run["parameters"]}
+    assert values == {parameter["name"]: parameter["value"] for parameter in found["parameters"]}
+    assert "Plotly" in (here.folder / "report.html").read_text()
