@@ -51,24 +51,7 @@ def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
     )
     with run_embedded_service(data_dir, port=own_port, cpus=settings.cpus or os.cpu_count()) as url:
         console.print(f"service ready on {url}", highlight=False)
-        with Client(url) as client:
-            dataset = client.simulate_dataset(DATASET_BODY)
-            job = client.submit(
-                {
-                    "name": "paper example 1",
-                    "model": "duffing-eq16",
-                    "datasets": [dataset["id"]],
-                    "sweep": {"axes": [{"path": "/algorithm/method", "values": list(METHODS)}]},
-                }
-            )
-            finished = _watch_job(client, job["id"], console)
-            runs = {run["cell"]["/algorithm/method"]: run for run in client.runs(job["id"])}
-            if finished["state"] != "succeeded":
-                console.print(f"the job {finished['state']}: {finished.get('error')}")
-                raise typer.Exit(1)
-            _print_table(console, runs)
-            report = data_dir / "report.html"
-            report.write_text(client.report(job["id"]), encoding="utf-8")
+        report = run_example(url, data_dir, console)
     _print_locations(console, data_dir, report)
     command = [_name_program(), "serve", "--data-dir", str(data_dir)]
     command += [] if port is None else ["--port", str(port)]
@@ -78,6 +61,35 @@ def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
         markup=False,
         soft_wrap=True,
     )
+
+
+def run_example(url: str, data_dir: Path, console: Console) -> Path:
+    """Run Example 1 on a service, print its table, and write the report into a folder.
+
+    Returns
+    -------
+    Path
+        The file of the report.
+    """
+    with Client(url) as client:
+        dataset = client.simulate_dataset(DATASET_BODY)
+        job = client.submit(
+            {
+                "name": "paper example 1",
+                "model": "duffing-eq16",
+                "datasets": [dataset["id"]],
+                "sweep": {"axes": [{"path": "/algorithm/method", "values": list(METHODS)}]},
+            }
+        )
+        finished = _watch_job(client, job["id"], console)
+        runs = {run["cell"]["/algorithm/method"]: run for run in client.runs(job["id"])}
+        if finished["state"] != "succeeded":
+            console.print(f"the job {finished['state']}: {finished.get('error')}")
+            raise typer.Exit(1)
+        _print_table(console, runs)
+        report = data_dir / "report.html"
+        report.write_text(client.report(job["id"]), encoding="utf-8")
+    return report
 
 
 def _name_program() -> str:

@@ -118,7 +118,7 @@ work.add_group("sweep", sweeps.app)
 work.add(
     "reidentify",
     reidentify,
-    "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv 20=c.csv --wait",
+    "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv --wait",
     "lagid reidentify --model tube --label length_m --reference tube 30=new.csv",
 )
 results = _HelpPanel("Results")

@@ -43,7 +43,8 @@ def list_by_default(context: typer.Context) -> None:
 
 
 @app.command(
-    "list", epilog=show_examples("lagid models", "lagid models list --url http://127.0.0.1:8000")
+    "list",
+    epilog=show_examples("lagid models list", "lagid models list --url http://127.0.0.1:8000"),
 )
 def list_models(
     url: Annotated[

@@ -114,8 +114,7 @@ IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns t
     "noise",
     epilog=show_examples(
         "lagid sweep noise --model fopdt --data recording --sigma 0:0.2:0.05 --wait",
-        "lagid sweep noise --model fopdt --true K=2 --true T=1 --true L=0.5 --true y0=0 "
-        "--input 'u=sin(t)' --samples 100 --sample-time 0.1 --sigma 0,0.1",
+        "lagid sweep noise --model mine.yaml --data recording --sigma 0,0.1,0.5",
     ),
 )
 def sweep_noise(

@@ -16,6 +16,7 @@ from zipfile import ZipFile
 import pytest
 
 from service.client.embedded import find_free_port
+from tests.guard import SESSION_VARIABLE
 from tests.needs import report_missing
 from tests.repository import ROOT
 from tests.rest import recording
@@ -109,11 +110,12 @@ class Installation:
         self.folder, self._bin = folder / "work", folder / "environment" / "bin"
         self.folder.mkdir()
         subprocess.run([python, "-m", "venv", self._bin.parent], check=True)
-        kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        self._environment = {
-            **{name: value for name, value in kept.items() if not name.startswith("LAGID_")},
-            "LAGID_CACHE_DIR": str(folder / "cache"),
+        kept = {
+            name: value
+            for name, value in os.environ.items()
+            if name == SESSION_VARIABLE or not name.startswith(("LAGID_", "PYTHON"))
         }
+        self._environment = {**kept, "LAGID_CACHE_DIR": str(folder / "cache")}
 
     def install(self, requirement: str) -> None:
         words = ("install", "--quiet", "--disable-pip-version-check", requirement)
