@@ -1,5 +1,7 @@
 """Compiling is announced once where it takes long, and is no time of a search."""
 
+from functools import cache
+
 import pytest
 
 from sysid.core import jit
@@ -24,7 +26,7 @@ def clock() -> Clock:
 @pytest.fixture
 def watch(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> CompilationWatch:
     """A watch of a process that has compiled nothing."""
-    monkeypatch.setattr(jit, "_announce_once", jit.cache(jit._announce_once.__wrapped__))
+    monkeypatch.setattr(jit, "_announce_once", cache(jit._announce_once.__wrapped__))
     return CompilationWatch(clock)
 
 
