@@ -280,7 +280,7 @@ def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]
         f"--data-binary @- <<'LAGID'\n{body}\nLAGID"
     )
     python = (
-        f'from service.client.client import Client\n\nclient = Client("{url}")\n'
+        f'from lagid import Client\n\nclient = Client("{url}")\n'
         f"job = client.submit({pformat(dict(job.request), width=92, sort_dicts=False)})\n"
         'client.wait(job["id"])\n'
     )
