@@ -32,10 +32,10 @@ $(READY): requirements.lock pyproject.toml
 	@git config core.hooksPath .ci/hooks 2>/dev/null || true  # subjects of at most 72 characters
 	@touch $@
 
-demo: warm
+demo: $(READY)
 	@$(BIN)/lagid demo
 
-paper: warm
+paper: $(READY)
 	@$(BIN)/lagid paper
 
 serve: warm

@@ -16,6 +16,7 @@ from service.cli.common import format_estimate
 from service.cli.server import load_settings
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
+from sysid.identification import warmup
 
 # Example 1 of the paper: Eq. 13-16 with the parameters and the input of its section 4.
 TRUE_PARAMETERS = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
@@ -46,6 +47,7 @@ def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
     settings = load_settings(data_dir=data_dir, port=port)
     data_dir = settings.data_dir if "data_dir" in settings.model_fields_set else FOLDER
     own_port = settings.port if "port" in settings.model_fields_set else None
+    warmup.compile_search()  # here a line can tell it; a worker would be silent for a minute
     console.print(
         "[bold]lagid[/] starts: web process, dispatcher, local Ray, SQLite", highlight=False
     )

@@ -24,6 +24,7 @@ from service.cli.common import (
     fail,
     fail_usage,
     format_estimate,
+    name_file,
     open_recording,
     out,
     parse_channels,
@@ -135,8 +136,9 @@ def identify(
     reading = CsvOptions(sample_time, tuple(split_names(segments)))
     with open_recording(data) as path:
         recording = read_recording(path, reading)
+    source = Path(name_file(data))
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
-    records = _extract_records(recording, data, loaded, body)
+    records = _extract_records(recording, source, loaded, body)
     validation_records = []
     if validation is not None:
         validation_records = _extract_records(

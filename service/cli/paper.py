@@ -63,11 +63,13 @@ def _client(url: str | None, key: str | None) -> "Iterator[Client]":
     """Open a client of the named server, or of one that runs until the command ends."""
     from service.client.client import Client
     from service.client.embedded import run_embedded_service
+    from sysid.identification.warmup import compile_search
 
     if url is not None:
         with Client(url, key) as client:
             yield client
         return
+    compile_search()  # here a line can tell it; a worker would be silent for a minute
     with (
         TemporaryDirectory(prefix="lagid-paper-") as folder,
         run_embedded_service(Path(folder), cpus=os.cpu_count()) as own_url,

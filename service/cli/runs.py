@@ -53,7 +53,7 @@ class _RunsGroup(TyperGroup):
     """Group of commands on runs; without a command it lists the runs of a job."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args or args[0] not in (*self.commands, "--help"):
+        if not args or args[0] not in (*self.commands, *ctx.help_option_names):
             args = [LIST_COMMAND, *args]
         return super().parse_args(ctx, args)
 

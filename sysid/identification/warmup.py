@@ -12,7 +12,8 @@ def compile_search() -> None:
     """Run a minimal search.
 
     The search is one compiled function for all models, and its machine code is stored on disk.
-    So this takes some twenty seconds after an installation or update, and a moment otherwise.
+    So this takes about a minute after an installation or update, and a moment otherwise. A line
+    on stderr tells the former.
     """
     times = 0.1 * np.arange(40.0)
     step = np.where(times < 0.5, 0.0, 1.0)

@@ -68,6 +68,16 @@ def test_what_tests_import_is_declared() -> None:
     assert imported - declared - {*names.values()} == set()
 
 
+def test_what_is_declared_is_in_the_lock() -> None:
+    locked = set(
+        re.findall(r"^([\w.-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+    )
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lists = (project["dependencies"], *project["optional-dependencies"].values())
+    names = {Requirement(line).name.lower() for lines in lists for line in lines}
+    assert names - locked == set()
+
+
 # Without the libraries of a server: as after a plain `pip install lagid`.
 PLAIN = """
 import contextlib, io, json, sys

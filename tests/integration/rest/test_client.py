@@ -90,6 +90,14 @@ def test_a_problem_has_its_document_and_a_readable_line(client: Client, dataset:
     assert "\n" not in str(refused.value)
 
 
+def test_a_dataset_is_downloaded_piece_by_piece(client: Client, dataset: str) -> None:
+    assert b"".join(client.download(dataset)) == client.content(dataset)
+    text = b"".join(client.download(dataset, "csv")).decode()
+    assert text.count("\n") == 1 + client.dataset(dataset)["samples"]
+    with pytest.raises(ProblemError, match="no dataset"):
+        next(client.download("ds_0"))
+
+
 def test_models_are_read_checked_and_stored(client: Client) -> None:
     document = client.model("fopdt")["document"]
     assert client.check_model(document)["valid"] is True
@@ -135,6 +143,8 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
             assert (await client.wait(job["id"]))["state"] == "cancelled"
             with pytest.raises(ProblemError, match="no run"):
                 await client.run("run_0")
+            pieces = [piece async for piece in client.download(dataset)]
+            assert b"".join(pieces) == await client.content(dataset)
             sweep = {"model": "fopdt", "datasets": [dataset], "sigma": [0, 0.1], "replicates": 3}
             twins = [await client.noise_sweep(sweep, idempotency_key="n") for _ in range(2)]
             assert twins[0]["id"] == twins[1]["id"]

@@ -12,6 +12,7 @@ import typer
 from service.cli import common, demo
 from service.cli.common import Listing, fetch_listing
 from service.cli.main import app
+from sysid.identification import warmup
 from tests.commands import check_refusal, run_lagid
 
 PROGRAM: Any = typer.main.get_command(app)
@@ -64,6 +65,8 @@ def test_help_shows_the_groups_and_the_examples() -> None:
     assert places == sorted(places)
     assert {"Results", "Server"} <= {*re.findall(r"╭─ (\w+) ─", text)}
     assert "$ lagid identify recording.csv --model fopdt" in text
+    assert run_lagid("-h").stdout == text
+    assert run_lagid("runs", "-h").stdout == run_lagid("runs", "--help").stdout
 
 
 def test_json_is_a_switch_and_quiet_and_limit_mean_the_same_everywhere() -> None:
@@ -209,11 +212,12 @@ def test_the_demo_obeys_its_settings_and_ends_with_what_opens_its_data(
 
     monkeypatch.setattr(demo, "run_embedded_service", Embedded)
     monkeypatch.setattr(demo, "run_example", run_example)
+    monkeypatch.setattr(warmup, "compile_search", lambda: asked.append("compiled"))
     monkeypatch.delenv("LAGID_DATA_DIR", raising=False)
     monkeypatch.delenv("LAGID_PORT", raising=False)
     done = run_lagid("demo", *words, cwd=tmp_path, **environment)
     assert done.code == 0, done.stderr
-    assert asked == [(Path(folder), port), "http://of-the-demo"]
+    assert asked == ["compiled", (Path(folder), port), "http://of-the-demo"]
     last = done.stdout.strip().splitlines()[-1]
     assert last.startswith("Look at it again: ")
     assert last.endswith(again.format("http://127.0.0.1:"))

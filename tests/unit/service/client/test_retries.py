@@ -208,7 +208,7 @@ def test_methods_of_both_clients_have_the_same_parameters_and_docstring(name: st
     assert inspect.signature(plain).parameters == inspect.signature(twin).parameters
     assert inspect.getdoc(plain) == inspect.getdoc(twin)
     gives, twin_gives = (inspect.signature(one).return_annotation for one in (plain, twin))
-    iterates = {"events": "Iterator", "runs": "list"}.get(name)
+    iterates = {"download": "Iterator", "events": "Iterator", "runs": "list"}.get(name)
     if iterates is None:
         assert inspect.iscoroutinefunction(twin)
         assert gives == twin_gives
