@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from service.client.calls import DEFAULT_URL, MCAP_MAGIC, NotFinite, ProblemError
+from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
 from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import DASH, format_value, plain_estimate
@@ -33,6 +33,7 @@ MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
 STANDARD_INPUT = Path("-")
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 LISTED_ENTRIES = 50
 """Entries of a table, if the user names no other number."""
 COUNTED_ENTRIES = 500
