@@ -390,9 +390,8 @@ def _run_identification(
         TimeElapsedColumn(),
     )
     console = Console(stderr=True, highlight=False)
-    quiet = (
-        quiet or err.quiet or not console.is_terminal
-    )  # in a file a finished bar is an empty line
+    # In a file a finished bar is an empty line.
+    quiet = quiet or err.quiet or not console.is_terminal
     with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
         bar = progress.add_task("", total=algorithm.generations, rms="–")
 

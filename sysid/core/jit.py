@@ -40,7 +40,7 @@ _SOURCE_PATTERNS = (
     "uncertainty/sensitivities.py",
 )
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
-_LONG_TO_COMPILE = ("sysid.search.", "sysid.islands.")
+_LONG_TO_COMPILE = "sysid.islands.evolve"  # its function holds the whole search
 COMPILATION_NOTE = "compiling the search, once after an installation: about a minute"
 _REDUCED_PARTS = 9  # of a compiled function; the last are environments
 _CACHE_ERRORS = (
@@ -162,25 +162,26 @@ class CompilationWatch(threading.local):
     """
 
     def __init__(self, clock: Callable[[], float] = perf_counter) -> None:
-        self._clock = clock
+        self._clock, self._depth = clock, 0
         self.begun: float | None = None
         self.seconds = 0.0
 
     def begin(self, module: str) -> None:
         """Note that a function of a module is about to be compiled."""
-        if self.begun is None:
+        if self.begun is None and self._depth:
             self.begun = self._clock()
-        if module.startswith(_LONG_TO_COMPILE):
+        if module == _LONG_TO_COMPILE:
             _announce_once()
 
     @contextmanager
     def watch_function(self) -> Iterator[None]:
         """Note the end of what is begun inside; functions that it calls are compiled meanwhile."""
-        is_outermost = self.begun is None
+        self._depth += 1
         try:
             yield
         finally:  # also if the user interrupts it
-            if is_outermost and self.begun is not None:
+            self._depth -= 1
+            if self._depth == 0 and self.begun is not None:
                 self.seconds += self._clock() - self.begun
                 self.begun = None
 

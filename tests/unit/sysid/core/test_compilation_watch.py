@@ -75,11 +75,27 @@ def test_the_clock_goes_on_after_a_compilation_that_is_interrupted(
 def test_only_the_search_is_announced_and_only_once(
     watch: CompilationWatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    watch.begin("sysid.simulation.evaluator")
+    watch.begin("sysid.search.evolution")
     assert capsys.readouterr() == ("", "")
     watch.begin("sysid.islands.evolve")
-    watch.begin("sysid.search.evolution")
+    watch.begin("sysid.islands.evolve")
     assert capsys.readouterr() == ("", f"{COMPILATION_NOTE}\n")
+
+
+def test_what_is_compiled_unwatched_does_not_stop_the_clock(
+    watch: CompilationWatch, clock: Clock
+) -> None:
+    start = watch.read_clock()
+    watch.begin("sysid.data.interpolation")
+    clock.now += 3
+    assert watch.read_clock() - start == 3
+
+
+def test_the_function_that_is_announced_is_there() -> None:
+    from sysid.islands import evolve
+
+    assert evolve.__name__ == jit._LONG_TO_COMPILE
+    assert hasattr(evolve._run_epochs, "signatures")
 
 
 def test_a_program_may_tell_it_by_other_means(
@@ -87,7 +103,7 @@ def test_a_program_may_tell_it_by_other_means(
 ) -> None:
     lines: list[str] = []
     with announce_compilation(lines.append):
-        watch.begin("sysid.search.evolution")
+        watch.begin("sysid.islands.evolve")
     assert lines == [COMPILATION_NOTE]
     assert capsys.readouterr() == ("", "")
 
