@@ -37,6 +37,7 @@ PAPER_PROPOSED = {"c": 0.195112, "L": 0.497556, "b": 5.004888, "a": 1.012708}
 
 
 FOLDER = Path("lagid-demo")
+DEFAULT_PORT = 8000
 
 
 def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
@@ -46,7 +47,7 @@ def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
     """
     settings = load_settings(data_dir=data_dir, port=port)
     data_dir = settings.data_dir if "data_dir" in settings.model_fields_set else FOLDER
-    own_port = settings.port if "port" in settings.model_fields_set else None
+    own_port = settings.port if settings.port and "port" in settings.model_fields_set else None
     warmup.compile_search()  # here a line can tell it; a worker would be silent for a minute
     console.print(
         "[bold]lagid[/] starts: web process, dispatcher, local Ray, SQLite", highlight=False
@@ -56,9 +57,10 @@ def run_demo(data_dir: Path | None, port: int | None, console: Console) -> None:
         report = run_example(url, data_dir, console)
     _print_locations(console, data_dir, report)
     command = [_name_program(), "serve", "--data-dir", str(data_dir)]
-    command += [] if port is None else ["--port", str(port)]
+    command += [] if own_port is None else ["--port", str(own_port)]
+    address = f"http://{settings.host}:{own_port or DEFAULT_PORT}/"
     console.print(
-        f"Look at it again: {shlex.join(command)}, then open http://{settings.host}:{settings.port}/",
+        f"Look at it again: {shlex.join(command)}, then open {address}",
         highlight=False,
         markup=False,
         soft_wrap=True,

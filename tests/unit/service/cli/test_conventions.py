@@ -174,8 +174,9 @@ def test_not_all_entries_of_a_long_list_are_counted() -> None:
             {"LAGID_DATA_DIR": "my data", "LAGID_PORT": "8701"},
             "my data",
             8701,
-            "serve --data-dir 'my data', then open {}8701/",
+            "serve --data-dir 'my data' --port 8701, then open {}8701/",
         ),
+        (["--port", "0"], {}, "lagid-demo", None, "serve --data-dir lagid-demo, then open {}8000/"),
         (
             ["--data-dir", "other", "--port", "8702"],
             {"LAGID_DATA_DIR": "mine", "LAGID_PORT": "8701"},
