@@ -165,13 +165,16 @@ class Installation:
         return [str(self._bin / program), *map(str, words)]
 
 
+@pytest.fixture(params=PYTHONS)
+def here(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Installation]:
+    """An environment of this Python, with nothing in it; it is removed, as it grows large."""
+    yield Installation(find_python(request.param), tmp_path)
+    shutil.rmtree(tmp_path)
+
+
 @pytest.mark.night
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("version", PYTHONS)
-def test_the_wheel_identifies_serves_and_runs_a_job(
-    version: str, wheel: Path, tmp_path: Path
-) -> None:
-    here = Installation(find_python(version), tmp_path)
+def test_the_wheel_identifies_serves_and_runs_a_job(wheel: Path, here: Installation) -> None:
     (here.folder / "steps.csv").write_bytes(recording())
     identify = ("identify", "steps.csv", "--model", "fopdt")
 
@@ -189,7 +192,6 @@ def test_the_wheel_identifies_serves_and_runs_a_job(
     assert {
         name: value for name, value in json.loads(again.stdout).items() if name not in unlike
     } == {name: value for name, value in found.items() if name not in unlike}
-    assert found["seconds"] < 30  # the compilation takes a minute and more
     assert "pip install 'lagid[server]'" in here.run("lagid", "serve").stderr
     (here.folder / "face.py").write_text(
         "import lagid\nprint(lagid.identify.__module__, lagid.Client.__module__)\n"
