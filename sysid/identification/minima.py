@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
 from sysid.identification.projection import draw_projected_places
 from sysid.identification.result import CHI_SQUARE_95, Minimum
@@ -342,13 +342,15 @@ def mark_ambiguous(
     by_name = {estimate.name: estimate.value for estimate in estimates}
     theta = np.array([by_name[name] for name in problem.free_names])
     declared = {parameter.name for parameter in problem.model.parameters}
+    is_declared = np.array([name in declared for name in problem.free_names])
     pairs = [
         pair
-        for is_recorded in (False, True)
+        for is_recorded, compared in ((False, np.ones_like(is_declared)), (True, is_declared))
         for pair in _pair_with_own(
             problem,
             theta,
             [m for m in found.minima if (m.recorded_from is not None) == is_recorded],
+            compared,
         )
     ]
     columns = {name: d for d, name in enumerate(problem.free_names)}
@@ -365,14 +367,31 @@ def mark_ambiguous(
 
 
 def _pair_with_own(
-    problem: Problem, theta: FloatArray, minima: Sequence[Minimum]
+    problem: Problem, theta: FloatArray, minima: Sequence[Minimum], compared: BoolArray
 ) -> list[tuple[Minimum, Minimum]]:
-    """Pair the compatible minimum nearest to the estimate (D,) with each other one."""
+    """Pair the compatible minimum nearest to the estimate (D,) with each other one.
+
+    The distance is that of the `compared` parameters (D,).
+    """
     compatible = [minimum for minimum in minima if minimum.is_compatible]
     if not compatible:
         return []
-    own = min(compatible, key=lambda one: compute_distance(problem, one.values, theta))
+
+    def find_distance(one: Minimum) -> float:
+        return compute_distance(problem, np.where(compared, one.values, theta), theta)
+
+    own = min(compatible, key=find_distance)
     return [(own, one) for one in compatible if one is not own]
+
+
+def _find_own_outside(
+    interval: tuple[float, float], column: int, pairs: Sequence[tuple[Minimum, Minimum]]
+) -> list[Minimum]:
+    """Find the own minimum of the recorded part if an assumed input has moved the estimate away."""
+    own = next((own for own, _ in pairs if own.recorded_from is not None), None)
+    if own is None or interval[0] <= own.values[column] <= interval[1]:
+        return []
+    return [own]
 
 
 def _mark_one(
@@ -388,6 +407,7 @@ def _mark_one(
     ]
     if not others:
         return estimate
+    others += _find_own_outside(estimate.interval95, column, pairs)
     listed = ", ".join(f"{value:.4g}" for value in sorted(m.values[column] for m in others))
     verb = "fits" if len(others) == 1 else "fit"
     since = next((m.recorded_from for m in others if m.recorded_from is not None), None)

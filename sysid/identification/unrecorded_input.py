@@ -11,7 +11,8 @@ the others. Only then is the model fitted again without them, and the move is re
 
 The assumption also decides between minima: a longer time lag reads the assumed input for longer.
 If the data contradict it (predictive test of Chow, Econometrica 28 (1960) 591), the minima are
-compared again on the samples that read recorded input with every time lag in question.
+compared again on the samples that read recorded input with every time lag in question. So are they
+if the estimate reads no assumed input, because then no sample supports the assumption.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -229,12 +230,15 @@ def compare_where_recorded(
     budget: int,
     is_late: Callable[[], bool],
 ) -> RecordedComparison:
-    """Compare minima where the input is recorded, if the data contradict the input assumed before.
+    """Compare minima where the input is recorded, unless the data support the input assumed before.
 
     It takes about `budget` simulations at most. There are no minima if the assumption holds, or if
     too little is recorded. Time lags are compared up to half of the shortest record.
     """
-    if not delays or not _may_contradict(problem, analysis):
+    assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
+    if not delays or problem.prediction != "simulation":
+        return RecordedComparison()
+    if assumed.any() and not _may_contradict(analysis, assumed):
         return RecordedComparison()
     evaluator = problem.evaluator
     spans = {one.name: (one.value, one.value) for one in analysis.estimates}
@@ -245,8 +249,11 @@ def compare_where_recorded(
     others = _select_recorded(problem, reach, _release_initial_states(problem))
     if others is None or others.n_scored <= _MIN_SAMPLES_PER_PARAMETER * theta.size:
         return RecordedComparison()
+    if others.n_scored == problem.n_scored:
+        return RecordedComparison()  # no time lag in question reads an assumed input
     (end,) = refine_candidates(others, [theta], min(budget, _MAX_STEPS * (theta.size + 1)))
-    if end is None or not _is_contradicted(problem, end, others, analysis):
+    is_contradicted = end is not None and _is_contradicted(problem, end, others, assumed)
+    if end is None or not (is_contradicted or not assumed.any()):
         return RecordedComparison(evaluations=0 if end is None else end.evaluations)
     left = budget - end.evaluations
     scanned = scan_parameters(others, end, delays, left, is_late, only_delays=True)
@@ -262,26 +269,24 @@ def compare_where_recorded(
     return RecordedComparison(
         collect_minima(others, kept, recorded_from=since),
         end.evaluations + scanned.evaluations,
-        is_contradicted=True,
+        is_contradicted,
     )
 
 
-def _may_contradict(problem: Problem, analysis: Analysis) -> bool:
-    """Whether samples that read an assumed input fit far worse than the others."""
-    if analysis.residuals_and_sensitivities is None or problem.prediction != "simulation":
+def _may_contradict(analysis: Analysis, assumed: BoolArray) -> bool:
+    """Whether samples that read an assumed input (n,) fit far worse than the others."""
+    if analysis.residuals_and_sensitivities is None or not assumed.any() or assumed.all():
         return False
-    assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
     error = analysis.residuals_and_sensitivities[0]
-    if not assumed.any() or assumed.all():
-        return False
     return bool(np.mean(error[assumed] ** 2) > _CONTRADICTION * np.mean(error[~assumed] ** 2))
 
 
 def _is_contradicted(
-    problem: Problem, end: RefinedCandidate, others: Problem, analysis: Analysis
+    problem: Problem, end: RefinedCandidate, others: Problem, assumed: BoolArray
 ) -> bool:
-    """Whether samples that read an assumed input do not follow from a fit of the others."""
-    assumed = np.concatenate(find_assumed_samples(problem, analysis))[problem.scored_rows]
+    """Whether samples that read an assumed input (n,) do not follow from a fit of the others."""
+    if not assumed.any():
+        return False
     evaluator, rows = problem.evaluator, problem.scored_rows
     error = evaluator.weight * (problem.predict(end.theta[None])[0] - evaluator.measured)
     degrees = others.n_scored - end.theta.size

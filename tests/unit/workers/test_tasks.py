@@ -16,9 +16,13 @@ from sysid.data.noise import Noise
 from sysid.identification import best_estimate, conclude, generalised_least_squares
 from sysid.identification.identify import identify
 from sysid.identification.run import begin_run
+from sysid.kernels import build, compilation
+from sysid.kernels.layout import KernelVariant
 from sysid.models.catalogue.load import copy_catalogue_document
+from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from tests.compiling import compile_here
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
 from workers.inline_executor import InlineExecutor
@@ -75,6 +79,33 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
     assert isinstance(done.outcome, RunFailure)
     assert "the model diverged for every one of" in done.outcome.reason
     assert "Narrow the bounds" in done.outcome.reason
+
+
+def test_a_run_whose_model_needs_too_long_to_compile_fails_alone_with_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def compile_one(model: Model, variant: KernelVariant) -> bytes:
+        is_costly = model.name == "costly"
+        return (compilation.compile_kernel if is_costly else compile_here)(model, variant)
+
+    monkeypatch.setattr(build, "compile_kernel", compile_one)
+    monkeypatch.setattr(compilation, "_WALL_SECONDS", 0.05)
+    whole = spec(1, generations=5)
+    costly = {
+        **whole.problem.model,
+        "name": "costly",
+        "equations": {"x": "(K*u(t-L) - x)/T - 0.015625*x**5"},
+    }
+    problem = replace(whole.problem, model=costly)
+    pack = [
+        AdvanceRun("r1", replace(whole, problem=problem), None, 100.0),
+        AdvanceRun("r2", whole, None, 100.0),
+    ]
+    refused, done = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
+    assert isinstance(refused.outcome, RunFailure)
+    assert "compiling them needs more than 0.05 s" in refused.outcome.reason
+    assert refused.outcome.kind == "InvalidModel"
+    assert isinstance(done.outcome, RunConclusion)
 
 
 def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:

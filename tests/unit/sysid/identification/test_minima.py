@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.traps import CHATTER
+from benchmarks.traps import CHATTER, periodic_input
 from sysid import Channel, GeneticAlgorithm, Identification, Record, identify, load_model
 from sysid.core.settings import Loss, SearchMethod
 from sysid.core.types import FloatArray
@@ -131,10 +131,9 @@ def test_lags_a_period_apart_are_listed_where_the_start_is_skipped() -> None:
     assert status(found, "L") == "ambiguous"
     lags = sorted(one.values[2] for one in found.search.minima if one.is_compatible)
     assert lags == pytest.approx([LAG, LAG + PERIOD, LAG + 2 * PERIOD], abs=0.02)
-    told = {float(text) for text in reason(found, "L").split(" s ")[0].split(", ")}
     (own,) = (one.value for one in found.estimates if one.name == "L")
     others = [lag for lag in lags if abs(lag - own) > 1]
-    assert sorted(told) == pytest.approx(others, abs=0.01)
+    assert list_told(found) == pytest.approx(others, abs=0.01)
     assert {status(found, name) for name in "KT"} == {"identified"}
 
 
@@ -147,6 +146,30 @@ def test_lags_a_period_apart_are_listed_though_an_assumed_input_tells_them_apart
     assert sum("assumed" in text for text in found.warnings) == 1
     compared = [one for one in found.search.minima if one.recorded_from is not None]
     assert len([one for one in compared if one.is_compatible]) == 3
+    assert list_told(found) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
+
+
+def test_lags_a_period_apart_are_listed_though_few_samples_are_skipped() -> None:
+    """The skipped samples alone could tell whether the input before the record was the first."""
+    found = identify(lag_model(), record(periodic(500), 200), skip=40, seed=3)
+    assert status(found, "L") == "ambiguous"
+    assert list_told(found) == pytest.approx([LAG + PERIOD, LAG + 2 * PERIOD], abs=0.05)
+    assert not any("contradict" in text for text in found.warnings)
+
+
+def test_a_lag_that_the_assumed_input_has_moved_is_told_with_its_value_without() -> None:
+    draw = periodic_input(np.random.default_rng(62_001))
+    found = identify(draw.model, draw.record, seed=1)
+    (own,) = (one for one in found.estimates if one.name == "L")
+    assert own.interval95 is not None
+    assert not own.interval95[0] <= draw.truth <= own.interval95[1]
+    lags = [draw.truth + k * draw.period for k in range(3)]
+    assert list_told(found) == pytest.approx(lags, abs=0.05)
+
+
+def list_told(found: Identification) -> list[float]:
+    """The time lags (s) that the result names beside its own."""
+    return sorted(float(text) for text in reason(found, "L").split(" s ")[0].split(", "))
 
 
 def test_a_noise_model_does_not_hide_that_the_data_contradict_the_assumed_input() -> None:
@@ -163,8 +186,9 @@ def test_a_record_that_begins_at_rest_tells_lags_a_period_apart() -> None:
     assert not any("contradict" in text for text in found.warnings)
 
 
-def test_an_input_without_a_period_tells_the_lag() -> None:
-    found = identify(lag_model(), record(steps(500), 200))
+@pytest.mark.parametrize("skip", [0, 40])
+def test_an_input_without_a_period_tells_the_lag(skip: int) -> None:
+    found = identify(lag_model(), record(steps(500), 200), skip=skip)
     assert status(found, "L") == "identified"
     (own,) = (one for one in found.estimates if one.name == "L")
     assert own.stderr is not None
