@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
-DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
 out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -39,11 +38,12 @@ Key = Annotated[
     str | None, typer.Option("--key", envvar="LAGID_KEY", help="API key.", show_default=False)
 ]
 Segments = Annotated[
-    str | None, typer.Option(help="CSV label columns that divide the rows into segments: col,col.")
+    str | None, typer.Option(help="Label columns that divide the rows into segments: col,col.")
 ]
 SampleTime = Annotated[
-    float | None, typer.Option(help="Sampling period in s, for a CSV without a time column.")
+    float | None, typer.Option(help="Sampling period in s, for a file without a time column.")
 ]
+DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP."
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 __all__ = [
@@ -263,6 +263,11 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
+READ_OPTIONS = (
+    (re.compile(r"\bsample_time\b"), "--sample-time"),
+    (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
+)
+"""Words of the reader of files, which are options here."""
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
@@ -271,6 +276,13 @@ SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
+
+
+def name_read_options(text: str) -> str:
+    """Name the options of reading a file as the user types them here."""
+    for pattern, option in READ_OPTIONS:
+        text = pattern.sub(option, text)
+    return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,10 +297,13 @@ class FieldOrigins:
         the pointer, which is a place in a file.
     rest : str
         The same for all other fields; in ``--set {}`` the braces stand for the whole path.
+    rewrite : callable
+        Changes the text of a fault, such as names of options in it.
     """
 
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
+    rewrite: Callable[[str], str] = str
 
     def locate(self, pointer: str) -> str:
         """Return the option or file where the field of a pointer was typed."""
@@ -316,6 +331,7 @@ class FieldOrigins:
         detail = fault.detail
         if not self.rest.endswith("…"):
             detail = POINTER_PATTERN.sub(lambda match: self.locate(match[0]), detail)
+        detail = self.rewrite(detail)
         return f"{origin}{column}: {detail}" if origin else detail
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.common import (
+    DATA_HELP,
     AsJson,
     FieldOrigins,
     Key,
@@ -14,6 +15,7 @@ from service.cli.common import (
     Url,
     connect_client,
     fail,
+    name_read_options,
     parse_number,
     parse_pairs,
     print_json,
@@ -54,7 +56,7 @@ def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = Fal
 
 @app.command("add")
 def add_dataset(
-    file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
+    file: Annotated[Path, typer.Argument(help=DATA_HELP)],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
@@ -65,10 +67,8 @@ def add_dataset(
     """Store a recording."""
     if not file.is_file():
         fail(f"there is no file {file}")
-    with (
-        connect_client(url, key) as client,
-        report_faults(FieldOrigins(UPLOAD_OPTIONS, rest=str(file))),
-    ):
+    origins = FieldOrigins(UPLOAD_OPTIONS, rest=str(file), rewrite=name_read_options)
+    with connect_client(url, key) as client, report_faults(origins):
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
     _print_dataset(stored, as_json)
 
@@ -154,9 +154,10 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
     sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
     before = stored["details"].get("known_before")
     history = f"known for {before:.6g} s before, " if before else ""
+    started = f"started at {stored['started_at']}, " if stored["started_at"] else ""
     print_line(
-        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {history}"
-        f"channels {_format_channels(stored)}"
+        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
+        f"{started}{history}channels {_format_channels(stored)}"
     )
     for warning in stored["warnings"]:
         print_line(f"note: {warning}")

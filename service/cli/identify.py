@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
+    DATA_HELP,
     MODEL_SUFFIXES,
     FieldOrigins,
     SampleTime,
@@ -21,6 +22,7 @@ from service.cli.common import (
     fail,
     fail_usage,
     format_estimate,
+    name_read_options,
     out,
     parse_channels,
     print_json,
@@ -63,15 +65,18 @@ FIELD_ORIGINS = FieldOrigins(
 
 
 @dataclass(frozen=True, slots=True)
-class CsvOptions:
-    """Options for reading CSV files."""
+class FileOptions:
+    """Options for reading files."""
 
     sample_time: float | None
     segments: tuple[str, ...]
 
 
 def identify(
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Recording, CSV or MCAP.")],
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help=DATA_HELP),
+    ],
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     changes: Annotated[
         list[str] | None,
@@ -113,7 +118,7 @@ def identify(
         changes.append("posterior=true")
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
-    reading = CsvOptions(sample_time, tuple(split_names(segments)))
+    reading = FileOptions(sample_time, tuple(split_names(segments)))
     recording = read_recording(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     records = _extract_records(recording, data, loaded, body)
@@ -213,23 +218,24 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_recording(path: Path, reading: CsvOptions) -> "Recording":
+def read_recording(path: Path, reading: FileOptions) -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.csv_recordings import read_csv
+    from service.formats.errors import InvalidUpload
+    from service.formats.limits import DEFAULT_LIMITS
+    from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
 
     if not path.is_file():
         fail(f"there is no file {path}")
-    if path.suffix.lower() == ".mcap":
-        from service.formats.limits import DEFAULT_LIMITS
-        from service.formats.sandbox import read_untrusted
-
-        upload = read_untrusted(path, "mcap", DEFAULT_LIMITS)
-        recording, notes = upload.recording, upload.notes
-    else:
-        recording, notes = read_csv(
-            path, sample_time=reading.sample_time, segments=reading.segments
+    try:
+        recording, notes = read_with_notes(
+            path,
+            sample_time=reading.sample_time,
+            segments=reading.segments,
+            limits=DEFAULT_LIMITS,
         )
+    except InvalidUpload as error:
+        fail(f"{path}: {name_read_options(error.detail)}")
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

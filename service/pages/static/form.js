@@ -97,10 +97,9 @@ async function upload() {
   if (!file) return;
   clearFaults(form);
   showState(`storing ${file.name}…`);
-  const type = file.name.toLowerCase().endsWith('.mcap') ? 'application/x-mcap' : 'text/csv';
   try {
     const stored = await ask(`/v1/datasets?name=${encodeURIComponent(file.name)}`, {
-      method: 'POST', headers: { 'Content-Type': type }, body: file,
+      method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     });
     await selectDataset(stored.id);
     showState(`${file.name} is stored`);
