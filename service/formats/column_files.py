@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from service.formats.cells import CellKind
@@ -48,13 +49,7 @@ _DAMAGES: Final = (
 def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     """Read the arrays of an ``.npz`` file, or the fields or columns of an ``.npy`` file."""
     try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            names = content.dtype.names
-            arrays = {name: content[name] for name in names} if names else {"": content}
-        else:
-            with content:
-                arrays = dict(content)
+        arrays = _read_arrays(path)
     except _DAMAGES as error:
         raise _build_damage_error("NumPy", error) from None
     if "" in arrays:
@@ -62,6 +57,21 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
             "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y)"
         )
     return _build_array_table(arrays, options, notes)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read arrays by name; `read_array` runs nothing that a file holds: objects are refused."""
+    with path.open("rb") as stream:
+        if not zipfile.is_zipfile(stream):
+            stream.seek(0)
+            array = read_array(stream)
+            return {name: array[name] for name in array.dtype.names or ()} or {"": array}
+        with zipfile.ZipFile(stream) as archive:
+            arrays = {}
+            for name in archive.namelist():
+                with archive.open(name) as member:
+                    arrays[name.removesuffix(".npy")] = read_array(member)
+            return arrays
 
 
 def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:

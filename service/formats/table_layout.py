@@ -121,7 +121,7 @@ class _Row(NamedTuple):
     fields: list[str]
 
 
-class _Block(NamedTuple):
+class _DataBlock(NamedTuple):
     """The run of data under one separator, with the rows before it."""
 
     separator: str
@@ -207,7 +207,7 @@ def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
         )
 
 
-def _find_block(rows: Sequence[_Row], separator: str) -> _Block:
+def _find_block(rows: Sequence[_Row], separator: str) -> _DataBlock:
     """Find the longest run of rows of data, and the rows before it that are not blank."""
     best: tuple[int, int] = (0, 0)
     start, width = 0, -1
@@ -225,10 +225,10 @@ def _find_block(rows: Sequence[_Row], separator: str) -> _Block:
     first, stop = best
     data = [row for row in full[first:stop] if not is_comment(row.fields)]
     if len(data) > 1 and not first and _is_header_of(data[0].fields, data[1].fields):
-        return _Block(separator, full[:1], data[1:])
+        return _DataBlock(separator, full[:1], data[1:])
     if not data:
-        return _Block(separator, list(full), [])
-    return _Block(separator, full[:first], data)
+        return _DataBlock(separator, list(full), [])
+    return _DataBlock(separator, full[:first], data)
 
 
 def _is_data(fields: Sequence[str]) -> bool:
@@ -244,7 +244,7 @@ def _is_header_of(fields: Sequence[str], below: Sequence[str]) -> bool:
     return any(kind == "text" and other not in ("text", "empty") for kind, other in kinds)
 
 
-def _choose_block(blocks: Sequence[_Block], lines: Sequence[str]) -> _Block:
+def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBlock:
     """Choose the separator under which the data have a header, then the longest and the widest."""
     found = [block for block in blocks if block.data and block.width > 1]
     if found:
@@ -255,13 +255,13 @@ def _choose_block(blocks: Sequence[_Block], lines: Sequence[str]) -> _Block:
     if all(separator not in "".join(lines) for separator in SEPARATORS[:3]):
         return next(
             (block for block in blocks if block.before and len(block.before[0].fields) > 1),
-            _Block(",", _find_block(_split_lines(lines, ",", 0), ",").before, []),
+            _DataBlock(",", _find_block(_split_lines(lines, ",", 0), ",").before, []),
         )
     return blocks[0]
 
 
 def _build_layout(
-    block: _Block, segments: Sequence[str], sample_time: float | None, max_channels: int
+    block: _DataBlock, segments: Sequence[str], sample_time: float | None, max_channels: int
 ) -> TableLayout:
     header, units, names = _find_header(block)
     cells = [row.fields for row in block.data]
@@ -292,7 +292,7 @@ def classify_cells(cells: Sequence[str], name: str) -> CellKind:
     return "count" if is_count else kind
 
 
-def _find_header(block: _Block) -> tuple[_Row, list[str], list[str]]:
+def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     """Find the header before the data, the row of units below it, and the names."""
     rows = [row for row in block.before if not is_comment(row.fields)]
     if not block.data:
@@ -330,7 +330,7 @@ def _build_narrow_error(name: str) -> InvalidUpload:
     )
 
 
-def _split_comment(fields: Sequence[str], block: _Block) -> list[str]:
+def _split_comment(fields: Sequence[str], block: _DataBlock) -> list[str]:
     """Split a comment that may be the header: ``# t u y``, also above columns with commas."""
     sign = block.separator or ","
     text = sign.join(fields).lstrip()

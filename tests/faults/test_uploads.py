@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from service.cli.identify import FileOptions, read_recording
 from service.formats import limits as format_limits
@@ -102,7 +103,7 @@ def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
 
 
 def test_identify_reads_mcap_under_the_limits_of_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     times = np.arange(20_000) * 0.01
     path = tmp_path / "recording.mcap"
@@ -115,8 +116,9 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
     ):
         smaller = replace(DEFAULT_LIMITS, **change)  # type: ignore[arg-type]
         monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
-        with pytest.raises(InvalidUpload, match=words):
+        with pytest.raises(typer.Exit):
             read_recording(path, own)
+        assert words in capsys.readouterr().err
 
 
 def test_the_reader_does_not_see_the_secrets_of_the_environment(
