@@ -62,6 +62,8 @@ def classify_column(cells: Iterable[str]) -> CellKind:
         return "empty"
     if "number" in kinds:
         return "number"
+    if kinds == {"stamp", "date"}:  # some programs write midnight as a date
+        return "stamp"
     return kinds.pop() if len(kinds) == 1 else "text"
 
 

@@ -21,7 +21,6 @@ from service.formats.table_columns import (
     build_missing_time_error,
     holds_numbers,
     parse_texts,
-    shorten_text,
 )
 from service.formats.table_layout import (
     Heading,
@@ -301,4 +300,6 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
 
 def _build_damage_error(kind: str, error: Exception) -> InvalidUpload:
     reason = " ".join(str(error).split())
-    return InvalidUpload(f"the {kind} file cannot be read: {shorten_text(reason)}")
+    if reason.startswith("Object arrays"):
+        reason = "an array holds Python objects; write arrays of numbers"
+    return InvalidUpload(f"the {kind} file cannot be read: {reason[:120]}")

@@ -49,7 +49,7 @@ def main() -> int:
 
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     options = ReadOptions(task["sample_time"], tuple(task["segments"]), limits)
-    recording, messages = _read_file(Path(task["source"]), task["kind"], options)
+    recording, messages = read_file(Path(task["source"]), task["kind"], options)
     try:
         write_recording(recording, task["target"])
     except ValueError as error:
@@ -57,7 +57,8 @@ def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     return messages
 
 
-def _read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
+def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
+    """Read a file of a kind, and return the notes with its recording."""
     if kind == "csv":
         recording, notes = read_csv(
             path,

@@ -11,6 +11,7 @@ from service.formats.table_columns import Table, read_rows
 from service.formats.table_layout import TableLayout, detect_sheet_layout
 
 PEEK_ROWS = 200
+_EXACT_INTEGER = 2.0**53
 
 
 def read_sheets(path: Path, options: ReadOptions, notes: list[str]) -> Table:
@@ -70,4 +71,6 @@ def _write_cell(cell: float | str | date | time | timedelta) -> str:
         return cell.isoformat()
     if isinstance(cell, timedelta):
         return repr(cell.total_seconds())
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < _EXACT_INTEGER:
+        return str(int(cell))
     return repr(cell)

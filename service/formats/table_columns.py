@@ -94,7 +94,7 @@ def read_rows(
     if not blocks:
         raise InvalidUpload("there are no rows below the header")
     if comments:
-        notes.append(f"{comments} comments among the rows were skipped")
+        notes.append(f"comments in {comments} of the rows were skipped")
     if layout.has_decimal_commas:
         notes.append("decimal commas were read as decimal points")
     values = tuple(

@@ -20,7 +20,7 @@ from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import suggest_name
 from sysid.core.units import find_conversion_factor, is_known_unit
 
-SEPARATORS: Final = ("\t", ";", ",", " ")
+SEPARATORS: Final = ("\t", ";", ",", "|", " ")
 COMMENT_SIGNS: Final = ("#", "%", "//")
 TIME_NAMES: Final = ("t", "time")
 TIME_WORDS: Final = frozenset(
@@ -29,7 +29,7 @@ TIME_WORDS: Final = frozenset(
         *("timestamp", "time stamp", "datetime", "date time", "date/time", "date"),
         *("elapsed", "elapsed time", "time elapsed", "sec", "secs", "seconds"),
         *("zeit", "zeitstempel", "uhrzeit", "datum", "datum/zeit", "datum/uhrzeit"),
-        *("datum zeit", "datum uhrzeit", "temps", "tiempo", "tempo", "tijd", "tid"),
+        *("datum zeit", "datum uhrzeit", "temps", "tiempo", "tempo", "tijd", "tid", "x value"),
     )
 )
 _DATE_WORDS: Final = frozenset(("date", "datum"))
@@ -252,7 +252,7 @@ def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBl
     single = next((block for block in blocks if block.data), None)
     if single is not None:
         return single._replace(separator=single.separator.strip(" ") or ",")
-    if all(separator not in "".join(lines) for separator in SEPARATORS[:3]):
+    if all(separator not in "".join(lines) for separator in SEPARATORS[:-1]):
         return next(
             (block for block in blocks if block.before and len(block.before[0].fields) > 1),
             _DataBlock(",", _find_block(_split_lines(lines, ",", 0), ",").before, []),
@@ -355,7 +355,7 @@ def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
     return (
         bool(full)
         and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)
-        and all(find_unit_seconds(unit) is not None for unit in times)
+        and (not times or any(find_unit_seconds(unit) is not None for unit in times))
         and 2 * sum(map(_is_unit, full)) > len(full)
     )
 
@@ -550,7 +550,7 @@ def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
         word = _find_time_word(column.name)
         is_stamp = column.kind in ("stamp", "date", "clock")
         if word in TIME_NAMES and column.role == "value":
-            ranks.append((0, i))
+            ranks.append((0 if column.name != "T" else 1, i))
         elif word is not None and (is_stamp or word not in _DATE_WORDS):
             ranks.append((1 if column.kind == "stamp" else 2, i))
         elif is_stamp:
@@ -558,6 +558,11 @@ def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
         elif column.role == "nameless" and column.kind == "number" and (i == 0 or column.name):
             ranks.append((5, i))  # the index of a table, which is its time
     return min(ranks)[1] if ranks else None
+
+
+def is_plain_time_name(name: str) -> bool:
+    """Whether a column is called ``t`` or ``time``, so that its unit is s unless it has one."""
+    return _find_time_word(name) in TIME_NAMES
 
 
 def is_time_name(name: str) -> bool:

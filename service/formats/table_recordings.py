@@ -5,10 +5,14 @@ from math import floor, log10
 
 import numpy as np
 
-from service.formats.cells import begins_like_number
+from service.formats.cells import begins_like_number, classify_cell
 from service.formats.errors import InvalidUpload
-from service.formats.table_columns import ColumnValues, Table, shorten_text
-from service.formats.table_layout import TableColumn, build_nameless_error, counts_rows
+from service.formats.table_columns import ColumnValues, Table, holds_numbers, shorten_text
+from service.formats.table_layout import (
+    TableColumn,
+    build_nameless_error,
+    counts_rows,
+)
 from service.formats.time_columns import (
     ClockTimes,
     join_dates,
@@ -75,13 +79,22 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
         times, spans = _build_segments(table, labels, times, starts, notes)
     else:
         _report_irregular_sampling(times, notes)
-    channels = []
+    channels, empty = [], []
     for column, values in zip(table.columns, table.values, strict=True):
         if column.role != "value":
             continue
         numbers = np.asarray(values, dtype=np.float64)
+        if np.isnan(numbers).all():
+            empty.append(column.name)
+            continue
+        if column.kind == "flag":
+            notes.append(f"channel {column.name!r}: true and false were read as 1 and 0")
         _report_missing_values(column.name, numbers, table, notes)
         channels.append(Channel(column.name, times, numbers, column.unit or "1"))
+    if not channels:
+        raise InvalidUpload("every value is missing; leave the column out", column=empty[0])
+    if empty:
+        notes.append(f"columns without any value were left out: {', '.join(empty)}")
     return Recording(tuple(channels), spans, clock.started_at)
 
 
@@ -116,8 +129,7 @@ def _check_text(
         place = place if wrong is None else wrong
         if wrong is not None or is_needed:
             raise InvalidUpload(
-                f"found {shorten_text(texts[place])}, which is not a number"
-                f"{_explain_text(texts[place])}",
+                f"found {shorten_text(texts[place])}{_explain_text(texts[place])}",
                 row=int(table.rows[place]),
                 column=column.name,
             )
@@ -128,9 +140,15 @@ def _check_text(
 
 
 def _explain_text(text: str) -> str:
+    """Say what to do with a text among numbers."""
+    if classify_cell(text) == "number":
+        return " in a column that begins with text; a signal has numbers in all rows"
     if "," in text and "." in text:
-        return "; decimal points and commas are mixed: write numbers without thousands separators"
-    return "; write numbers alone, and their unit in the header: u [V]"
+        return (
+            ", which is not a number; decimal points and commas are mixed: write numbers without "
+            "thousands separators"
+        )
+    return ", which is not a number; write numbers alone, and their unit in the header: u [V]"
 
 
 def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes:
@@ -149,7 +167,7 @@ def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes
         return ClockTimes(np.concatenate(counts) * sample_time, start)
     assert time is not None  # checked with the layout
     assert clock is not None
-    _check_increasing(clock.times, starts, table, time.name)
+    _check_increasing(clock.times, starts, table, time)
     _report_repeated_times(clock.times, starts, notes)
     return clock
 
@@ -211,7 +229,9 @@ def _parse_labels(column: ColumnValues) -> list[float | str]:
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
 
 
-def _check_increasing(times: FloatArray, starts: IntArray, table: Table, name: str) -> None:
+def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: TableColumn) -> None:
+    """Refuse times that do not increase inside a segment."""
+    is_stamp = not holds_numbers(time)
     steps = np.diff(times)
     # Repeats may be pooled, and pooled samples may share a time.
     stays = steps < 0 if starts.size > 1 else steps <= 0
@@ -219,13 +239,16 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, name: s
     wrong = np.flatnonzero(stays)
     if wrong.size == 0:
         return
+    advice = "For repeated measurements, name their label columns with segments."
+    if is_stamp:
+        advice = "If the stamps are too coarse, give the sampling period with sample_time."
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
     raise InvalidUpload(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
-        "row to row. For repeated measurements, name their label columns with segments.",
+        f"row to row. {advice}",
         row=int(table.rows[wrong[0] + 1]),
-        column=name,
+        column=time.name,
     )
 
 
@@ -250,8 +273,6 @@ def _report_missing_values(name: str, values: FloatArray, table: Table, notes: l
     missing = np.flatnonzero(np.isnan(values))
     if missing.size == 0:
         return
-    if missing.size == values.size:
-        raise InvalidUpload("every value is missing; leave the column out", column=name)
     notes.append(
         f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
         f"first in row {table.rows[missing[0]]}. An output is not scored at missing values. "

@@ -115,7 +115,8 @@ def _detect_utf16(head: bytes) -> str:
     """Detect UTF-16 without a byte-order mark: every second byte of numbers is NUL."""
     half = len(head) // 2
     for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if half and head[first::2].count(0) >= _MIN_NUL_SHARE * half:
+        signs = head[1 - first :: 2].count(0)
+        if half and head[first::2].count(0) >= _MIN_NUL_SHARE * half and not signs:
             return encoding
     raise InvalidUpload(
         "the file is not text; need CSV or another text of columns", byte=head.index(b"\0")

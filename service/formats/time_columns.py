@@ -18,7 +18,7 @@ from service.formats.table_columns import (
     build_missing_time_error,
     shorten_text,
 )
-from service.formats.table_layout import find_unit_seconds
+from service.formats.table_layout import find_unit_seconds, is_plain_time_name
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import measure_sampling
 
@@ -30,6 +30,7 @@ EPOCH_THRESHOLD_SECONDS: Final = 1e8
 _PLAUSIBLE_CLOCK: Final = (6.3e8, 4.2e9)  # s since 1970: the years 1990 to 2103
 _EPOCH_UNITS: Final = (("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds"))
 _DAY_SECONDS: Final = 86_400.0
+_EXACT_INTEGER: Final = 2.0**53
 _ZONE_FORM: Final = "%#z"
 _EXACT_DECIMALS: Final = 6  # of s since 1970 in a number of 53 bits
 
@@ -49,7 +50,10 @@ def find_clock_start(seconds: float) -> datetime | None:
 
 
 def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]) -> ClockTimes:
-    """Convert a column of numbers to seconds; a clock is counted from the first sample."""
+    """Convert a column of numbers to seconds; a clock is counted from the first sample.
+
+    Numbers without a unit are s, unless they can only be a finer clock since 1970.
+    """
     first = float(np.min(values))
     if not unit:
         for symbol, word in _EPOCH_UNITS:
@@ -57,6 +61,8 @@ def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]
             if _PLAUSIBLE_CLOCK[0] <= first * size <= _PLAUSIBLE_CLOCK[1]:
                 notes.append(f"column {name!r} was read as {word} since 1970")
                 unit = symbol
+    if not unit and not is_plain_time_name(name):
+        notes.append(f"column {name!r} was read as the time in s")
     size = find_unit_seconds(unit) or 1.0
     if first * size < EPOCH_THRESHOLD_SECONDS:
         if size != 1.0:
@@ -65,11 +71,12 @@ def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]
             )
         return ClockTimes(_scale_times(values, size))
     origin = float(values[0])
+    shown = f"{origin:.0f}" if origin >= _EXACT_INTEGER else repr(origin)
     shifted = np.round(_scale_times(values - origin, size), _EXACT_DECIMALS if size == 1.0 else 9)
     start = find_clock_start(float(_scale_times(np.array([origin]), size)[0]))
     moment = "" if start is None else f" ({format_moment(start)})"
     notes.append(
-        f"times are counted from the first sample, at {origin!r} {unit or 's'} of the file's clock"
+        f"times are counted from the first sample, at {shown} {unit or 's'} of the file's clock"
         f"{moment}"
     )
     return ClockTimes(shifted, start)
@@ -161,7 +168,8 @@ def parse_stamps(
     InvalidUpload
         If a stamp is missing or has another form; with its row.
     """
-    forms = _list_forms(str(texts[0]))
+    first = next((text for text in texts.tolist() if STAMP.fullmatch(text)), str(texts[0]))
+    forms = _list_forms(first)
     if not forms:
         raise _build_stamp_error(texts, 0, rows, name, "a date such as 2026-01-31 12:00:00")
     stamps = _normalise_stamps(texts)
@@ -169,7 +177,7 @@ def parse_stamps(
     readings = [attempt for attempt in attempts if not np.isnat(attempt[1]).any()]
     if not readings:
         place = int(np.flatnonzero(np.isnat(attempts[0][1]))[0])
-        raise _build_stamp_error(texts, place, rows, name, f"a time stamp such as {texts[0]}")
+        raise _build_stamp_error(texts, place, rows, name, f"a time stamp such as {first}")
     form, parsed = min(readings, key=lambda reading: _rank_reading(reading[1]))
     if len(forms) > 1:
         order = "day before the month" if form.startswith("%d") else "month before the day"
@@ -192,12 +200,9 @@ def _list_forms(text: str) -> list[str]:
         year = "%y" if parts["short"] or parts["either_short"] else "%Y"
         orders = ("%d{0}%m{0}{1}", "%m{0}%d{0}{1}")[: 1 if sign == "." else 2]
         days = [order.format(sign, year) for order in orders]
-    if parts.get("hour") is None:
-        return [f"{day} %H:%M" for day in days]
-    clock = "%I:%M" if parts["half"] else "%H:%M"
-    clock += ("%:S%.f" if parts["second"] else "") + (" %p" if parts["half"] else "")
-    zone = _ZONE_FORM if parts["zone"] else ""
-    return [f"{day} {clock.replace('%:S', ':%S')}{zone}" for day in days]
+    clock = "%I:%M:%S%.f %p" if parts.get("half") else "%H:%M:%S%.f"
+    zone = _ZONE_FORM if parts.get("zone") else ""
+    return [f"{day} {clock}{zone}" for day in days]
 
 
 def _normalise_stamps(texts: NDArray[np.str_]) -> "pl.Series":
@@ -213,7 +218,8 @@ def _normalise_stamps(texts: NDArray[np.str_]) -> "pl.Series":
         (r"\s?(UTC|GMT|z)$", "Z"),
         (r"\s([+-]\d{2}:?\d{2})$", "$1"),
         (r"([+-]\d{2})$", "$1"),
-        (r"^(\S+)$", "$1 00:00"),
+        (r"^(\S+)$", "$1 00:00:00"),
+        (r"( \d{1,3}:\d{2})($|[^:.\d].*$)", "$1:00$2"),
     ):
         series = series.str.replace(pattern, text)
     return series
