@@ -277,7 +277,7 @@ def _build_layout(
     notes = []
     preamble = [r for r in block.before if r.place < header.place and not is_comment(r.fields)]
     if preamble:
-        notes.append(f"{len(preamble)} lines before the header in row {row} were skipped")
+        notes.append(f"the header is in row {row}; the lines before it were skipped")
     if units:
         notes.append(f"row {row + 1} was read as the units of the columns")
     commas = block.separator != "," and any(_DECIMAL_COMMA.match(c) for r in cells for c in r)

@@ -28,7 +28,7 @@ def test_guesses_are_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     recording = read_recording(path, FileOptions(None, ()))
     np.testing.assert_array_equal(recording.channel("u").times, TIMES)
     notes = capsys.readouterr().err.splitlines()
-    assert "note: 1 lines before the header in row 3 were skipped" in notes
+    assert "note: the header is in row 3; the lines before it were skipped" in notes
     assert "note: column 'Zeit' was read as the time in s" in notes
 
 

@@ -1,5 +1,6 @@
 """Files as loggers, spreadsheets and other programs write them: all give the same experiment."""
 
+import doctest
 import re
 import struct
 import warnings
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.formats import recordings
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
-from service.formats.file_kinds import detect_kind
+from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
 from service.formats.recordings import ReadingNote, read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
@@ -32,6 +34,7 @@ from tests.recorded_files import (
     write_parquet,
     write_sheet,
 )
+from tests.repository import ROOT
 
 ROWS = join_rows("t,u,y")
 BODY = ROWS.partition("\n")[2]
@@ -398,7 +401,9 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
 def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
     path = tmp_path / "scope.csv"
     path.write_text("Device: Scope 1\n\n" + ROWS)
-    with pytest.warns(ReadingNote, match="1 lines before the header in row 3 were skipped"):
+    with pytest.warns(
+        ReadingNote, match="the header is in row 3; the lines before it were skipped"
+    ):
         check_experiment(read_recording(path))
     with warnings.catch_warnings():
         check_experiment(read_recording(ROWS.encode()))
@@ -430,3 +435,25 @@ def test_a_kind_is_told_by_bytes_and_only_then_by_name(tmp_path: Path) -> None:
     assert detect_kind(path) == "matlab"
     path.write_bytes(struct.pack("<5i", 1, 40, 1, 0, 2) + b"t,")
     assert detect_kind(path) == "csv"
+
+
+def test_the_examples_of_the_reader_and_of_its_page_run(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert doctest.testmod(recordings).failed == 0
+    page = (ROOT / "docs/recordings.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        exec(snippet, {})
+    assert {entry.category for entry in caught} == {ReadingNote}
+    assert "'Zeit' read as local time stamps, 0.1 s apart" in str(caught[-1].message)
+    assert capsys.readouterr().out == "('Ventil', 'Druck') 2026-03-14 08:00:00\n"
+
+
+def test_the_page_lists_every_suffix_that_forms_offer() -> None:
+    page = (ROOT / "docs/recordings.md").read_text(encoding="utf-8")
+    names = {".csv": "CSV", ".mcap": "MCAP", ".parquet": "Parquet", ".gz": "gzip"}
+    texts = (".txt", ".tsv", ".dat", ".asc")  # any name of a text
+    missing = [s for s in SUFFIXES if s not in texts and names.get(s, f"`{s}`") not in page]
+    assert missing == []
