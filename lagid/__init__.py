@@ -21,10 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from service.formats.recordings import (  # type: ignore[import-untyped, unused-ignore]
-        read_recording,
-    )
-
     from service.client import (
         AsyncClient,
         Client,
@@ -33,6 +29,7 @@ if TYPE_CHECKING:
         ProblemError,
         ServerUnreachable,
     )
+    from service.formats.recordings import read_recording
     from sysid import (
         Channel,
         Estimate,

@@ -33,7 +33,7 @@ from service.core.errors import (
 )
 from service.core.settings import Settings
 from service.core.text_checks import parse_digits
-from service.datasets.datasets import FileFormat, check_upload_size
+from service.datasets.datasets import check_upload_size
 from service.storage.objects import ObjectStore
 
 MCAP_TYPE = "application/x-mcap"
@@ -154,8 +154,20 @@ def _matches_etag(header: str, etag: str) -> bool:
     return etag in etags or etags == ["*"]
 
 
-CSV_TYPES = ("text/csv", "application/csv", "text/plain")
 MCAP_TYPES = ("application/x-mcap", "application/mcap", "application/vnd.mcap")
+FILE_TYPES = frozenset(
+    (
+        *MCAP_TYPES,
+        *("text/csv", "application/csv", "text/plain", "text/tab-separated-values"),
+        *("application/octet-stream", "application/gzip", "application/x-gzip"),
+        *("application/zip", "application/x-zip-compressed", "application/x-npz"),
+        *("application/x-matlab-data", "application/matlab-mat"),
+        *("application/vnd.apache.parquet", "application/x-parquet"),
+        *("application/vnd.ms-excel", "application/vnd.oasis.opendocument.spreadsheet"),
+        "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet",
+    )
+)
+"""Media types of files that may hold a recording; which kind it is, its bytes say."""
 MULTIPART = "multipart/form-data"
 PIECE_BYTES = 1 << 20
 MAX_PAUSE_SECONDS = 60.0
@@ -163,12 +175,12 @@ MAX_PAUSE_SECONDS = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A received file: its path, format, and the hash of its bytes."""
+    """A received file: its path, the hash of its bytes, and its name if the sender gave one."""
 
     path: Path
-    file_format: FileFormat
     sha256: str
-    name: str | None
+    name: str | None = None
+    suffix: str = ""
 
 
 @asynccontextmanager
@@ -189,11 +201,14 @@ async def receive_upload(
     TooLarge
         As soon as the announced or received bytes exceed the limit.
     UnsupportedMediaType
-        If the body is neither CSV nor MCAP.
+        If the body is said to be something else than a file.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != MULTIPART:
-        _detect_format(kind, None)  # refused before the body is read
+    if kind not in (*FILE_TYPES, MULTIPART):
+        raise UnsupportedMediaType(
+            f"found {kind!r}; need application/octet-stream or text/csv for the bytes of a file, "
+            "or a form with a file"
+        )
     announced = request.headers.get("content-length", "")
     if announced.isdecimal():
         check_upload_size(parse_digits(announced), settings)
@@ -207,7 +222,7 @@ async def receive_upload(
                 yield await _receive_form(request, path, settings)
             else:
                 digest = await _save_body(request.stream(), path, settings)
-                yield Upload(path, _detect_format(kind, None), digest, None)
+                yield Upload(path, digest, suffix=".mcap" if kind in MCAP_TYPES else "")
 
 
 def _limit_pauses(receive: Receive) -> Receive:
@@ -242,12 +257,10 @@ async def _receive_form(request: Request, path: Path, settings: Settings) -> Upl
     async with request.form(max_files=1, max_fields=20) as form:
         file = next((value for value in form.values() if isinstance(value, UploadFile)), None)
         if file is None or not file.filename:
-            raise InvalidRequest.from_fault(
-                "/file", "the form has no file; need one CSV or MCAP file"
-            )
+            raise InvalidRequest.from_fault("/file", "the form has no file; need one recording")
         digest = await _save_body(_read_pieces(file), path, settings)
-        file_format = _detect_format((file.content_type or "").partition(";")[0], file.filename)
-        return Upload(path, file_format, digest, Path(file.filename).stem)
+        name = Path(file.filename)
+        return Upload(path, digest, _find_stem(name), name.suffix)
 
 
 async def _read_pieces(file: UploadFile) -> AsyncIterator[bytes]:
@@ -266,12 +279,6 @@ async def _save_body(pieces: AsyncIterator[bytes], path: Path, settings: Setting
     return digest.hexdigest()
 
 
-def _detect_format(kind: str, file_name: str | None) -> FileFormat:
-    # Browsers send many types for CSV and none for MCAP, so the file's suffix comes first.
-    suffix = Path(file_name or "").suffix.lower()
-    if suffix == ".mcap" or kind in MCAP_TYPES:
-        return "mcap"
-    if suffix in (".csv", ".txt", ".tsv") or kind in CSV_TYPES:
-        return "csv"
-    kind_text = f"{kind!r}" + (f" ({file_name})" if file_name else "")
-    raise UnsupportedMediaType(f"found {kind_text}; need text/csv or application/x-mcap")
+def _find_stem(name: Path) -> str:
+    """Return the name without its suffix, and without that of the text that it compresses."""
+    return Path(name.stem).stem if name.suffix.lower() == ".gz" else name.stem

@@ -1,6 +1,7 @@
 """Routes of datasets."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -31,6 +32,7 @@ UPLOAD_BODY: dict[str, Any] = {
         "required": True,
         "content": {
             "text/csv": {"schema": {"type": "string"}},
+            "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
             "application/x-mcap": {"schema": {"type": "string", "format": "binary"}},
             "multipart/form-data": {
                 "schema": {
@@ -45,10 +47,10 @@ UPLOAD_BODY: dict[str, Any] = {
 Name = Annotated[str | None, Query(max_length=200)]
 Segments = Annotated[
     str | None,
-    Query(description="CSV label columns, separated by commas; each combination is a segment"),
+    Query(description="label columns, separated by commas; each combination is a segment"),
 ]
 SampleTime = Annotated[
-    float | None, Query(gt=0, description="sampling period in s, for a CSV without a time column")
+    float | None, Query(gt=0, description="sampling period in s, for a file without a time column")
 ]
 
 
@@ -61,15 +63,18 @@ async def add_dataset(
     segments: Segments = None,
     sample_time: SampleTime = None,
 ) -> DatasetOut:
-    """Store a recording, CSV or MCAP. The same bytes again return the same dataset (200)."""
+    """Store a recording: CSV or other text, Excel, Parquet, NumPy, MATLAB or MCAP.
+
+    The kind is recognised by the bytes. The same bytes again return the same dataset (200).
+    """
     async with receive_upload(request, parts.settings, parts.upload_places) as upload:
         stored = await run_in_threadpool(
             datasets.add_upload,
             parts.database,
             parts.store,
             upload.path,
-            upload.file_format,
             sha256=upload.sha256,
+            suffix=upload.suffix or Path(name or "").suffix,
             name=name or upload.name,
             segments=[column.strip() for column in (segments or "").split(",") if column.strip()],
             sample_time=sample_time,

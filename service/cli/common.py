@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -30,10 +29,8 @@ if TYPE_CHECKING:
 
 
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
-DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 PIPE_WIDTH = 200  # in a pipe or a file, lines are not folded at 80 columns
 STANDARD_INPUT = Path("-")
-MCAP_MAGIC = b"\x89MCAP0\r\n"
 LISTED_ENTRIES = 50
 """Entries of a table, if the user names no other number."""
 COUNTED_ENTRIES = 500
@@ -74,11 +71,12 @@ Key = Annotated[
     ),
 ]
 Segments = Annotated[
-    str | None, typer.Option(help="CSV label columns that divide the rows into segments: col,col.")
+    str | None, typer.Option(help="Label columns that divide the rows into segments: col,col.")
 ]
 SampleTime = Annotated[
-    float | None, typer.Option(help="Sampling period in s, for a CSV without a time column.")
+    float | None, typer.Option(help="Sampling period in s, for a file without a time column.")
 ]
+DATA_HELP = "Recording: text (CSV), Excel, Parquet, NumPy, MATLAB or MCAP; - for standard input."
 AsJson = Annotated[
     bool,
     typer.Option("--json", help="Print JSON on standard output.", rich_help_panel=OUTPUT_PANEL),
@@ -329,22 +327,6 @@ def name_file(path: Path) -> str:
     return "standard input" if path == STANDARD_INPUT else str(path)
 
 
-@contextmanager
-def open_recording(path: Path) -> Iterator[Path]:
-    """Give the path of a recording: the user's file, or a temporary one with standard input."""
-    if path != STANDARD_INPUT:
-        yield path
-        return
-    content = read_file(path)
-    if not content:
-        fail("standard input is empty; need a recording, such as < recording.csv")
-    suffix = ".mcap" if content.startswith(MCAP_MAGIC) else ".csv"
-    with TemporaryDirectory(prefix="lagid-") as folder:
-        copy = Path(folder) / f"stdin{suffix}"
-        copy.write_bytes(content)
-        yield copy
-
-
 def read_document(path: Path) -> Any:
     """Parse a YAML or JSON file; end the command if this fails."""
     try:
@@ -434,6 +416,11 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
+READ_OPTIONS = (
+    (re.compile(r"\bsample_time\b"), "--sample-time"),
+    (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
+)
+"""Words of the reader of files, which are options here."""
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
@@ -442,6 +429,13 @@ SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
+
+
+def name_read_options(text: str) -> str:
+    """Name the options of reading a file as the user types them here."""
+    for pattern, option in READ_OPTIONS:
+        text = pattern.sub(option, text)
+    return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -456,10 +450,13 @@ class FieldOrigins:
         the pointer, which is a place in a file.
     rest : str
         The same for all other fields; in ``--set {}`` the braces stand for the whole path.
+    rewrite : callable
+        Changes the text of a fault, such as names of options in it.
     """
 
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
+    rewrite: Callable[[str], str] = str
 
     def locate(self, pointer: str) -> str:
         """Return the option or file where the field of a pointer was typed."""
@@ -487,6 +484,7 @@ class FieldOrigins:
         detail = fault.detail
         if not self.rest.endswith("…"):
             detail = POINTER_PATTERN.sub(lambda match: self.locate(match[0]), detail)
+        detail = self.rewrite(detail)
         return f"{origin}{column}: {detail}" if origin else detail
 
 

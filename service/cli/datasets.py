@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 import typer
 
 from service.cli.common import (
+    DATA_HELP,
     DOCUMENT_HELP,
     STANDARD_INPUT,
     AsJson,
@@ -25,6 +26,7 @@ from service.cli.common import (
     fetch_listing,
     file_origins,
     name_file,
+    name_read_options,
     parse_number,
     parse_pairs,
     print_json,
@@ -86,7 +88,7 @@ def list_datasets(
     ),
 )
 def add_dataset(
-    file: Annotated[Path, typer.Argument(help="CSV or MCAP file; - for standard input.")],
+    file: Annotated[Path, typer.Argument(help=DATA_HELP)],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
@@ -99,10 +101,8 @@ def add_dataset(
     if file != STANDARD_INPUT and not file.is_file():
         fail(f"there is no file {file}")
     source = read_file(file) if file == STANDARD_INPUT else file
-    with (
-        connect_client(url, key) as client,
-        report_faults(FieldOrigins(UPLOAD_OPTIONS, rest=name_file(file))),
-    ):
+    origins = FieldOrigins(UPLOAD_OPTIONS, rest=name_file(file), rewrite=name_read_options)
+    with connect_client(url, key) as client, report_faults(origins):
         stored = client.add_dataset(source, name, segments=segments, sample_time=sample_time)
     _print_dataset(stored, as_json)
 
@@ -282,9 +282,10 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
     sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
     before = stored["details"].get("known_before")
     history = f"known for {before:.6g} s before, " if before else ""
+    started = f"started at {stored['started_at']}, " if stored["started_at"] else ""
     print_line(
-        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {history}"
-        f"channels {_format_channels(stored)}"
+        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
+        f"{started}{history}channels {_format_channels(stored)}"
     )
     for warning in stored["warnings"]:
         print_note(warning)

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
+    DATA_HELP,
     MODEL_SUFFIXES,
     OUTPUT_PANEL,
+    STANDARD_INPUT,
     AsJson,
     FieldOrigins,
     Quiet,
@@ -25,7 +27,7 @@ from service.cli.common import (
     fail_usage,
     format_estimate,
     name_file,
-    open_recording,
+    name_read_options,
     out,
     parse_channels,
     print_json,
@@ -80,8 +82,8 @@ ResultFile = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class CsvOptions:
-    """Options for reading CSV files."""
+class FileOptions:
+    """Options for reading files."""
 
     sample_time: float | None
     segments: tuple[str, ...]
@@ -90,7 +92,7 @@ class CsvOptions:
 def identify(
     data: Annotated[
         Path,
-        typer.Argument(metavar="DATA", help="Recording, CSV or MCAP; - for standard input."),
+        typer.Argument(metavar="DATA", help=DATA_HELP),
     ],
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     changes: Annotated[
@@ -133,12 +135,10 @@ def identify(
         changes.append("posterior=true")
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
-    reading = CsvOptions(sample_time, tuple(split_names(segments)))
-    with open_recording(data) as path:
-        recording = read_recording(path, reading)
-    source = Path(name_file(data))
+    reading = FileOptions(sample_time, tuple(split_names(segments)))
+    recording = read_recording(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
-    records = _extract_records(recording, source, loaded, body)
+    records = _extract_records(recording, Path(name_file(data)), loaded, body)
     validation_records = []
     if validation is not None:
         validation_records = _extract_records(
@@ -235,23 +235,24 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_recording(path: Path, reading: CsvOptions) -> "Recording":
+def read_recording(path: Path, reading: FileOptions) -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.csv_recordings import read_csv
+    from service.formats.errors import InvalidUpload
+    from service.formats.limits import DEFAULT_LIMITS
+    from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
 
-    if not path.is_file():
+    if path != STANDARD_INPUT and not path.is_file():
         fail(f"there is no file {path}")
-    if path.suffix.lower() == ".mcap":
-        from service.formats.limits import DEFAULT_LIMITS
-        from service.formats.sandbox import read_untrusted
-
-        upload = read_untrusted(path, "mcap", DEFAULT_LIMITS)
-        recording, notes = upload.recording, upload.notes
-    else:
-        recording, notes = read_csv(
-            path, sample_time=reading.sample_time, segments=reading.segments
+    try:
+        recording, notes = read_with_notes(
+            read_file(path) if path == STANDARD_INPUT else path,
+            sample_time=reading.sample_time,
+            segments=reading.segments,
+            limits=DEFAULT_LIMITS,
         )
+    except InvalidUpload as error:
+        fail(f"{name_file(path)}: {name_read_options(error.detail)}")
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

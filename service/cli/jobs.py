@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
-    DATA_SUFFIXES,
     MODEL_SUFFIXES,
     AsJson,
     Force,
@@ -48,6 +47,7 @@ from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.states import JobState
 from service.core.text import append_unit
+from service.formats.file_kinds import SUFFIXES
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -203,7 +203,7 @@ def read_job(file: Path) -> dict[str, Any]:
     if isinstance(model, str) and model.endswith(MODEL_SUFFIXES):
         body["model"] = read_document(file.parent / model)
     for dataset in body.get("datasets") or []:
-        if isinstance(dataset, str) and dataset.endswith(DATA_SUFFIXES):
+        if isinstance(dataset, str) and dataset.endswith(SUFFIXES):
             fail(
                 f"{name_file(file)}: datasets must be ids or names on the server, but "
                 f"{dataset!r} is a file. Add it first: lagid dataset add {dataset}"

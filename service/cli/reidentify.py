@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
-    DATA_SUFFIXES,
     OUTPUT_PANEL,
     AsJson,
     FieldOrigins,
@@ -44,6 +43,7 @@ from service.cli.tables import print_reuse_note, print_trend
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.text import format_labels
+from service.formats.file_kinds import SUFFIXES
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -217,7 +217,7 @@ def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> lis
         if source in dataset_ids:
             continue
         is_file = Path(source).is_file()
-        if not is_file and source.endswith(DATA_SUFFIXES):
+        if not is_file and source.endswith(SUFFIXES):
             fail(f"there is no file {source}")
         dataset_ids[source] = client.add_dataset(Path(source))["id"] if is_file else source
     return [{"x": x, "datasets": [dataset_ids[name] for name in sources]} for x, sources in batch]

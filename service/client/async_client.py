@@ -93,7 +93,7 @@ class AsyncClient:
         segments: str | None = None,
         sample_time: float | None = None,
     ) -> Document:
-        """Store a recording (CSV or MCAP) from a file or from bytes."""
+        """Store a recording from a file of any kind that is read, or from its bytes."""
         return await self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     async def simulate_dataset(self, body: Mapping[str, Any]) -> Document:

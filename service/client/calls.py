@@ -25,8 +25,8 @@ Document: TypeAlias = dict[str, Any]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 TERMINAL_STATES = frozenset(state.value for state in JobState if state.is_terminal)
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
+FILE_TYPE = "application/octet-stream"  # the server recognises the kind by the bytes
+MCAP_TYPE = "application/x-mcap"
 IDEMPOTENCY_HEADER = "Idempotency-Key"
 
 POLL_SECONDS = 0.3
@@ -216,15 +216,12 @@ def build_download(dataset: str, file_format: str) -> RestCall:
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> RestCall:
-    """Build the call that stores a file or bytes; suffix or content decide its media type."""
-    content: bytes | Path
-    if isinstance(source, bytes):
-        content = source
-        kind = "application/x-mcap" if content.startswith(MCAP_MAGIC) else "text/csv"
-    else:
-        content = Path(source)
-        kind = MEDIA_TYPES.get(content.suffix.lower(), "application/octet-stream")
-        name = name or content.stem
+    """Build the call that stores a file or bytes."""
+    content = source if isinstance(source, bytes) else Path(source)
+    kind = FILE_TYPE
+    if isinstance(content, Path):
+        kind = MCAP_TYPE if content.suffix.lower() == ".mcap" else FILE_TYPE
+        name = name or content.name.removesuffix(".gz").rpartition(".")[0] or content.name
     call = ADD_DATASET(name=name, segments=segments, sample_time=sample_time)
     return replace(call, content=content, headers={"content-type": kind})
 

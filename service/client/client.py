@@ -111,7 +111,7 @@ class Client:
         segments: str | None = None,
         sample_time: float | None = None,
     ) -> Document:
-        """Store a recording (CSV or MCAP) from a file or from bytes."""
+        """Store a recording from a file of any kind that is read, or from its bytes."""
         return self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     def simulate_dataset(self, body: Mapping[str, Any]) -> Document:

@@ -27,6 +27,7 @@ from service.datasets.schemas import (
     SignalsOut,
 )
 from service.formats.decimate import decimate
+from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.mcap import write_recording
 from service.formats.sandbox import read_untrusted
 from service.repositories.datasets import DatasetRepository, NewDataset, StoredDataset
@@ -65,27 +66,31 @@ def resolve_dataset(session: Session, reference: str) -> Dataset | str:
         ids = ", ".join(dataset.id for dataset in matches)
         return f"{len(matches)} datasets are named {reference!r}; use one of the ids {ids}"
     hint = suggest_name(reference, set(list_dataset_names(session)))
-    if "/" in reference or reference.endswith((".csv", ".mcap")):
+    if "/" in reference or reference.endswith(SUFFIXES):
         hint = "; file paths are not read here: add the file first with `lagid dataset add`"
     return f"there is no dataset {reference!r}{hint}"
 
 
 DatasetKind = Literal["upload", "simulate", "derive"]
-FileFormat = Literal["csv", "mcap"]
 
 
 def add_upload(
     database: Database,
     store: ObjectStore,
     path: Path,
-    form: FileFormat,
     *,
     sha256: str,
+    suffix: str = "",
     name: str | None = None,
     segments: Sequence[str] = (),
     sample_time: float | None = None,
 ) -> StoredDataset:
     """Store an uploaded file, or return the existing dataset of the same bytes.
+
+    Parameters
+    ----------
+    suffix : str
+        Suffix of the name that the user gave the file.
 
     Raises
     ------
@@ -94,7 +99,7 @@ def add_upload(
     """
     read_as = {
         "sha256": sha256,
-        "format": form,
+        "format": detect_kind(path, suffix),
         "segments": list(segments),
         "sample_time": sample_time,
     }
@@ -104,7 +109,7 @@ def add_upload(
     if existing is not None:
         return StoredDataset(existing, is_new=False)
     # Reading takes time. An open transaction would block all others on SQLite.
-    read = read_untrusted(path, form, segments=segments, sample_time=sample_time)
+    read = read_untrusted(path, suffix=suffix, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
     return add_recording(
         database,
@@ -186,6 +191,7 @@ def describe_recording(
     content: StoredObject,
 ) -> NewDataset:
     """Build the description of a recording for its row."""
+    start = recording.started_at
     return NewDataset(
         name=name,
         kind=kind,
@@ -198,6 +204,7 @@ def describe_recording(
         channels=[_describe_channel(channel) for channel in recording.channels],
         details={
             **details,
+            "started_at": None if start is None else start.isoformat(),
             "warnings": [*details["warnings"], *list_unknown_unit_warnings(recording.channels)],
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
@@ -214,6 +221,7 @@ def to_out(row: Dataset) -> DatasetOut:
         row,
         samples=row.n_samples,
         segments=details.pop("segments"),
+        started_at=details.pop("started_at", None),
         warnings=details.pop("warnings"),
         details=details,
     )

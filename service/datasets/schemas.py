@@ -140,6 +140,10 @@ class DatasetOut(Answer):
     samples: int
     duration: float
     sample_time: float | None
+    started_at: str | None = Field(
+        default=None,
+        description="time 0 s on the clock that recorded, ISO 8601; without a zone it is local",
+    )
     segments: list[dict[str, Any]]
     warnings: list[str]
     details: dict[str, Any]

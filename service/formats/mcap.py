@@ -24,6 +24,7 @@ from service.formats.mcap_content import (
     sort_columns,
 )
 from service.formats.mcap_writer import McapWriter
+from service.formats.time_columns import find_clock_start
 from service.formats.topics import (
     DATASET_RECORD,
     TIME_FIELD,
@@ -265,7 +266,7 @@ def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> R
         _attach_history(_build_channel(entry, topics), manifest, topics)
         for entry in manifest.channels
     )
-    return Recording(channels, manifest.segments)
+    return Recording(channels, manifest.segments, manifest.started_at)
 
 
 def _decode_topic(
@@ -336,7 +337,8 @@ def _build_foreign_recording(
         raise InvalidUpload(
             f"the file has {len(channels)} signals; at most {limits.channels} are read"
         )
-    return Recording(tuple(channels.values())), tuple(notes)
+    clock = find_clock_start(start / 1e9)
+    return Recording(tuple(channels.values()), started_at=clock), tuple(notes)
 
 
 def _choose_free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:

@@ -12,17 +12,19 @@ from dataclasses import asdict, dataclass
 from hashlib import file_digest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 from service.core import temporary_files
 from service.core.errors import Unavailable
 from service.formats.errors import InvalidUpload
+from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.data.records import Recording
 
-FileKind = Literal["csv", "mcap"]
+OUT_OF_MEMORY = ("MemoryError", "memory allocation of", "failed to allocate", "bad_alloc")
+"""What the reader's libraries write on stderr if they get no memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +34,7 @@ class UploadedRecording:
     Attributes
     ----------
     notes : tuple of str
-        Notes for the user: missing values, irregular times, skipped topics.
+        Notes for the user: what was guessed, missing values, irregular times, skipped topics.
     source_sha256 : str
         Hash of the uploaded bytes.
     """
@@ -44,18 +46,20 @@ class UploadedRecording:
 
 def read_untrusted(
     path: str | os.PathLike[str],
-    kind: FileKind,
     limits: UploadLimits = DEFAULT_LIMITS,
     *,
+    suffix: str = "",
     sample_time: float | None = None,
     segments: Sequence[str] = (),
 ) -> UploadedRecording:
-    """Read an uploaded file.
+    """Read an uploaded file of any kind.
 
     Parameters
     ----------
+    suffix : str
+        Suffix of the name that the user gave the file; see `file_kinds.detect_kind`.
     sample_time, segments
-        For CSV; see `service.formats.csv_recordings.read_csv`.
+        See `service.formats.csv_recordings.read_csv`.
 
     Raises
     ------
@@ -75,7 +79,7 @@ def read_untrusted(
         task = {
             "source": str(source.absolute()),
             "target": str(clean),
-            "kind": kind,
+            "kind": detect_kind(source, suffix),
             "sample_time": sample_time,
             "segments": list(segments),
             "limits": asdict(limits),
@@ -113,7 +117,7 @@ def _parse_answer(
     except (json.JSONDecodeError, KeyError, TypeError):
         errors = child.stderr.decode(errors="replace")
         reason = (errors.strip().splitlines() or ["no message"])[-1]
-        if "MemoryError" in reason or child.returncode == -9:
+        if any(word in errors for word in OUT_OF_MEMORY) or child.returncode == -9:
             raise InvalidUpload(
                 f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"
             ) from None

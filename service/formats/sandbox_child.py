@@ -1,6 +1,7 @@
 """The child process of `service.formats.sandbox`: one task on stdin, one answer on stdout."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,11 @@ import numpy as np
 from service.core.temporary_files import FULL_DISK_ERRORS
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
-from service.formats.limits import MIB, UploadLimits
+from service.formats.file_kinds import FileKind
+from service.formats.limits import MIB, ReadOptions, UploadLimits
 from service.formats.mcap import read_mcap_with_notes, write_recording
+from service.formats.table_columns import Table
+from service.formats.table_recordings import build_recording
 from sysid.core.child_processes import limit_resources
 from sysid.data.records import Recording
 
@@ -23,6 +27,7 @@ def main() -> int:
     """
     task = json.load(sys.stdin)
     limits = UploadLimits(**task["limits"])
+    os.environ["POLARS_MAX_THREADS"] = "1"  # the stacks of its threads would count as memory
     limit_resources(
         seconds=limits.seconds,
         memory_bytes=limits.memory_bytes,
@@ -43,22 +48,43 @@ def main() -> int:
 
 
 def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
-    if task["kind"] == "csv":
-        recording, notes = read_csv(
-            Path(task["source"]),
-            sample_time=task["sample_time"],
-            segments=task["segments"],
-            limits=limits,
-        )
-        messages = list(notes)
-    else:
-        recording, notes = read_mcap_with_notes(task["source"], limits)
-        messages = [*notes, *_check_finite_values(recording)]
+    options = ReadOptions(task["sample_time"], tuple(task["segments"]), limits)
+    recording, messages = read_file(Path(task["source"]), task["kind"], options)
     try:
         write_recording(recording, task["target"])
     except ValueError as error:
         raise InvalidUpload(str(error)) from None
     return messages
+
+
+def read_file(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Recording, list[str]]:
+    """Read a file of a kind, and return the notes with its recording."""
+    if kind == "csv":
+        recording, notes = read_csv(
+            path,
+            sample_time=options.sample_time,
+            segments=options.segments,
+            limits=options.limits,
+        )
+        return recording, list(notes)
+    if kind == "mcap":
+        recording, notes = read_mcap_with_notes(path, options.limits)
+        return recording, [*notes, *_check_finite_values(recording)]
+    table, messages = _read_table(path, kind, options)
+    return build_recording(table, messages), messages
+
+
+def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table, list[str]]:
+    """Read a table by the library of its kind, which is loaded for it alone."""
+    messages: list[str] = []
+    if kind == "excel":
+        from service.formats.sheet_files import read_sheets
+
+        return read_sheets(path, options, messages), messages
+    from service.formats.column_files import read_matlab, read_numpy, read_parquet
+
+    read = {"numpy": read_numpy, "matlab": read_matlab, "parquet": read_parquet}[kind]
+    return read(path, options, messages), messages
 
 
 def _check_finite_values(recording: Recording) -> list[str]:

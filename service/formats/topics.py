@@ -9,6 +9,7 @@ each message carries its time in a separate field.
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from math import floor
 from typing import Any, Literal, get_args
 
@@ -112,7 +113,15 @@ DATASET_RECORD = "lagid.dataset"
 """Name of the metadata record that describes a file written by lagid."""
 
 FORMAT_VERSION = "1"
-RESERVED_KEYS = ("format", "sample_time", "channels", "topics", "segments", "history")
+RESERVED_KEYS = (
+    "format",
+    "sample_time",
+    "channels",
+    "topics",
+    "segments",
+    "history",
+    "started_at",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +217,7 @@ def build_manifest(
         for c, field in zip(topic.channels, topic.fields, strict=True)
     }
     clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history)}
-    sampling = recording.sampling
+    sampling, start = recording.sampling, recording.started_at
     return {
         "format": FORMAT_VERSION,
         "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
@@ -216,6 +225,7 @@ def build_manifest(
         "topics": json.dumps(clocks),
         "segments": json.dumps([asdict(segment) for segment in recording.segments]),
         "history": json.dumps(histories),
+        **({} if start is None else {"started_at": start.isoformat()}),
         **metadata,
     }
 
@@ -239,6 +249,7 @@ class Manifest:
     clocks: Mapping[str, TopicClock]
     segments: tuple[Segment, ...]
     history: Mapping[str, tuple[str, str]]
+    started_at: datetime | None = None
 
 
 def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
@@ -266,6 +277,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
             {path: TopicClock.from_dict(entry) for path, entry in clocks.items()},
             segments,
             history,
+            datetime.fromisoformat(metadata["started_at"]) if "started_at" in metadata else None,
         )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None

@@ -17,6 +17,7 @@ from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.figures.posterior import posterior_height
 from service.figures.residuals import residuals_height
+from service.formats.file_kinds import SUFFIXES
 from service.jobs.stored_run import StoredRun
 from service.models import models
 from service.models.schemas import ModelOut
@@ -83,6 +84,7 @@ def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> s
         next=_encode_query({**chosen, "cursor": page.next}) if page.next else "",
         choices=list_choices(),
         defaults=DEFAULTS,
+        recording_suffixes=",".join(SUFFIXES),
     )
 
 

@@ -138,12 +138,14 @@ def _cut_rows(recording: Recording, arguments: StepArguments) -> Recording:
         )
         for channel in recording.channels
     )
-    return Recording(channels, _clip_segments(recording.segments, times[first], times[last - 1]))
+    segments = _clip_segments(recording.segments, times[first], times[last - 1])
+    return replace(recording, channels=channels, segments=segments)
 
 
 def _cut_span(recording: Recording, start: float, stop: float) -> Recording:
     channels = tuple(channel.slice_time(start, stop) for channel in recording.channels)
-    return Recording(channels, _clip_segments(recording.segments, start, stop))
+    segments = _clip_segments(recording.segments, start, stop)
+    return replace(recording, channels=channels, segments=segments)
 
 
 def _clip_segments(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[Segment, ...]:

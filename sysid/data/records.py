@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -196,10 +197,20 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """All channels of one dataset, without roles; without segments it is one measurement."""
+    """All channels of one dataset, without roles; without segments it is one measurement.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+    segments : tuple of Segment
+    started_at : datetime or None
+        Time 0 s on the clock that recorded; None if it is not known. Without a zone it is local
+        time of an unknown zone.
+    """
 
     channels: tuple[Channel, ...]
     segments: tuple[Segment, ...] = ()
+    started_at: datetime | None = None
 
     def channel(self, name: str) -> Channel:
         """Return the channel of a name.

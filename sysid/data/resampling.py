@@ -62,7 +62,7 @@ def resample_recording(recording: Recording, arguments: StepArguments) -> Record
         _move_segment(channel, grid)
         for channel, grid in zip(recording.segments, grids, strict=False)
     )
-    return Recording(tuple(channels), segments)
+    return replace(recording, channels=tuple(channels), segments=segments)
 
 
 def _resample_channel(

@@ -90,7 +90,7 @@ def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: P
     path = tmp_path / "step.csv"
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
     opened(own_site, page)
-    page.get_by_label("or upload CSV or MCAP").set_input_files(path)
+    page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator("#form-state")).to_contain_text("step.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
 
@@ -101,8 +101,23 @@ def test_a_file_that_cannot_be_used_is_told_with_its_place(
     path = tmp_path / "bad.csv"
     path.write_text("t,u,y\n0,1,2\n0.1,oops,2\n0.2,1,2\n")
     opened(site, page)
-    page.get_by_label("or upload CSV or MCAP").set_input_files(path)
+    page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text("oops")
+
+
+def test_a_file_without_times_is_stored_with_its_sampling_period(
+    own_site: Site, page: Page, tmp_path: Path
+) -> None:
+    path = tmp_path / "notime.csv"
+    path.write_text("u;y\n" + "".join(f"{n % 2};{n},5\n" for n in range(20)))
+    opened(own_site, page)
+    page.get_by_label("or upload a recording").set_input_files(path)
+    expect(page.locator('[data-fault="/datasets"]')).to_contain_text('field "sampling period"')
+    page.get_by_label("sampling period [s]").fill("0.1")
+    page.get_by_label("sampling period [s]").blur()
+    expect(page.locator("#form-state")).to_contain_text("notime.csv is stored")
+    expect(page.locator("#form-state")).to_contain_text("decimal commas")
+    expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
 
 
 def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) -> None:

@@ -40,7 +40,7 @@ def test_the_reader_of_uploads_and_the_compiler_run_no_module_of_the_working_fol
     file.write_text("t,u\n0,1\n1,2\n")
     with chdir(foreign.path):
         monkeypatch.setattr(sys, "path", ["", str(foreign.path), ".", *sys.path])
-        assert read_untrusted(file, "csv").recording.channels[0].values.tolist() == [1.0, 2.0]
+        assert read_untrusted(file).recording.channels[0].values.tolist() == [1.0, 2.0]
         assert compile_kernel(duffing(), KernelVariant())
     assert foreign.list_imported() == []
 

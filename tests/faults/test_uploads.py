@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
-from service.cli.identify import CsvOptions, read_recording
+from service.cli.identify import FileOptions, read_recording
 from service.formats import limits as format_limits
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
-from service.formats.sandbox import FileKind, read_untrusted
+from service.formats.sandbox import read_untrusted
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
@@ -25,16 +26,16 @@ def saved(folder: Path, content: bytes) -> Path:
     return path
 
 
-def refused(path: Path, kind: FileKind, **options: object) -> InvalidUpload:
+def refused(path: Path, **options: object) -> InvalidUpload:
     with pytest.raises(InvalidUpload) as caught:
-        read_untrusted(path, kind, **options)  # type: ignore[arg-type]
+        read_untrusted(path, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
 
 
 def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
     content = b"n,u [V]\n1,0.5\n1,\n2,0.25\n"
-    read = read_untrusted(saved(tmp_path, content), "csv", sample_time=0.5, segments=("n",))
+    read = read_untrusted(saved(tmp_path, content), sample_time=0.5, segments=("n",))
     np.testing.assert_array_equal(read.recording.channel("u").values, [0.5, np.nan, 0.25])
     assert [one.labels["n"] for one in read.recording.segments] == [1.0, 2.0]
     assert any("missing" in note for note in read.notes)
@@ -43,7 +44,7 @@ def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
 
 def test_an_mcap_upload_comes_through_bit_for_bit(tmp_path: Path) -> None:
     before = Channel("u", TIMES, np.sin(TIMES), "V", "zero")
-    read = read_untrusted(saved(tmp_path, recorded(Recording((before,)))), "mcap")
+    read = read_untrusted(saved(tmp_path, recorded(Recording((before,)))))
     after = read.recording.channel("u")
     assert (after.unit, after.hold) == ("V", "zero")
     np.testing.assert_array_equal(after.values, before.values)
@@ -51,35 +52,35 @@ def test_an_mcap_upload_comes_through_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_the_place_of_a_fault_comes_out_of_the_child(tmp_path: Path) -> None:
-    error = refused(saved(tmp_path, b"t,u\n0,1\n1,x\n"), "csv")
+    error = refused(saved(tmp_path, b"t,u\n0,1\n1,x\n"))
     assert (error.row, error.column) == (3, "u")
     content = recorded(Recording((Channel("u", TIMES, TIMES),)))
-    assert refused(saved(tmp_path, content[:-100]), "mcap").byte is not None
+    assert refused(saved(tmp_path, content[:-100])).byte is not None
 
 
 def test_missing_values_are_said_and_infinite_ones_refused(tmp_path: Path) -> None:
     messages = json_messages("/a", {"x": 1}, {"x": float("nan")})
-    read = read_untrusted(saved(tmp_path, foreign(messages)), "mcap")
+    read = read_untrusted(saved(tmp_path, foreign(messages)))
     assert any("'x': 1 of 2 values are missing" in note for note in read.notes)
     infinite = foreign(json_messages("/a", {"x": 1}, {"x": float("inf")}))
-    assert "infinite at t = 0.1 s" in refused(saved(tmp_path, infinite), "mcap").detail
+    assert "infinite at t = 0.1 s" in refused(saved(tmp_path, infinite)).detail
 
 
 def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, file_bytes=10)
-    assert "at most 10" in refused(saved(tmp_path, bytes(11)), "csv", limits=limits).detail
+    assert "at most 10" in refused(saved(tmp_path, bytes(11)), limits=limits).detail
 
 
 def test_a_file_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, seconds=0.01)
-    assert "takes more than 0.01 s" in refused(saved(tmp_path, b""), "csv", limits=limits).detail
+    assert "takes more than 0.01 s" in refused(saved(tmp_path, b""), limits=limits).detail
 
 
 @pytest.mark.slow
 def test_a_file_that_burns_the_processor_is_stopped(tmp_path: Path) -> None:
     rows = "".join(f"{k},\n" for k in range(2_000_000))  # empty fields take the slow way
     limits = replace(DEFAULT_LIMITS, seconds=0.9)
-    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), "csv", limits=limits)
+    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), limits=limits)
     assert "takes more than 0.9 s" in error.detail
 
 
@@ -87,27 +88,27 @@ def test_a_file_that_burns_the_processor_is_stopped(tmp_path: Path) -> None:
 def test_a_file_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{k},{k}\n" for k in range(300_000))
     limits = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
-    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), "csv", limits=limits)
+    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), limits=limits)
     assert "64 MiB of memory" in error.detail
 
 
 def test_a_file_that_makes_the_reader_stop_is_refused(tmp_path: Path) -> None:
     limits = replace(DEFAULT_LIMITS, total_bytes=0)  # the child may not write its answer's file
-    error = refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), "csv", limits=limits)
+    error = refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), limits=limits)
     assert "crashes its reader" in error.detail
 
 
 def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
-    assert "63 bits" in refused(saved(tmp_path, b"t,u\n-1e12,1\n0,2\n"), "csv").detail
+    assert "63 bits" in refused(saved(tmp_path, b"t,u\n-1e12,1\n0,2\n")).detail
 
 
 def test_identify_reads_mcap_under_the_limits_of_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     times = np.arange(20_000) * 0.01
     path = tmp_path / "recording.mcap"
     path.write_bytes(recorded(Recording((Channel("u", times, np.sin(times)),))))
-    own = CsvOptions(None, ())
+    own = FileOptions(None, ())
     np.testing.assert_array_equal(read_recording(path, own).channel("u").values, np.sin(times))
     for change, words in (
         ({"memory_bytes": 64 * MIB}, "64 MiB of memory"),
@@ -115,8 +116,9 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
     ):
         smaller = replace(DEFAULT_LIMITS, **change)  # type: ignore[arg-type]
         monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
-        with pytest.raises(InvalidUpload, match=words):
+        with pytest.raises(typer.Exit):
             read_recording(path, own)
+        assert words in capsys.readouterr().err
 
 
 def test_the_reader_does_not_see_the_secrets_of_the_environment(
@@ -127,7 +129,7 @@ def test_the_reader_does_not_see_the_secrets_of_the_environment(
     program.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(program))
     monkeypatch.setenv("LAGID_API_KEY", "secret")
-    refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), "csv")
+    refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"))
     names = {line.partition("=")[0] for line in (tmp_path / "seen").read_text().splitlines()}
     assert "PYTHONPATH" in names
     assert "LAGID_API_KEY" not in names

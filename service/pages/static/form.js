@@ -97,16 +97,19 @@ async function upload() {
   if (!file) return;
   clearFaults(form);
   showState(`storing ${file.name}…`);
-  const type = file.name.toLowerCase().endsWith('.mcap') ? 'application/x-mcap' : 'text/csv';
   try {
-    const stored = await ask(`/v1/datasets?name=${encodeURIComponent(file.name)}`, {
-      method: 'POST', headers: { 'Content-Type': type }, body: file,
+    const options = new URLSearchParams({ name: file.name });
+    const period = field('upload-period').value;
+    if (period) options.set('sample_time', period);
+    const stored = await ask(`/v1/datasets?${options}`, {
+      method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     });
     await selectDataset(stored.id);
-    showState(`${file.name} is stored`);
+    showState([`${file.name} is stored`, ...stored.warnings].join(' · '));
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    form.querySelector('[data-fault="/datasets"]').textContent = error.message;
+    const message = error.message.replace(/\bsample_time\b/g, 'the field "sampling period"');
+    form.querySelector('[data-fault="/datasets"]').textContent = message;
     showState('');
   }
 }
@@ -276,7 +279,7 @@ function openPanel() {
 }
 
 field('dataset').addEventListener('change', withFaults(showDataset));
-field('upload').addEventListener('change', withFaults(upload));
+for (const name of ['upload', 'upload-period']) field(name).addEventListener('change', withFaults(upload));
 field('model').addEventListener('change', withFaults(() => {
   field('source').value = 'listed';
   // Clear the old model's table at once, so that no typed value is lost.

@@ -138,7 +138,9 @@ def test_a_segment_as_long_as_a_round_step_does_not_touch_the_next() -> None:
 
 
 def test_labels_are_numbers_only_if_all_of_them_are_finite() -> None:
-    recording, _ = read_csv(b"n,m,t,u\n1,1,0,1\nnan,2,0,2\n", segments=("n", "m"))
+    recording, _ = read_csv(
+        b"n,m,t,u\n1,1,0,1\n1,1,1,1\nnan,2,0,2\nnan,2,1,2\n", segments=("n", "m")
+    )
     assert [dict(one.labels) for one in recording.segments] == [
         {"n": "1", "m": 1.0},
         {"n": "nan", "m": 2.0},
@@ -183,7 +185,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
     ("content", "words"),
     [
         ("", "the file is empty"),
-        ("\n\n", "first row is empty"),
+        ("\n\n", "first rows are empty"),
         ("t\n1\n2\n", "only one column"),
         ("1\n2\n", "only one column"),
         ("t,u\n", "no rows"),
@@ -214,9 +216,9 @@ def test_what_cannot_be_used_is_refused_in_one_line(content: str, words: str) ->
     assert words in refused(content).detail
 
 
-def test_bytes_that_are_not_utf_8_are_told_with_their_row() -> None:
+def test_bytes_that_are_no_text_are_told_with_their_place() -> None:
     assert refused(b"t,u\n0,1\n1,\xb5\n").row == 3
-    assert "UTF-16" in refused("t,u\n0,1\n".encode("utf-16")).detail
+    assert refused(b"t,u\n0,1\n\x01").byte == 8
     assert refused(b"\x7fELF\0\0").byte == 4
 
 

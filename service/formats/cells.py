@@ -1,0 +1,72 @@
+"""What one cell of a table holds: a number, a time stamp, a word, or nothing."""
+
+import re
+from collections.abc import Iterable
+from typing import Final, Literal
+
+CellKind = Literal["empty", "number", "flag", "stamp", "date", "clock", "text", "count"]
+"""``stamp`` is a date with a time of day, ``clock`` a time of day, ``flag`` true or false.
+
+``count`` is said of a column that numbers the rows.
+"""
+
+MISSING: Final = frozenset(
+    ("", "na", "n/a", "#n/a", "#nv", "#na", "nan", "-nan", "null", "none", "-", "--", "---", "?")
+)
+"""Words of a missing value, in small letters."""
+FLAGS: Final = {"true": 1.0, "false": 0.0}
+
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|[+-]?inf(?:inity)?", re.I)
+_NUMBER_START = re.compile(r"[+-]?\s?[.,]?\d")
+_DATE = (
+    r"(?P<iso>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})"
+    r"|(?P<day>\d{1,2}\.\d{1,2}\.\d{4})"
+    r"|(?P<short>\d{1,2}\.\d{1,2}\.\d{2})"
+    r"|(?P<either>\d{1,2}(?P<sign>[/-])\d{1,2}(?P=sign)\d{4})"
+    r"|(?P<either_short>\d{1,2}/\d{1,2}/\d{2})"
+    r"|(?P<month>\d{1,2}-[A-Za-z]{3}-\d{4})"
+)
+_CLOCK = (
+    r"(?P<hour>\d{1,3}):(?P<minute>\d{2})(?::(?P<second>\d{2}))?(?P<fraction>[.,]\d*)?"
+    r"(?:\s?(?P<half>[AaPp])\.?[Mm]\.?)?"
+)
+_ZONE = r"(?P<zone>Z|z|\s?UTC|\s?GMT|\s?[+-]\d{2}:?\d{2}|[+-]\d{2})"
+STAMP: Final = re.compile(rf"(?:{_DATE})(?P<gap>[Tt]|,?\s+)(?:{_CLOCK}){_ZONE}?")
+DATE_ONLY: Final = re.compile(_DATE)
+CLOCK_TIME: Final = re.compile(_CLOCK)
+
+
+def classify_cell(text: str) -> CellKind:
+    """Return what a cell holds."""
+    text = text.strip()
+    if text.lower() in MISSING:
+        return "empty"
+    if _NUMBER.fullmatch(text):
+        return "number"
+    if text.lower() in FLAGS:
+        return "flag"
+    if text[0].isdigit():
+        if STAMP.fullmatch(text):
+            return "stamp"
+        if CLOCK_TIME.fullmatch(text):
+            return "clock"
+        if DATE_ONLY.fullmatch(text):
+            return "date"
+    return "text"
+
+
+def classify_column(cells: Iterable[str]) -> CellKind:
+    """Return what a column holds: a number wins, since a text among numbers is a fault."""
+    kinds = {classify_cell(cell) for cell in cells} - {"empty"}
+    if not kinds:
+        return "empty"
+    if "number" in kinds:
+        return "number"
+    if kinds == {"stamp", "date"}:  # some programs write midnight as a date
+        return "stamp"
+    return kinds.pop() if len(kinds) == 1 else "text"
+
+
+def begins_like_number(text: str) -> bool:
+    """Whether a text that is no number begins like one, such as ``1,000.5`` or ``5 V``."""
+    return _NUMBER_START.match(text.strip()) is not None

@@ -1,0 +1,609 @@
+"""Guess the layout of a table from its first rows: header, units, separator, decimal sign, roles.
+
+The longest run of rows of one width that hold numbers or time stamps is the data. The header is
+the last row of that width before them; a row of units may lie between. Lines before the header are
+a preamble. Rows that begin with ``#``, ``%`` or ``//`` are comments, and one of them may be the
+header.
+"""
+
+import csv
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final, Literal, NamedTuple
+
+from service.core.text import unescape_formula
+from service.formats.cells import CellKind, classify_cell, classify_column
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
+from sysid.core.errors import suggest_name
+from sysid.core.units import find_conversion_factor, is_known_unit
+
+SEPARATORS: Final = ("\t", ";", ",", "|", " ")
+COMMENT_SIGNS: Final = ("#", "%", "//")
+TIME_NAMES: Final = ("t", "time")
+TIME_WORDS: Final = frozenset(
+    (
+        *TIME_NAMES,
+        *("timestamp", "time stamp", "datetime", "date time", "date/time", "date"),
+        *("elapsed", "elapsed time", "time elapsed", "sec", "secs", "seconds"),
+        *("zeit", "zeitstempel", "uhrzeit", "datum", "datum/zeit", "datum/uhrzeit"),
+        *("datum zeit", "datum uhrzeit", "temps", "tiempo", "tempo", "tijd", "tid", "x value"),
+    )
+)
+_DATE_WORDS: Final = frozenset(("date", "datum"))
+NO_NAMES: Final = ("", "unnamed: 0", "__index_level_0__")
+INDEX_NAMES: Final = (*NO_NAMES, "index", "no", "no.", "nr", "nr.", "#")
+"""Names of a column that is left out if it counts rows, in small letters."""
+SECOND_NAMES: Final = ("", "s", "sec", "secs", "second", "seconds")
+_LONG_UNITS: Final = {
+    **dict.fromkeys(("minute", "minutes", "mins"), "min"),
+    **dict.fromkeys(("hour", "hours", "hrs"), "h"),
+    **dict.fromkeys(("millisecond", "milliseconds", "msec", "msecs"), "ms"),
+    **dict.fromkeys(("microsecond", "microseconds", "usec", "usecs", "μs"), "us"),
+    **dict.fromkeys(("nanosecond", "nanoseconds", "nsec"), "ns"),
+    "days": "day",
+}
+MAX_TIME_UNIT = 86_400.0
+"""Longest unit of time in s (a day); a longer one is taken for a mistake."""
+PEEK_CELLS = 20_000
+"""Most cells of the first rows that are looked at."""
+_MAX_UNIT_CHARACTERS = 12
+
+_BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
+_PARENTHESES = re.compile(r"^(?P<name>.*?)\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
+_SLASH = re.compile(r"^(?P<name>[^/]+?)\s*(?:/|\s+in\s+)\s*\(?(?P<unit>[^()]+?)\)?$", re.DOTALL)
+_DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
+
+ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
+"""``date`` completes a time of day; ``nameless`` and ``text`` are left out of the recording."""
+
+
+class Heading(NamedTuple):
+    """Name and unit of a column, and what its first cells hold."""
+
+    name: str
+    unit: str
+    kind: CellKind
+
+
+@dataclass(frozen=True, slots=True)
+class TableColumn:
+    """One column: its name without the unit, its unit, what it holds and its role."""
+
+    name: str
+    unit: str
+    kind: CellKind
+    role: ColumnRole
+
+
+@dataclass(frozen=True, slots=True)
+class TableLayout:
+    """Layout of a table.
+
+    Attributes
+    ----------
+    columns : tuple of TableColumn
+    separator : str
+        Of the fields in a line; ``" "`` is any blanks, and empty if the rows are fields already.
+    has_decimal_commas : bool
+    header_row : int
+        Row of the header in the file, from 1.
+    skipped : int
+        Rows before the first row of data, or up to the header if there is none.
+    sample_time : float or None
+        Sampling period in s, if it was given.
+    notes : tuple of str
+    """
+
+    columns: tuple[TableColumn, ...]
+    separator: str
+    has_decimal_commas: bool
+    header_row: int = 1
+    skipped: int = 1
+    sample_time: float | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_stamps(self) -> bool:
+        """Whether the times are dates."""
+        return any(
+            column.role in ("time", "date") and column.kind in ("stamp", "date")
+            for column in self.columns
+        )
+
+
+class _Row(NamedTuple):
+    """A row of fields, and its place among the rows of the file, from 0."""
+
+    place: int
+    fields: list[str]
+
+
+class _DataBlock(NamedTuple):
+    """The run of data under one separator, with the rows before it."""
+
+    separator: str
+    before: list[_Row]
+    data: list[_Row]
+
+    @property
+    def width(self) -> int:
+        return len(self.data[0].fields) if self.data else 0
+
+    @property
+    def has_header(self) -> bool:
+        return any(len(row.fields) == self.width for row in self.before)
+
+
+def detect_layout(
+    lines: Sequence[str],
+    segments: Sequence[str],
+    sample_time: float | None,
+    max_channels: int = DEFAULT_LIMITS.channels,
+) -> TableLayout:
+    """Detect the layout of a text from its first lines.
+
+    Raises
+    ------
+    InvalidUpload
+        If there is no usable header, if it has too many signals, or if the time is missing or given
+        twice.
+    """
+    hint = re.match(r'"?sep=(.)"?\s*$', lines[0], re.IGNORECASE)
+    blocks = []
+    for separator in (hint[1],) if hint else SEPARATORS:
+        if hint or separator == " " or any(separator in line for line in lines):
+            rows = _split_lines(lines[1:] if hint else lines, separator, int(bool(hint)))
+            _check_width(rows, len(segments), max_channels)
+            blocks.append(_find_block(rows, separator))
+    return _build_layout(_choose_block(blocks, lines), segments, sample_time, max_channels)
+
+
+def detect_sheet_layout(
+    rows: Sequence[list[str]],
+    segments: Sequence[str],
+    sample_time: float | None,
+    max_channels: int = DEFAULT_LIMITS.channels,
+) -> TableLayout:
+    """Detect the layout of rows that are split already; raises as `detect_layout`."""
+    numbered = [_Row(place, fields) for place, fields in enumerate(rows)]
+    _check_width(numbered, len(segments), max_channels)
+    return _build_layout(_find_block(numbered, ""), segments, sample_time, max_channels)
+
+
+def split_blanks(lines: Iterable[str]) -> Iterator[str]:
+    """Replace runs of blanks by one, so that each separates two fields."""
+    return (" ".join(line.split()) + "\n" for line in lines)
+
+
+def is_comment(fields: Sequence[str]) -> bool:
+    """Whether a row is a comment."""
+    return bool(fields) and fields[0].lstrip().startswith(COMMENT_SIGNS)
+
+
+def _split_lines(lines: Sequence[str], separator: str, first: int) -> list[_Row]:
+    reader = csv.reader(split_blanks(lines) if separator == " " else lines, delimiter=separator)
+    rows, place, cells = [], first, 0
+    try:
+        for fields in reader:
+            rows.append(_Row(place, fields))
+            place, cells = first + reader.line_num, cells + len(fields)
+            if cells > PEEK_CELLS:
+                break
+    except csv.Error as error:
+        raise InvalidUpload(f"the first rows cannot be read ({error})") from None
+    return rows
+
+
+def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
+    """Refuse a table that is too wide before its cells are looked at."""
+    if rows and len(rows[0].fields) - labels - 1 > max_channels:
+        raise InvalidUpload(
+            f"the header has {len(rows[0].fields)} columns; at most {max_channels} signals are "
+            "read",
+            row=rows[0].place + 1,
+        )
+
+
+def _find_block(rows: Sequence[_Row], separator: str) -> _DataBlock:
+    """Find the longest run of rows of data, and the rows before it that are not blank."""
+    best: tuple[int, int] = (0, 0)
+    start, width = 0, -1
+    full = [row for row in rows if any(map(str.strip, row.fields))]
+    for number, row in enumerate(full):
+        if is_comment(row.fields):
+            continue
+        if _is_data(row.fields):
+            if len(row.fields) != width:
+                start, width = number, len(row.fields)
+            if number + 1 - start > best[1] - best[0]:
+                best = (start, number + 1)
+        else:
+            width = -1
+    first, stop = best
+    data = [row for row in full[first:stop] if not is_comment(row.fields)]
+    if len(data) > 1 and not first and _is_header_of(data[0].fields, data[1].fields):
+        return _DataBlock(separator, full[:1], data[1:])
+    if not data:
+        return _DataBlock(separator, list(full), [])
+    return _DataBlock(separator, full[:first], data)
+
+
+def _is_data(fields: Sequence[str]) -> bool:
+    """Whether a row is one of data: its first field is, or most of its fields are."""
+    kinds = [kind for kind in map(classify_cell, fields) if kind != "empty"]
+    count = sum(kind != "text" for kind in kinds)
+    return count > 0 and (kinds[0] != "text" or 2 * count > len(kinds))
+
+
+def _is_header_of(fields: Sequence[str], below: Sequence[str]) -> bool:
+    """Whether a row of numbered names such as ``t,1,2`` heads the row below."""
+    kinds = zip(map(classify_cell, fields), map(classify_cell, below), strict=True)
+    return any(kind == "text" and other not in ("text", "empty") for kind, other in kinds)
+
+
+def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBlock:
+    """Choose the separator under which the data have a header, then the longest and the widest."""
+    found = [block for block in blocks if block.data and block.width > 1]
+    if found:
+        return max(found, key=lambda block: (block.has_header, len(block.data), block.width))
+    single = next((block for block in blocks if block.data), None)
+    if single is not None:
+        return single._replace(separator=single.separator.strip(" ") or ",")
+    if all(separator not in "".join(lines) for separator in SEPARATORS[:-1]):
+        return next(
+            (block for block in blocks if block.before and len(block.before[0].fields) > 1),
+            _DataBlock(",", _find_block(_split_lines(lines, ",", 0), ",").before, []),
+        )
+    return blocks[0]
+
+
+def _build_layout(
+    block: _DataBlock, segments: Sequence[str], sample_time: float | None, max_channels: int
+) -> TableLayout:
+    header, units, names = _find_header(block)
+    cells = [row.fields for row in block.data]
+    names, cells = _align_header(names, cells)
+    headings = [
+        Heading(name, unit, classify_cells([row[i] for row in cells], name))
+        for i, (name, unit) in enumerate(split_headings(names, units))
+    ]
+    row = header.place + 1
+    if len(headings) == 1 and (sample_time is None or _is_number(names[0])):
+        raise _build_narrow_error(names[0])
+    columns = assign_roles(headings, segments, sample_time, max_channels, row)
+    notes = []
+    preamble = [r for r in block.before if r.place < header.place and not is_comment(r.fields)]
+    if preamble:
+        notes.append(f"the header is in row {row}; the lines before it were skipped")
+    if units:
+        notes.append(f"row {row + 1} was read as the units of the columns")
+    commas = block.separator != "," and any(_DECIMAL_COMMA.match(c) for r in cells for c in r)
+    skipped = block.data[0].place if block.data else header.place + 1
+    return TableLayout(columns, block.separator, commas, row, skipped, sample_time, tuple(notes))
+
+
+def classify_cells(cells: Sequence[str], name: str) -> CellKind:
+    """Return what a column holds; one without a name of its own may count rows."""
+    kind = classify_column(cells)
+    is_count = kind == "number" and name.lower() in INDEX_NAMES and counts_rows(cells)
+    return "count" if is_count else kind
+
+
+def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
+    """Find the header before the data, the row of units below it, and the names."""
+    rows = [row for row in block.before if not is_comment(row.fields)]
+    if not block.data:
+        rows = rows[:1] or block.before[:1]
+    fit = [row for row in rows if abs(len(row.fields) - block.width) <= 1] or rows[-1:]
+    same = [row for row in fit if len(row.fields) == block.width] or fit
+    if same:
+        last = same[-1]
+        above = same[-2] if len(same) > 1 else None
+        if above is not None and _is_unit_row(last.fields, above.fields):
+            return above, last.fields, above.fields
+        return last, [], last.fields
+    for row in reversed(block.before):
+        names = _split_comment(row.fields, block)
+        if len(names) == block.width and not all(map(_is_number, names)):
+            return row, [], names
+    if not block.data:
+        raise InvalidUpload("there are no rows below the header")
+    first = block.data[0]
+    if block.width == 1:
+        raise _build_narrow_error(first.fields[0])
+    raise _build_header_error(first.place + 1)
+
+
+def _build_header_error(row: int | None) -> InvalidUpload:
+    return InvalidUpload(
+        "the first row holds numbers; need a header that names the columns, such as t,u,y", row=row
+    )
+
+
+def _build_narrow_error(name: str) -> InvalidUpload:
+    return InvalidUpload(
+        f"there is only one column ({name.strip()!r}); need a time column and a signal, separated "
+        "by comma, semicolon, tab or blanks"
+    )
+
+
+def _split_comment(fields: Sequence[str], block: _DataBlock) -> list[str]:
+    """Split a comment that may be the header: ``# t u y``, also above columns with commas."""
+    sign = block.separator or ","
+    text = sign.join(fields).lstrip()
+    for mark in COMMENT_SIGNS:
+        text = text.lstrip(mark)
+    for separator in (sign, *SEPARATORS):
+        rows = _split_lines([text.strip()], separator, 0)
+        if rows and len(rows[0].fields) == block.width:
+            return [field.strip() for field in rows[0].fields]
+    return []
+
+
+def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether a row holds the units of the columns above: ``s,V,degC`` or ``(ms),(V),``."""
+    units = [_strip_brackets(field) for field in fields]
+    full = [unit for unit in units if unit]
+    times = [
+        unit
+        for unit, name in zip(units, names, strict=False)
+        if _find_time_word(_split_heading(name, slashes=True)[0]) is not None
+    ]
+    return (
+        bool(full)
+        and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)
+        and (not times or any(find_unit_seconds(unit) is not None for unit in times))
+        and 2 * sum(map(_is_unit, full)) > len(full)
+    )
+
+
+def _strip_brackets(text: str) -> str:
+    text = text.strip()
+    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()") else text
+
+
+def _align_header(names: list[str], cells: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Give a name to columns without one: blank ends of rows, and an index before the columns."""
+    width = len(cells[0]) if cells else len(names)
+    if width == len(names) + 1:
+        if not any(row[-1].strip() for row in cells):
+            return [*names, ""], cells
+        if counts_rows([row[0] for row in cells]):
+            return ["", *names], cells
+    return names, cells if width == len(names) else []
+
+
+def counts_rows(texts: Sequence[str]) -> bool:
+    """Whether cells count rows from 0 or from 1."""
+    first = texts[0].strip() if texts else ""
+    return (
+        len(texts) > 1
+        and first in ("0", "1")
+        and all(text.strip() == str(number) for number, text in enumerate(texts, int(first)))
+    )
+
+
+def split_headings(names: Sequence[str], units: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Split the names of columns into name and unit; `units` are those of a row below them."""
+    slashes = any(
+        _find_time_word(name) is not None and find_unit_seconds(unit) is not None and unit
+        for name, unit in (_split_heading(text, slashes=True) for text in names)
+    )
+    split = [_split_heading(text, slashes=slashes) for text in names]
+    if not units:
+        return split
+    return [
+        (name, unit or _strip_brackets(below))
+        for (name, unit), below in zip(split, units, strict=False)
+    ]
+
+
+def _split_heading(field: str, *, slashes: bool) -> tuple[str, str]:
+    """Split ``u [V]``, ``u (V)`` or, as a standard writes it, ``u/V`` into name and unit."""
+    text = unescape_formula(field.strip())
+    if match := _BRACKETS.match(text):
+        return match["name"], match["unit"].strip()
+    if (match := _PARENTHESES.match(text)) and _is_unit(match["unit"]) and match["name"]:
+        return match["name"].rstrip(" /"), match["unit"].strip()
+    if slashes and (match := _SLASH.match(text)) and _is_unit(match["unit"]):
+        return match["name"], match["unit"].strip()
+    return text, ""
+
+
+@lru_cache(maxsize=1024)
+def _is_unit(text: str) -> bool:
+    return is_known_unit(text) or (bool(text.strip()) and find_unit_seconds(text) is not None)
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def assign_roles(
+    headings: Sequence[Heading],
+    segments: Sequence[str],
+    sample_time: float | None,
+    max_channels: int = DEFAULT_LIMITS.channels,
+    row: int | None = 1,
+) -> tuple[TableColumn, ...]:
+    """Give each column its role.
+
+    Raises
+    ------
+    InvalidUpload
+        If a name is missing or occurs twice, a label column is missing, or there is no signal or no
+        time. Also if the time is given twice.
+    """
+    named = [
+        TableColumn(*heading, role="nameless" if _is_nameless(heading) else "value")
+        for heading in headings
+    ]
+    _check_names(named, row)
+    columns = [
+        replace(column, role="label" if column.name in segments else column.role)
+        for column in named
+    ]
+    names = [column.name for column in columns]
+    for label in segments:
+        if label not in names:
+            raise InvalidUpload(
+                f"there is no label column {label!r}{suggest_name(label, names)}", row=row
+            )
+    columns = _assign_time(columns, sample_time, row)
+    columns = [
+        replace(c, role="text")
+        if c.role == "value" and c.kind in ("text", "stamp", "date", "clock")
+        else c
+        for c in columns
+    ]
+    for number, column in enumerate(columns, 1):
+        if column.role == "nameless" and column.kind not in ("empty", "count"):
+            raise build_nameless_error(number, row)
+    signals = sum(column.role == "value" for column in columns)
+    if signals == 0 and not any(column.role == "text" for column in columns):
+        raise InvalidUpload("there is no signal: every column is time or a label")
+    if signals > max_channels:
+        raise InvalidUpload(
+            f"the header has {len(headings)} columns; at most {max_channels} signals are read",
+            row=row,
+        )
+    return tuple(columns)
+
+
+def build_nameless_error(number: int, row: int | None = 1) -> InvalidUpload:
+    """Return the error of a column of values without a name."""
+    return InvalidUpload(f"column {number} of the header has no name", row=row)
+
+
+def _is_nameless(heading: Heading) -> bool:
+    """Whether a column has no name of its own: that of an index, or none."""
+    return heading.kind == "count" or heading.name.lower() in NO_NAMES
+
+
+def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
+    if all(_is_number(column.name) for column in columns):
+        raise _build_header_error(row)
+    seen: set[str] = set()
+    for column in columns:
+        if column.name in seen and column.name:
+            raise InvalidUpload(
+                "two columns have this name; names must differ", row=row, column=column.name
+            )
+        seen.add(column.name)
+
+
+def _assign_time(
+    columns: Sequence[TableColumn], sample_time: float | None, row: int | None
+) -> list[TableColumn]:
+    """Give their roles to the column of times, and to that of dates beside times of day."""
+    time = _find_time_column(columns)
+    if sample_time is not None and not 0 < sample_time < float("inf"):
+        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
+    if time is None:
+        if sample_time is None:
+            names = ", ".join(column.name for column in columns if column.name)
+            raise InvalidUpload(
+                f"there is no time column; found {names}. Name one of them t (in seconds), or give "
+                "the sampling period with sample_time.",
+                row=row,
+            )
+        return list(columns)
+    column = columns[time]
+    name, unit = _split_time_name(column.name, column.unit)
+    if sample_time is not None and column.kind not in ("stamp", "date", "clock"):
+        raise InvalidUpload(
+            "the file has this time column, and sample_time is given too; remove one of them",
+            row=row,
+            column=name,
+        )
+    if column.kind in ("stamp", "date", "clock"):
+        unit = ""
+    elif find_unit_seconds(unit) is None:
+        raise InvalidUpload(
+            f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
+            row=row,
+            column=name,
+        )
+    roles = list(columns)
+    other = _find_other_half(columns, time)
+    if other is not None:
+        date, time = (other, time) if columns[other].kind == "date" else (time, other)
+        roles[date] = replace(columns[date], role="date")
+    roles[time] = replace(
+        columns[time], role="time", unit=unit, name=columns[time].name or "(no name)"
+    )
+    return roles
+
+
+def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
+    """Find the column of times: by a usual name, or because it holds time stamps."""
+    free = [(i, column) for i, column in enumerate(columns) if column.role in ("value", "nameless")]
+    ranks = []
+    for i, column in free:
+        word = _find_time_word(column.name)
+        is_stamp = column.kind in ("stamp", "date", "clock")
+        if word in TIME_NAMES and column.role == "value":
+            ranks.append((0 if column.name != "T" else 1, i))
+        elif word is not None and (is_stamp or word not in _DATE_WORDS):
+            ranks.append((1 if column.kind == "stamp" else 2, i))
+        elif is_stamp:
+            ranks.append((3 if column.kind == "stamp" else 4, i))
+        elif column.role == "nameless" and column.kind == "number" and (i == 0 or column.name):
+            ranks.append((5, i))  # the index of a table, which is its time
+    return min(ranks)[1] if ranks else None
+
+
+def is_plain_time_name(name: str) -> bool:
+    """Whether a column is called ``t`` or ``time``, so that its unit is s unless it has one."""
+    return _find_time_word(name) in TIME_NAMES
+
+
+def is_time_name(name: str) -> bool:
+    """Whether a column of this name holds times."""
+    return _find_time_word(name) is not None
+
+
+def _find_other_half(columns: Sequence[TableColumn], time: int) -> int | None:
+    """Find the column of dates of a column of times of day, or the reverse."""
+    wanted = {"clock": "date", "date": "clock"}.get(columns[time].kind)
+    return next(
+        (
+            i
+            for i, column in enumerate(columns)
+            if column.kind == wanted and column.role in ("value", "nameless")
+        ),
+        None,
+    )
+
+
+def _find_time_word(name: str) -> str | None:
+    """Return the usual name of time that a name is, without a unit at its end."""
+    text = " ".join(re.sub(r"[_-]", " ", name.lower()).split())
+    if text in TIME_WORDS:
+        return text
+    word, _, unit = text.rpartition(" ")
+    return word if unit and word in TIME_WORDS and find_unit_seconds(unit) is not None else None
+
+
+def _split_time_name(name: str, unit: str) -> tuple[str, str]:
+    """Split a unit from the name of a time column, such as ``time_ms``."""
+    end = re.split(r"[ _-]", name)[-1].lower()
+    if unit or end in SECOND_NAMES or end == name.lower() or find_unit_seconds(end) is None:
+        return name, unit
+    return name, end
+
+
+def find_unit_seconds(unit: str) -> float | None:
+    """Return the seconds in one unit of a time column; None if it is no unit of time."""
+    lower = unit.strip().lower()
+    if lower in SECOND_NAMES:
+        return 1.0
+    seconds = find_conversion_factor(_LONG_UNITS.get(lower, unit.strip()), "s")
+    return seconds if seconds is not None and 0 < seconds <= MAX_TIME_UNIT else None

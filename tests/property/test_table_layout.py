@@ -1,0 +1,111 @@
+"""The layout of a text is guessed: whatever surrounds the numbers, they come back bit for bit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from service.formats.cells import classify_cell
+from service.formats.csv_recordings import read_csv
+from service.formats.table_layout import SEPARATORS
+from tests.profiles import scale_examples
+
+NAMES = ("u", "y", "P1", "Druck", "flow rate", "x2", "T", "Ventil_1")
+UNITS = ("V", "degC", "bar", "%", "m/s", "l/min")
+PREAMBLES = (
+    [],
+    ["Device: Scope 1", "Date: 2026-01-01", ""],
+    ["# logger XY", "# t and others"],
+    ["", "  "],
+    ["[Header]", "Operator=X", "***End***"],
+    ["Model,DS1054Z", "Rate,1000", "Depth;7", "Mode\tauto"],
+    [f"Setting {i}: value {i}" for i in range(40)],
+)
+NUMBERS = st.floats(-1e6, 1e6, allow_nan=False, width=32)
+
+
+@dataclass(frozen=True)
+class Text:
+    """A table with its surroundings."""
+
+    values: np.ndarray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    separator: str
+    commas: bool
+    heading: str
+    preamble: int
+    comment: bool
+    end: str
+
+    def write(self) -> str:
+        separator = self.separator
+        names = [
+            name.replace(" ", "_") if separator == " " else name for name in ("t", *self.names)
+        ]
+        units = ("s", *self.units)
+        if self.heading == "row":
+            heads = [names, list(units)]
+        else:
+            form = {"none": "{0}", "brackets": "{0} [{1}]", "parentheses": "{0} ({1})"}[
+                self.heading
+            ]
+            heads = [[form.format(*pair) for pair in zip(names, units, strict=True)]]
+            if separator == " ":
+                heads = [[head.replace(" ", "") for head in heads[0]]]
+        rows = [
+            [repr(k / 8), *(repr(float(value)) for value in row)]
+            for k, row in enumerate(self.values)
+        ]
+        if self.commas:
+            rows = [[text.replace(".", ",") for text in row] for row in rows]
+        lines = [separator.join(row) for row in (*heads, *rows)]
+        if self.comment:
+            lines.insert(len(heads) + 1, "# here the pump was switched on")
+        return self.end.join([*PREAMBLES[self.preamble], *lines, ""])
+
+
+@st.composite
+def texts(draw: st.DrawFn) -> Text:
+    width = draw(st.integers(1, 4))
+    names = draw(st.permutations(NAMES))[:width]
+    units = draw(st.lists(st.sampled_from(UNITS), min_size=width, max_size=width))
+    rows = draw(
+        st.lists(st.lists(NUMBERS, min_size=width, max_size=width), min_size=6, max_size=40)
+    )
+    separator = draw(st.sampled_from(SEPARATORS))
+    return Text(
+        np.array(rows, dtype=np.float64),
+        tuple(names),
+        tuple(units),
+        separator,
+        separator != "," and draw(st.booleans()),
+        draw(st.sampled_from(["none", "brackets", "parentheses", "row"])),
+        draw(st.integers(0, len(PREAMBLES) - 1)),
+        draw(st.booleans()),
+        draw(st.sampled_from(["\n", "\r\n"])),
+    )
+
+
+@given(texts())
+@settings(max_examples=scale_examples(150))
+def test_numbers_names_and_units_come_back_from_any_layout(text: Text) -> None:
+    content = text.write()
+    recording, _ = read_csv(content.encode())
+    wanted = [name.replace(" ", "_") if text.separator == " " else name for name in text.names]
+    assert list(recording.names) == wanted, content
+    units = ["1"] * len(text.names) if text.heading == "none" else list(text.units)
+    assert [channel.unit for channel in recording.channels] == units, content
+    for channel, values in zip(recording.channels, text.values.T, strict=True):
+        np.testing.assert_array_equal(channel.values, values)
+        np.testing.assert_array_equal(channel.times, np.arange(len(values)) / 8)
+
+
+@given(st.text(max_size=30))
+@example("1_000")
+@example("٣")
+def test_what_is_called_a_number_is_one(text: str) -> None:
+    """A cell is a number exactly if Python reads it as one, with either decimal sign."""
+    if classify_cell(text) == "number":
+        float(text.replace(",", "."))

@@ -1,0 +1,127 @@
+"""One experiment as loggers, spreadsheets and other programs write it."""
+
+import gzip
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from datetime import datetime, timedelta
+
+import numpy as np
+from scipy.io import savemat
+
+N = 40
+TIMES = np.arange(N) / 10.0
+INPUT = np.repeat([0.0, 1.0, 0.5, 2.0], N // 4)
+OUTPUT = np.round(np.sin(TIMES) - 1.25, 6)
+START = datetime.fromisoformat("2026-03-14T23:59:58")  # the record goes on after midnight
+
+_SHEET_PARTS = {
+    "[Content_Types].xml": '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-'
+    'types"><Default Extension="rels" ContentType="application/vnd.openxmlformats-package.'
+    'relationships+xml"/><Override PartName="/xl/workbook.xml" ContentType="application/vnd.'
+    'openxmlformats-officedocument.spreadsheetml.sheet.main+xml"/></Types>',
+    "_rels/.rels": '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/'
+    'relationships"><Relationship Id="r1" Type="http://schemas.openxmlformats.org/officeDocument/'
+    '2006/relationships/officeDocument" Target="xl/workbook.xml"/></Relationships>',
+}
+_MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+_LINKS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
+
+
+def join_rows(
+    header: str,
+    separator: str = ",",
+    *,
+    time: Callable[[float], str] = lambda t: f"{t:.1f}",
+    commas: bool = False,
+    end: str = "",
+) -> str:
+    """The experiment as text: a header, and rows of time, input and output."""
+    lines = [header]
+    for t, u, y in zip(TIMES, INPUT, OUTPUT, strict=True):
+        numbers = separator.join((f"{u:g}", f"{y:.6f}"))
+        numbers = numbers.replace(".", ",") if commas else numbers
+        lines.append(f"{time(t)}{separator}{numbers}{end}")
+    return "\n".join(lines) + "\n"
+
+
+def stamp(form: str, digits: int = 3) -> Callable[[float], str]:
+    """Format a time as a date stamp; ``%f`` has so many digits."""
+
+    def write(t: float) -> str:
+        moment = START + timedelta(seconds=t)
+        return moment.strftime(form.replace("%f", f"{moment.microsecond:06d}"[:digits]))
+
+    return write
+
+
+def write_sheet(rows: Sequence[Sequence[object]], sheets: Sequence[str] = ("Data",)) -> bytes:
+    """An Excel file with the rows in its last sheet; the others have one text."""
+    cells = [list(rows) if name == sheets[-1] else [["made by hand"]] for name in sheets]
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in _SHEET_PARTS.items():
+            archive.writestr(name, text)
+        entries = "".join(
+            f'<sheet name="{name}" sheetId="{i}" r:id="r{i}"/>' for i, name in enumerate(sheets, 1)
+        )
+        archive.writestr(
+            "xl/workbook.xml",
+            f'<workbook xmlns="{_MAIN}" xmlns:r="{_LINKS}"><sheets>{entries}</sheets></workbook>',
+        )
+        targets = "".join(
+            f'<Relationship Id="r{i}" Type="{_LINKS}/worksheet" Target="worksheets/s{i}.xml"/>'
+            for i in range(1, len(sheets) + 1)
+        )
+        package = "http://schemas.openxmlformats.org/package/2006/relationships"
+        archive.writestr(
+            "xl/_rels/workbook.xml.rels",
+            f'<Relationships xmlns="{package}">{targets}</Relationships>',
+        )
+        for i, content in enumerate(cells, 1):
+            body = "".join(f"<row>{''.join(map(_write_cell, row))}</row>" for row in content)
+            archive.writestr(
+                f"xl/worksheets/s{i}.xml",
+                f'<worksheet xmlns="{_MAIN}"><sheetData>{body}</sheetData></worksheet>',
+            )
+    return buffer.getvalue()
+
+
+def _write_cell(value: object) -> str:
+    if isinstance(value, str):
+        return f'<c t="inlineStr"><is><t>{value}</t></is></c>'
+    return f"<c><v>{value!r}</v></c>"
+
+
+def write_experiment_sheet(sheets: Sequence[str] = ("Data",)) -> bytes:
+    """The experiment as an Excel file."""
+    rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
+    return write_sheet([["t [s]", "u [V]", "y"], *rows], sheets)
+
+
+def write_npz(**arrays: object) -> bytes:
+    """Arrays as a NumPy file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def write_mat(content: dict[str, object], form: str = "5") -> bytes:
+    """Arrays and structures as a MATLAB file."""
+    buffer = io.BytesIO()
+    savemat(buffer, content, format=form, do_compression=form == "5")
+    return buffer.getvalue()
+
+
+def write_parquet(**columns: object) -> bytes:
+    """Columns as a Parquet file."""
+    import polars as pl
+
+    buffer = io.BytesIO()
+    pl.DataFrame(columns).write_parquet(buffer)
+    return buffer.getvalue()
+
+
+def compress(text: str) -> bytes:
+    """Text compressed by gzip."""
+    return gzip.compress(text.encode())
