@@ -10,12 +10,13 @@ from service.api.html import HtmlPage
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.states import JobState
-from service.figures import plotly as figures
+from service.figures.csv import to_csv
 from service.pages import figures as results
 from service.pages import pages, report
 from service.pages import render as assets
 from service.pages.figures import FigureChoice, FigureName
 from service.pages.simulate import simulate_page as simulate
+from sysid.figures.plotly import Figure, apply_theme
 
 router = APIRouter()
 
@@ -167,10 +168,10 @@ def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSess
     return HTMLResponse(text, headers={"Content-Security-Policy": policy})
 
 
-def _figure_response(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
+def _figure_response(figure: Figure, name: str, choice: FigureChoice) -> Response:
     if choice.format == "csv":
-        return _csv_response(figures.to_csv(figure), name)
-    return JSONResponse(figures.apply_theme(figure, choice.theme))
+        return _csv_response(to_csv(figure), name)
+    return JSONResponse(apply_theme(figure, choice.theme))
 
 
 def _csv_response(text: str, name: str) -> Response:

@@ -24,7 +24,7 @@ from service.cli.common import (
     report_faults,
 )
 from service.client.calls import DEFAULT_URL
-from service.core.text import append_unit
+from sysid.core.text import append_unit
 
 app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
 

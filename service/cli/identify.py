@@ -30,9 +30,9 @@ from service.cli.common import (
     split_setting_path,
     write_file,
 )
-from service.core.text import plain_unit
 from sysid.core.errors import suggest_name
 from sysid.core.settings import NOISE_MODELS
+from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
     from service.jobs.schemas import JobIn

@@ -39,7 +39,7 @@ from service.cli.tables import (
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.states import JobState
-from service.core.text import append_unit
+from sysid.core.text import append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

@@ -4,8 +4,8 @@ import json
 
 from markupsafe import Markup
 
-from service.figures.plotly import Figure
-from service.figures.theme import plotly_template
+from sysid.figures.plotly import Figure
+from sysid.figures.theme import plotly_template
 
 
 def strip_template(figure: Figure) -> Figure:

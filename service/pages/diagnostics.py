@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
-from service.figures.data import CorrelationTrace
-from service.figures.plotly import Figure
-from service.figures.residuals import plot_residuals
 from service.runs.residuals import ResidualAnalysis
+from sysid.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
+from sysid.figures.data import CorrelationTrace
+from sysid.figures.plotly import Figure
+from sysid.figures.residuals import plot_residuals
 from sysid.residuals.residual_tests import CorrelationFunction
 
 Document = Mapping[str, Any]

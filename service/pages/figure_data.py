@@ -10,16 +10,6 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.datasets.recordings import load_recording
-from service.figures.data import (
-    CornerParameter,
-    ExperimentTraces,
-    Floats,
-    FreeParameter,
-    IslandImprovement,
-    OutputTraces,
-    RunFigureData,
-    SignalTrace,
-)
 from service.formats.mcap import FitRole, FittedOutput
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
@@ -30,6 +20,16 @@ from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel
+from sysid.figures.data import (
+    CornerParameter,
+    ExperimentTraces,
+    Floats,
+    FreeParameter,
+    IslandImprovement,
+    OutputTraces,
+    RunFigureData,
+    SignalTrace,
+)
 from sysid.models.parameters import Parameter, ParameterScale
 
 

@@ -17,10 +17,7 @@ from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import plotly, signals
 from service.figures.embed import strip_template, templates_json, to_script_json
-from service.figures.plotly import Figure
-from service.figures.posterior import plot_posterior
 from service.figures.svg import is_drawable, to_svg
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
@@ -44,6 +41,9 @@ from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
+from sysid.figures import plotly, signals
+from sysid.figures.plotly import Figure
+from sysid.figures.posterior import plot_posterior
 
 MAX_RANKED_RUNS = 10
 MAX_FAILED_RUNS = 20

@@ -8,12 +8,13 @@ from typing import Any
 
 from service.core.job_fields import DATASETS_PATH
 from service.core.states import OPEN_STATES, StateName
-from service.core.text import format_count, format_estimate, format_interval, format_value
+from service.core.text import format_count, format_value
 from service.core.wire import Answer
 from service.jobs.schemas import JobOut
 from service.jobs.submit import to_job_out
 from service.pages.diagnostics import Diagnostics, to_diagnostics
 from service.storage.tables import Event, Job, Run
+from sysid.core.text import format_estimate, format_interval
 
 Document = Mapping[str, Any]
 
