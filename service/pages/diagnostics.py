@@ -6,10 +6,9 @@ from typing import Any
 
 from service.runs.residuals import ResidualAnalysis
 from sysid.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
-from sysid.figures.data import CorrelationTrace
 from sysid.figures.plotly import Figure
 from sysid.figures.residuals import plot_residuals
-from sysid.residuals.residual_tests import CorrelationFunction
+from sysid.identification.figures import to_correlation_trace
 
 Document = Mapping[str, Any]
 
@@ -91,23 +90,6 @@ def to_diagnostics(result: Document) -> Diagnostics:
             )
             for term in result.get("selection", ())
         ],
-    )
-
-
-def to_correlation_trace(correlation: CorrelationFunction) -> CorrelationTrace:
-    """Convert a correlation function to the data of its figure."""
-    test = correlation.test
-    of = "" if test.input is None else f" with {test.input}"
-    kind = "autocorrelation" if test.input is None else "correlation"
-    title = f"{kind} of the residual of {test.output}{of}: {test.outcome}"
-    return CorrelationTrace(
-        title,
-        test.input is None,
-        correlation.period,
-        correlation.lags,
-        correlation.values,
-        correlation.band95,
-        correlation.band99,
     )
 
 

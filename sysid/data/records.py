@@ -1,10 +1,11 @@
 """Recordings: channels on their own times, segments, and records for a model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
@@ -12,6 +13,17 @@ from sysid.data.holds import HOLDS as HOLDS
 from sysid.data.holds import Hold as Hold
 from sysid.data.holds import HoldChoice, choose_hold
 from sysid.data.holds import HoldSetting as HoldSetting
+from sysid.data.tables import (
+    Column,
+    Labelled,
+    align_epochs,
+    describe_object,
+    is_labelled,
+    read_columns,
+    read_numbers,
+    read_times,
+    split_series,
+)
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -55,9 +67,13 @@ class History(NamedTuple):
     values: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Channel:
     """One measured signal on its own times.
+
+    Times and values may be lists or arrays of any library, of shape (N,) or (N, 1); they are kept
+    as arrays of float64. ``Channel(name, series)`` takes both from a series of pandas or xarray.
+    Dates become seconds from the first one. Their time zone is not kept.
 
     Attributes
     ----------
@@ -77,19 +93,38 @@ class Channel:
     Raises
     ------
     InvalidRecord
-        If the arrays differ in length or are empty, or the times decrease or are not finite. The
-        same holds for the history.
+        If the arrays hold no numbers, differ in length or are empty, or the times decrease or are
+        not finite. The same holds for the history.
+
+    Examples
+    --------
+    >>> Channel("P1", [0.0, 0.1, 0.2], [1.0, 1.2, 1.1], unit="bar")
+    Channel 'P1' [bar]: 3 samples, every 0.1 s, from 0 to 0.2 s, values from 1 to 1.2
     """
 
     name: str
     times: FloatArray
-    values: FloatArray
+    values: FloatArray = field(default=None)  # type: ignore[assignment]
     unit: str = "1"
     hold: HoldSetting = "auto"
     history: History | None = None
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
+    _epoch: int | None = field(default=None, init=False, repr=False)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            name: str,
+            times: ArrayLike | Labelled,
+            values: ArrayLike | None = None,
+            unit: str = "1",
+            hold: HoldSetting = "auto",
+            history: History | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
+        self._read_arrays()
         if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
             raise InvalidRecord(
                 f"channel {self.name!r} has times of shape {self.times.shape} and values of shape "
@@ -99,6 +134,32 @@ class Channel:
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
         if self.history is not None:
             self._check_history(self.history)
+
+    def __repr__(self) -> str:
+        unit = "" if self.unit == "1" else f" [{self.unit}]"
+        return f"Channel {self.name!r}{unit}: {_describe_samples(self)}"
+
+    def _read_arrays(self) -> None:
+        """Read times and values of any kind, once; arrays of float64 are kept as they are."""
+        if not isinstance(self.name, str):
+            raise InvalidRecord(f"a channel has the name {self.name!r}; need a text")
+        owner, times, values, unit = f"channel {self.name!r}", self.times, self.values, None
+        if self.values is None:
+            axis, values, unit = split_series(times, owner)
+        else:
+            axis = read_times(times, f"the times of {owner}")
+        object.__setattr__(self, "times", axis.seconds)
+        object.__setattr__(self, "values", read_numbers(values, owner))
+        object.__setattr__(self, "_epoch", axis.epoch)
+        if unit is not None and self.unit == "1":
+            object.__setattr__(self, "unit", unit)
+        if self.history is not None:
+            before, earlier = self.history
+            history = History(
+                read_numbers(before, f"the history of {owner}"),
+                read_numbers(earlier, f"the history of {owner}"),
+            )
+            object.__setattr__(self, "history", history)
 
     def _check_history(self, history: History) -> None:
         before, values = history
@@ -180,6 +241,109 @@ class Channel:
         return replace(self, history=history)
 
 
+Channels: TypeAlias = Channel | Sequence[Channel] | Labelled
+"""What is read as channels: one, several, or a table or series of another library."""
+
+_MAX_LISTED = 12  # channels in the text of a record
+
+
+def to_channels(groups: Sequence[tuple[Channels, str]]) -> list[tuple[Channel, ...]]:
+    """Read groups of channels on one time axis; each group has a name for messages.
+
+    Series of dates keep their distance: all are in seconds from the first date of any of them.
+
+    Raises
+    ------
+    InvalidRecord
+        If an object is no channel and has none, or times or values cannot be read.
+    """
+    read = [
+        group if _are_channels(group) else tuple(_iterate_channels(group, owner))
+        for group, owner in groups
+    ]
+    epochs = [channel._epoch for group in read for channel in group]
+    shifts = align_epochs(epochs)
+    if any(shifts):
+        shifted = iter(shifts)
+        read = [tuple(_shift_clock(channel, next(shifted)) for channel in one) for one in read]
+    return read
+
+
+def _are_channels(group: object) -> bool:
+    return type(group) is tuple and all(type(item) is Channel for item in group)
+
+
+def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
+    if isinstance(group, Channel):
+        yield group
+    elif is_labelled(group):
+        columns = read_columns(group, owner)
+        for column in columns:
+            yield to_channel(column, f"signal{columns.index(column) + 1}")
+    elif isinstance(group, Sequence) and not isinstance(group, str):
+        for item in group:
+            if not (isinstance(item, Channel) or is_labelled(item)):
+                raise InvalidRecord(
+                    f"{owner} has {describe_object(item)} in its list; need channels"
+                )
+            yield from _iterate_channels(item, owner)
+    else:
+        raise InvalidRecord(
+            f"{owner}: found {describe_object(group)}; need a channel, several, or a table or "
+            "series with names and times"
+        )
+
+
+def to_channel(column: Column, otherwise: str = "") -> Channel:
+    """Read a column of a table as a channel; `otherwise` is its name if it has none."""
+    axis = column.axis
+    channel = Channel(column.name or otherwise, axis.seconds, column.values, column.unit)
+    object.__setattr__(channel, "_epoch", axis.epoch)
+    return channel
+
+
+def _shift_clock(channel: Channel, seconds: float) -> Channel:
+    """Return the same channel with its times from an earlier date."""
+    if channel._epoch is None or not seconds:
+        return channel
+    history = channel.history
+    if history is not None:
+        history = history._replace(times=history.times + seconds)
+    shifted = replace(channel, times=channel.times + seconds, history=history)
+    object.__setattr__(shifted, "_epoch", channel._epoch - round(seconds * 1e9))
+    return shifted
+
+
+def _describe_samples(channel: Channel) -> str:
+    finite = channel.values[np.isfinite(channel.values)]
+    missing = channel.values.size - finite.size
+    text = f"{channel.sampling}, {_describe_range(channel.times[0], channel.times[-1])} s"
+    if finite.size:
+        text += f", values {_describe_range(np.min(finite), np.max(finite))}"
+    if missing:
+        text += f", {missing} missing"
+    before = channel.history
+    return text if before is None else f"{text}, {before.times.size} samples before"
+
+
+def _describe_span(record: "Record | Recording") -> str:
+    return f"{_describe_range(record.start, record.stop)} s"
+
+
+def _describe_range(first: float, last: float) -> str:
+    return f"from {first:.4g} to {last:.4g}"
+
+
+def _list_channels(role: str, channels: Sequence[Channel]) -> list[str]:
+    lines = [
+        f"  {role}{channel.name}{'' if channel.unit == '1' else f' [{channel.unit}]'}: "
+        f"{_describe_samples(channel)}"
+        for channel in channels[:_MAX_LISTED]
+    ]
+    left = len(channels) - _MAX_LISTED
+    return [*lines, f"  and {left} more"] if left > 0 else lines
+
+
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A part of a recording that was measured on its own, such as one repeat of a test.
@@ -194,12 +358,39 @@ class Segment:
     labels: Mapping[str, float | str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Recording:
-    """All channels of one dataset, without roles; without segments it is one measurement."""
+    """All channels of one dataset, without roles; without segments it is one measurement.
+
+    The channels may be a table of pandas, xarray or polars, or a mapping of lists. Its times are
+    the index, or the column ``t`` or ``time``, in seconds or as dates. Dates become seconds from
+    the first one. Their time zone is not kept.
+
+    Examples
+    --------
+    >>> Recording({"t": [0.0, 0.5, 1.0], "P1 [bar]": [1.0, 1.2, 1.1], "P2 [bar]": [0.0, 0.1, 0.3]})
+    Recording of 2 channels, from 0 to 1 s
+      P1 [bar]: 3 samples, every 0.5 s, from 0 to 1 s, values from 1 to 1.2
+      P2 [bar]: 3 samples, every 0.5 s, from 0 to 1 s, values from 0 to 0.3
+    """
 
     channels: tuple[Channel, ...]
     segments: tuple[Segment, ...] = ()
+
+    if TYPE_CHECKING:
+
+        def __init__(self, channels: Channels, segments: tuple[Segment, ...] = ()) -> None: ...
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", to_channels([(self.channels, "the recording")])[0])
+
+    def __repr__(self) -> str:
+        parts = f", {len(self.segments)} segments" if self.segments else ""
+        count = len(self.channels)
+        head = f"Recording of {count} channel{'s' if count != 1 else ''}{parts}"
+        if not count:
+            return head
+        return "\n".join([f"{head}, {_describe_span(self)}", *_list_channels("", self.channels)])
 
     def channel(self, name: str) -> Channel:
         """Return the channel of a name.
@@ -383,13 +574,42 @@ def _to_output(channel: Channel, role: str) -> Channel:
     return replace(channel, name=role, history=None)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Record:
-    """One experiment of a model: channels have the names of the model's signals."""
+    """One experiment of a model: inputs and outputs, each one channel or several.
+
+    A side may be a channel, a sequence of channels, or a table or series of pandas, xarray or
+    polars. If the times are dates, all channels are in seconds from the first date of any of them.
+    Their time zone is not kept. Channels usually have the names of the model's signals.
+
+    Examples
+    --------
+    >>> t = [0.0, 0.1, 0.2, 0.3]
+    >>> Record(Channel("u", t, [0, 1, 1, 1], unit="%"), Channel("y", t, [20.0, 20.0, 20.4, 20.7]))
+    Record, from 0 to 0.3 s
+      input u [%]: 4 samples, every 0.1 s, from 0 to 0.3 s, values from 0 to 1
+      output y: 4 samples, every 0.1 s, from 0 to 0.3 s, values from 20 to 20.7
+    """
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+
+    if TYPE_CHECKING:
+
+        def __init__(self, inputs: Channels, outputs: Channels, name: str = "") -> None: ...
+
+    def __post_init__(self) -> None:
+        sides = [(self.inputs, "the input side"), (self.outputs, "the output side")]
+        inputs, outputs = to_channels(sides)
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "outputs", outputs)
+
+    def __repr__(self) -> str:
+        title = f"Record {self.name!r}" if self.name else "Record"
+        sides = (*_list_channels("input ", self.inputs), *_list_channels("output ", self.outputs))
+        span = f", {_describe_span(self)}" if sides else ", without channels"
+        return "\n".join([title + span, *sides])
 
     @property
     def history_duration(self) -> float:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from service.figures.csv import to_csv
-from service.pages.figure_data import fitness_label
 from sysid.figures import plotly, signals
 from sysid.figures.data import (
     ExperimentTraces,
@@ -26,6 +25,7 @@ from sysid.figures.theme import (
     thin_indices,
     window_slice,
 )
+from sysid.identification.figures import label_fitness
 
 
 def island(points: int, start: float = 100.0) -> list[IslandImprovement]:
@@ -283,8 +283,8 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
 
 @pytest.mark.parametrize("draw", [plotly.plot_history, plotly.plot_waterfall])
 def test_a_robust_loss_is_not_called_the_rms(draw):
-    robust = fitness_label({"loss": {"kind": "soft-l1", "scale": 0.1}})
+    robust = label_fitness("soft-l1")
     shown = draw(run(fitness_label=robust))["layout"]["yaxis"]["title"]["text"]
     assert shown == "soft-l1 loss, as RMS [kPa]"
-    plain = draw(run(fitness_label=fitness_label({})))
+    plain = draw(run(fitness_label=label_fitness("squares")))
     assert plain["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
