@@ -164,7 +164,7 @@ def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSess
     """Export the job as one HTML file that needs no server: tables, figures, the exact request."""
     text = report.render_job_report(session, parts.store, job_id, str(request.base_url))
     # A file cannot say who may frame it: this directive works in a header only.
-    policy = f"{report.security_policy()}; frame-ancestors 'none'"
+    policy = f"{assets.security_policy()}; frame-ancestors 'none'"
     return HTMLResponse(text, headers={"Content-Security-Policy": policy})
 
 

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from sysid.data.records import Record, Recording
     from sysid.identification.result import Identification
     from sysid.models.model import Model
-    from sysid.residuals.residual_tests import ResidualTests
     from sysid.uncertainty.estimates import Posterior
 
 
@@ -104,6 +103,12 @@ def identify(
     json_file: Annotated[
         str | None, typer.Option("--json", metavar="FILE", help="Write the result; - for stdout.")
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write a report as one HTML file, with tables and figures."
+        ),
+    ] = None,
 ) -> None:
     """Identify a model's parameters and time lags from a recording, in this process."""
     changes = list(changes or ())
@@ -111,6 +116,8 @@ def identify(
         changes.append(f"loss.noise_model={noise_model}")
     if posterior:
         changes.append("posterior=true")
+    if report is not None:
+        _check_report(report)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = CsvOptions(sample_time, tuple(split_names(segments)))
@@ -127,7 +134,41 @@ def identify(
         result = _run_identification(
             loaded, records, validation_records, body, quiet=json_file == "-"
         )
-    print_result(loaded, result, time.perf_counter() - begun, json_file)
+    seconds = time.perf_counter() - begun
+    print_result(loaded, result, seconds, json_file)
+    if report is not None:
+        _write_report(report, data, loaded, result, seconds, body)
+
+
+def _check_report(path: Path) -> None:
+    """End the command before the search if no report could be written after it."""
+    from importlib.util import find_spec
+
+    missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
+    if missing:
+        fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
+    if not path.parent.is_dir():
+        fail_usage(f"--report {path}: there is no folder {path.parent}")
+
+
+def _write_report(
+    path: Path,
+    data: Path,
+    model: "Model",
+    result: "Identification",
+    seconds: float,
+    body: "JobIn",
+) -> None:
+    """Write the report with the figures of a job's report."""
+    import json
+
+    from service.pages.identification_report import render_identification_report
+
+    title = f"{model.title or model.name}: {data.name}"
+    facts = {"Model": model.name, "Recording": data.name}
+    request = json.dumps(body.to_normal_form(), indent=2, ensure_ascii=False)
+    write_file(path, render_identification_report(result, title, facts, seconds, request))
+    err.print(f"report written to {path}", markup=False)
 
 
 def _build_body(
@@ -240,6 +281,7 @@ def print_result(
 ) -> None:
     """Print the estimates, or write the result as JSON, or both."""
     from service.runs.result import to_result_document
+    from sysid.identification.summary import describe_residuals
 
     document = to_result_document(result, seconds)
     if json_file == "-":
@@ -284,7 +326,7 @@ def print_result(
             markup=False,
         )
     if result.residual_tests is not None and result.residual_tests.passed is not None:
-        out.print(_residual_verdict(result.residual_tests), markup=False, soft_wrap=True)
+        out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
     _print_posterior(result.posterior)
     for warning in result.warnings:
         err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
@@ -307,21 +349,6 @@ def _print_posterior(posterior: "Posterior | None") -> None:
         ),
         empty="no parameters",
     )
-
-
-def _residual_verdict(tests: "ResidualTests") -> str:
-    """Say whether the residuals pass their tests; failed tests have their p-value.
-
-    Warnings cover only p < 0.001, so most failed tests are reported only here.
-    """
-    failed = [
-        f"{test.output} {'is not white' if test.input is None else f'depends on {test.input}'}"
-        + ("" if test.p is None else f" (p = {test.p:.2g})" if test.p >= 1e-3 else " (p < 0.001)")
-        for test in tests.tests
-        if test.outcome == "failed"
-    ]
-    verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
-    return f"residuals on {tests.data} data: {verdict}"
 
 
 def _format_bounds(result: "Identification") -> str:

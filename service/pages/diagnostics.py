@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.runs.residuals import ResidualAnalysis
 from sysid.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
 from sysid.figures.plotly import Figure
 from sysid.figures.residuals import plot_residuals
 from sysid.identification.figures import to_correlation_trace
+
+if TYPE_CHECKING:  # a report without a database has diagnostics too
+    from service.runs.residuals import ResidualAnalysis
 
 Document = Mapping[str, Any]
 
@@ -93,7 +95,7 @@ def to_diagnostics(result: Document) -> Diagnostics:
     )
 
 
-def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int = 2) -> Figure:
+def plot_residual_tests(tested: "ResidualAnalysis", experiment: int, columns: int = 2) -> Figure:
     """Draw the residual correlations of one experiment; empty if none was tested."""
     functions = [
         to_correlation_trace(correlation)

@@ -26,7 +26,16 @@ _MAX_NAMES = 30
 
 
 class SysidError(Exception):
-    """Base class of the errors that the numerical core raises on purpose."""
+    """Base class of the errors that the numerical core raises on purpose.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_model("fopd")
+    ... except SysidError as error:
+    ...     print(error)
+    there is no model 'fopd'; did you mean 'fopdt'?
+    """
 
 
 class InvalidBounds(SysidError, ValueError):

@@ -61,7 +61,13 @@ def measure_sampling(times: FloatArray, within: float = REGULARITY_TOLERANCE) ->
 
 
 class History(NamedTuple):
-    """Samples before a channel's first: times (s, not decreasing) and values."""
+    """Samples before a channel's first: times (s, not decreasing) and values.
+
+    Examples
+    --------
+    >>> Channel("u", [0, 1], [2, 3], history=History([-2, -1], [1, 1])).total_samples
+    4
+    """
 
     times: FloatArray
     values: FloatArray
@@ -104,7 +110,7 @@ class Channel:
 
     name: str
     times: FloatArray
-    values: FloatArray = field(default=None)  # type: ignore[assignment]
+    values: FloatArray = field(default=None)  # type: ignore[arg-type]  # of a series: in `times`
     unit: str = "1"
     hold: HoldSetting = "auto"
     history: History | None = None
@@ -141,10 +147,12 @@ class Channel:
 
     def _read_arrays(self) -> None:
         """Read times and values of any kind, once; arrays of float64 are kept as they are."""
-        if not isinstance(self.name, str):
-            raise InvalidRecord(f"a channel has the name {self.name!r}; need a text")
-        owner, times, values, unit = f"channel {self.name!r}", self.times, self.values, None
-        if self.values is None:
+        name: object = self.name
+        if not isinstance(name, str):
+            raise InvalidRecord(f"a channel has the name {name!r}; need a text")
+        owner, times, unit = f"channel {self.name!r}", self.times, None
+        values: Any = self.values
+        if values is None:
             axis, values, unit = split_series(times, owner)
         else:
             axis = read_times(times, f"the times of {owner}")
@@ -257,20 +265,13 @@ def to_channels(groups: Sequence[tuple[Channels, str]]) -> list[tuple[Channel, .
     InvalidRecord
         If an object is no channel and has none, or times or values cannot be read.
     """
-    read = [
-        group if _are_channels(group) else tuple(_iterate_channels(group, owner))
-        for group, owner in groups
-    ]
+    read = [tuple(_iterate_channels(group, owner)) for group, owner in groups]
     epochs = [channel._epoch for group in read for channel in group]
     shifts = align_epochs(epochs)
     if any(shifts):
         shifted = iter(shifts)
         read = [tuple(_shift_clock(channel, next(shifted)) for channel in one) for one in read]
     return read
-
-
-def _are_channels(group: object) -> bool:
-    return type(group) is tuple and all(type(item) is Channel for item in group)
 
 
 def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:

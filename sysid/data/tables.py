@@ -68,7 +68,7 @@ def _convert_numbers(source: ArrayLike, owner: str) -> FloatArray:
         what = {"m": "time spans", "M": "dates", "c": "complex numbers", "V": "records"}
         raise InvalidRecord(f"{owner} has {what.get(kind, 'text')}; need numbers")
     if isinstance(source, np.ma.MaskedArray):
-        return np.asarray(source.astype(np.float64).filled(np.nan))
+        return np.asarray(np.ma.filled(source.astype(np.float64), np.nan))
     try:
         return np.asarray(source, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -119,7 +119,7 @@ def read_times(source: Any, owner: str) -> TimeAxis:
     if kind == "m":
         spans = np.asarray(source, dtype="timedelta64[ns]").ravel()
         _refuse_missing(spans, owner)
-        return TimeAxis(spans.astype(np.int64) * 1e-9)
+        return TimeAxis(np.asarray(spans.astype(np.int64) * 1e-9, dtype=np.float64))
     if kind in "UST":
         first = str(next(iter(np.asarray(source).flat)))
         raise InvalidRecord(
@@ -139,7 +139,7 @@ def _read_dates(source: Any, owner: str) -> TimeAxis:
     if not nanoseconds.size:
         return TimeAxis(np.zeros(0))
     first = int(nanoseconds[0])
-    return TimeAxis((nanoseconds - first) * 1e-9, first)
+    return TimeAxis(np.asarray((nanoseconds - first) * 1e-9, dtype=np.float64), first)
 
 
 def _to_nanoseconds(date: Any, owner: str) -> int:

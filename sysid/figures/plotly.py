@@ -53,6 +53,11 @@ def empty_figure() -> Figure:
     return {"data": [], "layout": base_layout(200)}
 
 
+def has_points(figure: Figure) -> bool:
+    """Test whether a figure has anything to show."""
+    return any(len(trace["x"]) > 0 for trace in figure["data"])
+
+
 def apply_theme(figure: Figure, paper: theme.Theme) -> Figure:
     """Set the template for a light or dark background."""
     return {**figure, "layout": {**figure["layout"], "template": theme.plotly_template(paper)}}

@@ -55,8 +55,8 @@ class _Part:
         self._layout = self._figure["layout"]
         margin = {**MARGIN, **self._layout.get("margin", {})}
         self._title_shift = margin["t"]
-        self._top = (top - margin["t"]) / total
-        self._bottom = (top - self._layout["height"] + margin["b"]) / total
+        self._top: float = (top - margin["t"]) / total
+        self._bottom: float = (top - self._layout["height"] + margin["b"]) / total
 
     def count_axes(self) -> dict[str, int]:
         """Count the axes that are used up to this part."""

@@ -1,10 +1,12 @@
 """Read what a user gives to `identify`: recordings and tables, channels, changes of parameters."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns, split_unit
 from sysid.models.model import Model
@@ -30,13 +32,9 @@ def read_records(
     InvalidSettings
         If `channels` names a signal or channel that does not exist.
     """
-    if channels is not None and not isinstance(channels, Mapping):
-        detail = f"found {channels!r}; need a mapping such as {{'u': 'P1'}}"
-        raise InvalidSettings("/channels", detail)
-    several = isinstance(data, list | tuple)
-    parts = [
-        part for one in (data if several else [data]) for part in _read_one(model, one, channels)
-    ]
+    check_kinds({"channels": channels})
+    each = data if isinstance(data, list | tuple) else [data]
+    parts = [part for one in each for part in _read_one(model, one, channels)]
     notes = dict.fromkeys(note for _, note in parts if note)
     return tuple(record for record, _ in parts), tuple(notes)
 
@@ -73,6 +71,35 @@ def _describe_wrong_data(data: object) -> str:
     return f"{found} with named columns"
 
 
+def check_kinds(values: Mapping[str, object]) -> None:
+    """Check the kinds of the arguments of `identify` that are values of their own.
+
+    Raises
+    ------
+    InvalidSettings
+        If one is of another kind; the message says what it may be.
+    """
+    for name, value in values.items():
+        kinds, need = _KINDS[name]
+        is_flag = isinstance(value, bool) and bool not in kinds
+        if value is not None and (is_flag or not isinstance(value, kinds)):
+            raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
+
+
+_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+    "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
+    "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
+    "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
+    "loss": ((Loss,), "Loss(…), such as Loss('soft-l1', scale=0.5)"),
+    "noise": ((Noise,), "Noise(…), such as Noise(sigma=0.1)"),
+    "seed": ((Integral,), "a whole number"),
+    "skip": ((Integral,), "a number of samples"),
+    "weights": ((Mapping,), "a mapping of outputs to numbers"),
+    "warm": ((Mapping,), "a mapping of parameters to values"),
+    "validation_fraction": ((Real,), "a number between 0 and 1"),
+}
+
+
 def read_changes(
     parameters: Mapping[str, Change] | None,
 ) -> dict[str, Mapping[str, Any]]:
@@ -85,9 +112,7 @@ def read_changes(
     """
     if parameters is None:
         return {}
-    if not isinstance(parameters, Mapping):
-        detail = f"found {describe_object(parameters)}; need a mapping such as {{'L': (0, 2)}}"
-        raise InvalidSettings("/parameters", detail)
+    check_kinds({"parameters": parameters})
     return {name: _read_change(name, change) for name, change in parameters.items()}
 
 

@@ -1,6 +1,7 @@
 """Draw the figures of a result, and convert channels and correlations to the data of figures."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Any, Literal, get_args
 
@@ -21,7 +22,7 @@ from sysid.figures.data import (
     RunFigureData,
     SignalTrace,
 )
-from sysid.figures.plotly import Figure, apply_theme, empty_figure
+from sysid.figures.plotly import Figure, apply_theme, empty_figure, has_points
 from sysid.figures.posterior import plot_posterior
 from sysid.figures.residuals import plot_residuals
 from sysid.figures.signals import plot_response
@@ -92,11 +93,6 @@ def draw_figures(
     }
     drawn = [draw[name]() for name in names]
     return [(title, figure) for title, figure in drawn if has_points(figure)]
-
-
-def has_points(figure: Figure) -> bool:
-    """Test whether a figure has anything to show."""
-    return any(len(trace["x"]) > 0 for trace in figure["data"])
 
 
 def _draw_response(experiments: Sequence[ExperimentTraces], number: int) -> tuple[str, Figure]:
@@ -198,8 +194,8 @@ def list_experiments(found: Identification) -> list[ExperimentTraces]:
     later = list(_pair(data.validation, found.simulated_validation))
     if data.is_part:
         return [
-            join_validation(experiment, outputs)
-            for experiment, (outputs, _) in zip(estimation, later, strict=True)
+            join_validation(replace(experiment, inputs=inputs), outputs)
+            for experiment, (outputs, inputs) in zip(estimation, later, strict=True)
         ]
     return estimation + [
         ExperimentTraces(f"validation {number}", outputs, inputs, -inf)

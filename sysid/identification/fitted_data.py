@@ -22,9 +22,11 @@ def collect_fitted_data(
     `problem` is that of the estimation data.
     """
     estimation = tuple(_select_signals(model, record) for record in records.estimation)
-    validation = tuple(_select_signals(model, record) for record in records.validation or ())
-    runs = tuple(_select_signals(model, record) for record in records.validation_runs or ())
     is_part = records.scored_from is not None
+    validation = tuple(
+        replace(_select_signals(model, record), inputs=_select_signals(model, run).inputs)
+        for record, run in zip(records.validation or (), records.validation_runs or (), strict=True)
+    )
     if validation:
         before = estimation if is_part else ()
         fits = _list_fits(validation, found.simulated_validation, before)
@@ -32,7 +34,7 @@ def collect_fitted_data(
         fits = _list_fits(estimation, found.simulated)
     series = list_fitted_residuals(
         fits,
-        [record.inputs for record in runs or estimation],
+        [record.inputs for record in validation or estimation],
         problem.output_weights,
         problem.settings.skip,
         problem.loss_scale,

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
 from sysid.data.noise import Noise
-from sysid.identification.arguments import Change, Data, read_changes, read_records
+from sysid.identification.arguments import Change, Data, check_kinds, read_changes, read_records
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
@@ -108,7 +107,19 @@ def identify(
     >>> round(found["L"].value, 2)
     0.5
     """
-    algorithm = _check_settings(settings)
+    check_kinds(
+        {
+            "settings": settings,
+            "loss": loss,
+            "noise": noise,
+            "seed": seed,
+            "skip": skip,
+            "weights": weights,
+            "warm": warm,
+            "validation_fraction": validation_fraction,
+        }
+    )
+    algorithm = settings or GeneticAlgorithm()
     model = resolve_model(model)
     whole, notes = read_records(model, records, channels)
     validation_records = (
@@ -129,15 +140,6 @@ def identify(
     )
     data = collect_fitted_data(model, prepared, problem, found)
     return replace(found, warnings=(*notes, *found.warnings), data=data)
-
-
-def _check_settings(settings: GeneticAlgorithm | None) -> GeneticAlgorithm:
-    if settings is None:
-        return GeneticAlgorithm()
-    if not isinstance(settings, GeneticAlgorithm):
-        detail = f"found {settings!r}; need GeneticAlgorithm(…), or None for its defaults"
-        raise InvalidSettings("/settings", detail)
-    return settings
 
 
 def _run_search(

@@ -120,7 +120,8 @@ class FittedData:
     records, validation : tuple of Record
         Signals of the model in its order. With added noise, as they were compared.
     is_part : bool
-        Whether the validation records are the last parts of `records`.
+        Whether the outputs of `validation` are the last parts of those in `records`. The inputs
+        are then those of the whole record.
     correlations : tuple of CorrelationFunction
         Correlation functions of the residuals that were tested.
     loss : {"squares", "soft-l1"}

@@ -85,7 +85,7 @@ def _describe_other_document(document: Any) -> str:
     name = document.get("format")
     if name is None and "parameters" in document and "fit_percent" in document:
         return "it is the document of a run, which has no signals. Save the result itself"
-    hint = _OTHER_FORMATS.get(name, f"need {FORMAT!r}, which Identification.save writes")
+    hint = _OTHER_FORMATS.get(str(name), f"need {FORMAT!r}, which Identification.save writes")
     return f"its format is {name!r}; {hint}"
 
 
@@ -104,7 +104,7 @@ def _encode(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"shape": value.shape} if value.size == 0 else _encode(value.tolist())
     if is_dataclass(value) or hasattr(value, "_fields"):
-        return {name: _encode(getattr(value, name)) for name in _list_fields(type(value))}
+        return {name: _encode(getattr(value, name)) for name in _list_fields(value.__class__)}
     if isinstance(value, Mapping):
         return {str(key): _encode(item) for key, item in value.items()}
     if isinstance(value, tuple | list):

@@ -37,7 +37,8 @@ def assign_channels(
     InvalidRecord
         If a signal has no channel; the message lists both.
     """
-    signals = [signal.name for signal in (*model.inputs, *model.outputs)]
+    signals = [signal.name for signal in model.inputs]
+    signals += [output.name for output in model.outputs]
     given = dict(channels or {})
     _check_given(given, signals, names)
     assigned, left, free = _assign_by_name(signals, names, given)
@@ -72,7 +73,8 @@ def assign_record(
     )
     signals = [name for side, _ in sides for name in side]
     _check_given(given, signals, [c.name for _, side in sides for c in side])
-    renamed, by_order = [], {}
+    renamed: list[tuple[Channel, ...]] = []
+    by_order: dict[str, str] = {}
     for wanted, side in sides:
         names = [channel.name for channel in side]
         chosen = {name: channel for name, channel in given.items() if channel in names}

@@ -82,8 +82,9 @@ def resolve_model(source: ModelSource) -> Model:
     """
     if isinstance(source, Model):
         return source
-    if not isinstance(source, str | Path | Mapping):
-        kind = type(source).__name__
+    given: object = source
+    if not isinstance(given, str | Path | Mapping):
+        kind = type(given).__name__
         raise InvalidModel(
             [
                 Fault(
