@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -16,7 +17,7 @@ from sysid.data.holds import HoldSetting as HoldSetting
 from sysid.data.tables import (
     Column,
     Labelled,
-    align_epochs,
+    align_starts,
     describe_object,
     is_labelled,
     read_columns,
@@ -79,7 +80,7 @@ class Channel:
 
     Times and values may be lists or arrays of any library, of shape (N,) or (N, 1); they are kept
     as arrays of float64. ``Channel(name, series)`` takes both from a series of pandas or xarray.
-    Dates become seconds from the first one. Their time zone is not kept.
+    Dates become seconds from the first one.
 
     Attributes
     ----------
@@ -115,7 +116,7 @@ class Channel:
     hold: HoldSetting = "auto"
     history: History | None = None
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
-    _epoch: int | None = field(default=None, init=False, repr=False)
+    _started_at: datetime | None = field(default=None, init=False, repr=False)
 
     if TYPE_CHECKING:
 
@@ -158,7 +159,7 @@ class Channel:
             axis = read_times(times, f"the times of {owner}")
         object.__setattr__(self, "times", axis.seconds)
         object.__setattr__(self, "values", read_numbers(values, owner))
-        object.__setattr__(self, "_epoch", axis.epoch)
+        object.__setattr__(self, "_started_at", axis.started_at)
         if unit is not None and self.unit == "1":
             object.__setattr__(self, "unit", unit)
         if self.history is not None:
@@ -266,8 +267,8 @@ def to_channels(groups: Sequence[tuple[Channels, str]]) -> list[tuple[Channel, .
         If an object is no channel and has none, or times or values cannot be read.
     """
     read = [tuple(_iterate_channels(group, owner)) for group, owner in groups]
-    epochs = [channel._epoch for group in read for channel in group]
-    shifts = align_epochs(epochs)
+    starts = [channel._started_at for group in read for channel in group]
+    shifts = align_starts(starts)
     if any(shifts):
         shifted = iter(shifts)
         read = [tuple(_shift_clock(channel, next(shifted)) for channel in one) for one in read]
@@ -299,19 +300,19 @@ def to_channel(column: Column, otherwise: str = "") -> Channel:
     """Read a column of a table as a channel; `otherwise` is its name if it has none."""
     axis = column.axis
     channel = Channel(column.name or otherwise, axis.seconds, column.values, column.unit)
-    object.__setattr__(channel, "_epoch", axis.epoch)
+    object.__setattr__(channel, "_started_at", axis.started_at)
     return channel
 
 
 def _shift_clock(channel: Channel, seconds: float) -> Channel:
     """Return the same channel with its times from an earlier date."""
-    if channel._epoch is None or not seconds:
+    if channel._started_at is None or not seconds:
         return channel
     history = channel.history
     if history is not None:
         history = history._replace(times=history.times + seconds)
     shifted = replace(channel, times=channel.times + seconds, history=history)
-    object.__setattr__(shifted, "_epoch", channel._epoch - round(seconds * 1e9))
+    object.__setattr__(shifted, "_started_at", channel._started_at - timedelta(seconds=seconds))
     return shifted
 
 
@@ -365,7 +366,15 @@ class Recording:
 
     The channels may be a table of pandas, xarray or polars, or a mapping of lists. Its times are
     the index, or the column ``t`` or ``time``, in seconds or as dates. Dates become seconds from
-    the first one. Their time zone is not kept.
+    the first one, which is kept.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+    segments : tuple of Segment
+    started_at : datetime or None
+        Time 0 s on the clock that recorded; None if it is not known. Without a zone it is local
+        time of an unknown zone.
 
     Examples
     --------
@@ -377,13 +386,24 @@ class Recording:
 
     channels: tuple[Channel, ...]
     segments: tuple[Segment, ...] = ()
+    started_at: datetime | None = None
 
     if TYPE_CHECKING:
 
-        def __init__(self, channels: Channels, segments: tuple[Segment, ...] = ()) -> None: ...
+        def __init__(
+            self,
+            channels: Channels,
+            segments: tuple[Segment, ...] = (),
+            started_at: datetime | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "channels", to_channels([(self.channels, "the recording")])[0])
+        channels = to_channels([(self.channels, "the recording")])[0]
+        object.__setattr__(self, "channels", channels)
+        if self.started_at is None:
+            starts = (channel._started_at for channel in channels)
+            first = next((start for start in starts if start is not None), None)
+            object.__setattr__(self, "started_at", first)
 
     def __repr__(self) -> str:
         parts = f", {len(self.segments)} segments" if self.segments else ""
@@ -581,7 +601,7 @@ class Record:
 
     A side may be a channel, a sequence of channels, or a table or series of pandas, xarray or
     polars. If the times are dates, all channels are in seconds from the first date of any of them.
-    Their time zone is not kept. Channels usually have the names of the model's signals.
+    Only a `Recording` keeps the date. Channels usually have the names of the model's signals.
 
     Examples
     --------

@@ -25,15 +25,15 @@ Labelled: TypeAlias = Any
 _NAME_WITH_UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]+)\]\s*")
 _TIME_NAMES = ("t", "time")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_NANOSECONDS = np.dtype("datetime64[ns]")
+_MIXED_ZONES = "some dates have a time zone and others have none; give all of them one"
 _NEED_TIMES = "need seconds, dates or time spans"
 
 
 class TimeAxis(NamedTuple):
-    """Times (s), and the first date in ns since 1970 (UTC) if they were dates."""
+    """Times (s), and the first date if they were dates; it has a zone if they have."""
 
     seconds: FloatArray
-    epoch: int | None = None
+    started_at: datetime | None = None
 
 
 class Column(NamedTuple):
@@ -130,24 +130,29 @@ def read_times(source: Any, owner: str) -> TimeAxis:
 
 def _read_dates(source: Any, owner: str) -> TimeAxis:
     if str(getattr(source, "dtype", "object")) == "object":
-        source = [_to_nanoseconds(date, owner) for date in np.asarray(source).flat]
-        dates = np.array(source, dtype=np.int64).view(_NANOSECONDS)
-    else:
-        dates = np.asarray(source, dtype=_NANOSECONDS).ravel()
+        return _read_date_objects(source, owner)
+    dates = np.asarray(source, dtype="datetime64[ns]").ravel()
     _refuse_missing(dates, owner)
-    nanoseconds = dates.astype(np.int64)
-    if not nanoseconds.size:
+    if not dates.size:
         return TimeAxis(np.zeros(0))
-    first = int(nanoseconds[0])
-    return TimeAxis(np.asarray((nanoseconds - first) * 1e-9, dtype=np.float64), first)
+    nanoseconds = dates.astype(np.int64)
+    first = _EPOCH + timedelta(microseconds=int(nanoseconds[0]) // 1000)
+    zone = getattr(getattr(source, "dtype", None), "tz", None)
+    started = first.replace(tzinfo=None) if zone is None else first.astimezone(zone)
+    return TimeAxis(np.asarray((nanoseconds - nanoseconds[0]) * 1e-9, dtype=np.float64), started)
 
 
-def _to_nanoseconds(date: Any, owner: str) -> int:
-    """Convert a date; one without time zone is read as UTC."""
-    if not isinstance(date, datetime) or date != date:
-        raise InvalidRecord(f"{owner} have {date!r} among dates; need a date at every sample")
-    aware = date if date.tzinfo is not None else date.replace(tzinfo=UTC)
-    return int((aware - _EPOCH) // timedelta(microseconds=1)) * 1000
+def _read_date_objects(source: Any, owner: str) -> TimeAxis:
+    dates = list(np.asarray(source, dtype=object).flat)
+    for date in dates:
+        if not isinstance(date, datetime) or date != date:
+            raise InvalidRecord(f"{owner} have {date!r} among dates; need a date at every sample")
+    try:
+        seconds = [(date - dates[0]).total_seconds() for date in dates]
+    except TypeError:
+        raise InvalidRecord(f"{owner}: {_MIXED_ZONES}") from None
+    first = dates[0].to_pydatetime() if hasattr(dates[0], "to_pydatetime") else dates[0]
+    return TimeAxis(np.array(seconds, dtype=np.float64), first)
 
 
 def _refuse_missing(times: NDArray[Any], owner: str) -> None:
@@ -304,7 +309,7 @@ def _read_index(index: Any, owner: str) -> TimeAxis | None:
 def _read_labelled_times(label: Any, source: Any, owner: str) -> TimeAxis:
     """Read times whose label may have their unit, such as ``t [ms]``."""
     axis, unit = read_times(source, owner), split_unit(str(label))[1]
-    if unit is None or axis.epoch is not None or _find_kind(source) == "m":
+    if unit is None or axis.started_at is not None or _find_kind(source) == "m":
         return axis
     size = find_conversion_factor(unit, "s")
     if size is None:
@@ -358,11 +363,19 @@ def _name_column(name: Any, values: Any, otherwise: str) -> tuple[str, str]:
     return plain, str(unit or "1")
 
 
-def align_epochs(epochs: Iterable[int | None]) -> list[float]:
+def align_starts(starts: Iterable[datetime | None]) -> list[float]:
     """Compute the seconds by which series of dates start after the first of them.
 
     Series of seconds are not shifted.
+
+    Raises
+    ------
+    InvalidRecord
+        If only some of the dates have a time zone.
     """
-    known = list(epochs)
-    first = min((epoch for epoch in known if epoch is not None), default=0)
-    return [0.0 if epoch is None else (epoch - first) * 1e-9 for epoch in known]
+    known = list(starts)
+    try:
+        first = min((start for start in known if start is not None), default=_EPOCH)
+        return [0.0 if start is None else (start - first).total_seconds() for start in known]
+    except TypeError:
+        raise InvalidRecord(_MIXED_ZONES) from None

@@ -50,7 +50,7 @@ def assign_channels(
             f"model {model.name!r} has inputs {inputs} and outputs {outputs}; the recording has "
             f"{', '.join(names)}. Say which channel is which: channels={{{example}}}"
         )
-    by_order = dict(zip(left, free, strict=True))
+    by_order = dict(zip(left, free, strict=True)) if left else {}
     return Assignment({**assigned, **by_order}, _describe_order(by_order))
 
 
