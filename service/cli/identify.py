@@ -168,7 +168,7 @@ def _write_report(
     facts = {"Model": model.name, "Recording": data.name}
     request = json.dumps(body.to_normal_form(), indent=2, ensure_ascii=False)
     write_file(path, render_identification_report(result, title, facts, seconds, request))
-    err.print(f"report written to {path}", markup=False)
+    err.print(f"report written to {path}", markup=False, soft_wrap=True)
 
 
 def _build_body(
