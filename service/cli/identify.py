@@ -428,12 +428,13 @@ def _assign_other_channels(
 ) -> dict[str, str]:
     """Assign the channels that are left to the signals that are left, in order, inputs first.
 
-    Only if no signal that is left has a channel of its name, and there are as many of both.
+    Only if there are as many of both, after those of the same name are matched.
     """
+    from sysid.models.signals import match_names
+
     names = [signal.name for signal in model.inputs] + [signal.name for signal in model.outputs]
-    signals = [name for name in names if name not in channels]
-    left = [name for name in recording.names if name not in channels.values()]
-    if len(signals) != len(left) or set(signals) & set(left):
+    _, signals, left = match_names(names, recording.names, channels)
+    if not signals or len(signals) != len(left):
         return {}
     assigned = dict(zip(signals, left, strict=True))
     pairs = ",".join(f"{signal}={name}" for signal, name in assigned.items())

@@ -22,7 +22,6 @@ from service.storage.objects import ObjectStore
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.residuals.fitted_series import FittedSeries, list_fitted_residuals
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import (
     TEST_LEVEL,
@@ -31,6 +30,7 @@ from sysid.residuals.residual_tests import (
     ResidualTests,
     compute_correlations,
     judge_tests,
+    make_residual_series,
 )
 
 JobBody = Mapping[str, Any]
@@ -118,25 +118,25 @@ def _build_series(
 ) -> Iterator[ResidualSeries]:
     """Build the residuals of the tested outputs as the loss uses them, without skipped samples."""
     loss = body["loss"]
+    scale = float(loss["scale"]) if loss["kind"] == "soft-l1" else 0.0
+    weights = _compute_weights(body, fits)
     before = _count_earlier_samples(body, fits)
-    return list_fitted_residuals(
-        (
-            FittedSeries(
-                fit.number - 1,
-                fit.name,
-                fit.times,
-                fit.measured,
-                fit.simulated,
-                before.get((fit.number, fit.name), 0),
-            )
-            for fit in tested
-        ),
-        inputs,
-        _compute_weights(body, fits),
-        body["skip"],
-        float(loss["scale"]) if loss["kind"] == "soft-l1" else 0.0,
-        times,
-    )
+    for fit in tested:
+        number = fit.number - 1
+        first = before.get((fit.number, fit.name), 0)
+        scored = np.arange(first, first + fit.times.size) >= body["skip"]
+        weight = weights[fit.name]
+        yield make_residual_series(
+            number,
+            fit.name,
+            fit.times,
+            weight * fit.measured,
+            weight * fit.simulated,
+            scored & np.isfinite(fit.measured),
+            inputs[number] if number < len(inputs) else (),
+            scale,
+            times.get(fit.name, 0.0),
+        )
 
 
 def _count_earlier_samples(

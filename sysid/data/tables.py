@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, TypeAlias
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,7 +138,9 @@ def _read_dates(source: Any, owner: str) -> TimeAxis:
         return TimeAxis(np.zeros(0))
     nanoseconds = dates.astype(np.int64)
     first = _EPOCH + timedelta(microseconds=int(nanoseconds[0]) // 1000)
-    zone = getattr(getattr(source, "dtype", None), "tz", None)
+    kind = getattr(source, "dtype", None)
+    named = getattr(kind, "time_zone", None)  # of polars; pandas has the zone itself
+    zone = ZoneInfo(named) if isinstance(named, str) else getattr(kind, "tz", None)
     started = first.replace(tzinfo=None) if zone is None else first.astimezone(zone)
     return TimeAxis(np.asarray((nanoseconds - nanoseconds[0]) * 1e-9, dtype=np.float64), started)
 

@@ -130,7 +130,7 @@ def identify(
     check_signal_units(model, (*whole, *(validation_records or ())))
     fit = FitSettings(changes, prediction, loss or Loss(), weights, skip)
     prepared = prepare_records(whole, validation_records, validation_fraction, noise)
-    problem, validation_problem = build_problems(model, prepared, fit)
+    problem, validation_problem = problems = build_problems(model, prepared, fit)
     found = conclude_run(
         problem,
         algorithm,
@@ -138,7 +138,7 @@ def identify(
         validation_problem,
         posterior=posterior,
     )
-    data = collect_fitted_data(model, prepared, problem, found)
+    data = collect_fitted_data(model, prepared, problems, found)
     return replace(found, warnings=(*notes, *found.warnings), data=data)
 
 

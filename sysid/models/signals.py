@@ -41,7 +41,7 @@ def assign_channels(
     signals += [output.name for output in model.outputs]
     given = dict(channels or {})
     _check_given(given, signals, names)
-    assigned, left, free = _assign_by_name(signals, names, given)
+    assigned, left, free = match_names(signals, names, given)
     if left and len(left) != len(free):
         inputs = ", ".join(signal.name for signal in model.inputs) or "none"
         outputs = ", ".join(output.name for output in model.outputs)
@@ -73,12 +73,13 @@ def assign_record(
     )
     signals = [name for side, _ in sides for name in side]
     _check_given(given, signals, [c.name for _, side in sides for c in side])
+    _check_sides(model, record, given)
     renamed: list[tuple[Channel, ...]] = []
     by_order: dict[str, str] = {}
     for wanted, side in sides:
         names = [channel.name for channel in side]
-        chosen = {name: channel for name, channel in given.items() if channel in names}
-        assigned, left, free = _assign_by_name(wanted, names, chosen)
+        chosen = {name: given[name] for name in wanted if name in given}
+        assigned, left, free = match_names(wanted, names, chosen)
         if len(left) == len(free) and not set(free) & set(signals):
             assigned.update(zip(left, free, strict=True))
             by_order.update(zip(left, free, strict=True))
@@ -86,6 +87,19 @@ def assign_record(
     if renamed == [record.inputs, record.outputs]:
         return record, ""
     return replace(record, inputs=renamed[0], outputs=renamed[1]), _describe_order(by_order)
+
+
+def _check_sides(model: Model, record: Record, given: Mapping[str, str]) -> None:
+    """Check that an input is given a channel of the inputs, and an output one of the outputs."""
+    inputs = {signal.name for signal in model.inputs}
+    for signal, channel in given.items():
+        side, others = (
+            ("inputs", record.inputs) if signal in inputs else ("outputs", record.outputs)
+        )
+        if channel not in [one.name for one in others]:
+            raise InvalidSettings(
+                f"/channels/{signal}", f"channel {channel!r} is not among the {side} of the record"
+            )
 
 
 def _rename_channels(
@@ -100,10 +114,13 @@ def _rename_channels(
     )
 
 
-def _assign_by_name(
+def match_names(
     signals: Sequence[str], names: Sequence[str], given: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str], list[str]]:
-    """Assign by name; return also the signals and the channels that are left."""
+    """Match signals and channels by name, after those that are given: model's name → channel's.
+
+    Returns what is matched, and the signals and the channels that are left.
+    """
     used = set(given.values())
     assigned = {name: given[name] for name in signals if name in given}
     for signal in signals:

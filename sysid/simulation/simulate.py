@@ -20,6 +20,7 @@ from sysid.models.model import (
     DerivedInitial,
     FixedInitial,
     InitialState,
+    MeasuredInitial,
     Model,
     name_initial_state,
     replace_substeps,
@@ -53,7 +54,8 @@ def simulate(
 
     With a result of `identify`, the model is simulated as it was identified: with its selected
     terms, its integration step, and its reading of the inputs. Several records have starts of
-    their own; the first one's are taken.
+    their own; the first one's are taken. So is a measured start, unless `inputs` is a `Record` with
+    measured outputs.
 
     Parameters
     ----------
@@ -97,6 +99,7 @@ def simulate(
     """
     model = resolve_model(model)
     signals = _read_inputs(model, inputs)
+    measured = _find_measured(inputs, values)
     if not isinstance(values, Mapping):
         model, signals, values = _restore(model, signals, values)
     _check_values(model, values)
@@ -105,12 +108,14 @@ def simulate(
         _fix_parameter(parameter, values[parameter.name]) for parameter in model.parameters
     )
     initial = tuple(
-        _fix_initial(start, state.name, values)
+        _fix_initial(start, state.name, values, is_measured=bool(measured))
         for start, state in zip(model.initial, model.states, strict=True)
     )
     at = _choose_times(signals, times)
-    missing = np.full(at.size, np.nan)
-    outputs = tuple(Channel(o.name, at, missing, o.unit) for o in model.outputs)
+    outputs = tuple(
+        Channel(output.name, at, _read_measured(measured, output.name, at), output.unit)
+        for output in model.outputs
+    )
     problem = build_simulation_problem(
         replace(model, parameters=fixed_parameters, initial=initial), Record(signals, outputs)
     )
@@ -128,6 +133,27 @@ def _read_inputs(model: Model, inputs: Channels | Record | Recording) -> tuple[C
     if len(channels) == len(model.inputs) == 1:
         return (replace(channels[0], name=model.inputs[0].name),)
     return channels
+
+
+def _find_measured(
+    inputs: Channels | Record | Recording, values: Mapping[str, float] | Identified
+) -> tuple[Channel, ...]:
+    """Find measured outputs, for initial states that start at them."""
+    if isinstance(inputs, Record) and inputs.outputs:
+        return inputs.outputs
+    data = getattr(values, "data", None)
+    return () if data is None else data.records[0].outputs
+
+
+def _read_measured(measured: tuple[Channel, ...], name: str, times: FloatArray) -> FloatArray:
+    """Read a measured output at times that begin where it begins; only its start is used."""
+    for channel in measured:
+        finite = np.isfinite(channel.values)
+        if channel.name == name and np.any(finite):
+            known = channel.times[finite]
+            later = times - times[0] + channel.times[0]
+            return np.interp(later, known, channel.values[finite])
+    return np.full(times.size, np.nan)
 
 
 def _restore(
@@ -202,11 +228,15 @@ def _fix_parameter(parameter: Parameter, value: float) -> Parameter:
     return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear", tied=None)
 
 
-def _fix_initial(start: InitialState, state: str, values: Mapping[str, float]) -> InitialState:
+def _fix_initial(
+    start: InitialState, state: str, values: Mapping[str, float], *, is_measured: bool
+) -> InitialState:
     name = name_initial_state(state, 0)
     if name in values:
         return FixedInitial(float(values[name]))
     if isinstance(start, FixedInitial | DerivedInitial):
+        return start
+    if isinstance(start, MeasuredInitial) and is_measured:
         return start
     raise InvalidSettings(
         f"/parameters/{name}", f"a value is missing. The model does not fix where {state!r} starts"

@@ -272,6 +272,21 @@ def test_simulation_of_several_records_starts_as_the_first(sampled: Identificati
     assert np.array_equal(answer, sampled.simulated[0][0])
 
 
+@pytest.mark.parametrize("name", ["tube", "narx"])
+def test_simulation_starts_where_the_measurement_started(name: str) -> None:
+    y = np.zeros(N)
+    for k in range(3, N):
+        y[k] = 0.6 * y[k - 1] + 0.02 * STEPS[k - 3]
+    y += 1.0 + np.random.default_rng(2).normal(0.0, 0.01, N)
+    record = Record(Channel("u", T, STEPS), Channel("y", T, y))
+    result = identify(name, record, QUICK)
+    for inputs in (record, record.inputs):
+        answer = simulate(name, inputs, result).channel("y").values
+        assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
+    with pytest.raises(InvalidSettings, match=r"/parameters/y\(0\): a value is missing"):
+        simulate(name, record.inputs, replace(result, data=None))
+
+
 def test_an_exported_model_is_read_and_simulated(found: Identification, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(export_model(load_model("fopdt"), found, "json"), encoding="utf-8")
@@ -371,7 +386,8 @@ def test_drawn_residuals_are_those_that_were_tested(
     robust = identify(
         "fopdt", frame, QUICK, parameters=FEW, loss=Loss("soft-l1", scale=0.2), skip=7
     )
-    for result in (found, sampled, robust):
+    one_step = identify("narx", frame, QUICK, prediction="one-step")
+    for result in (found, sampled, robust, one_step):
         verdict = judge_tests(result.data.correlations, result.residual_tests.data)
         assert verdict == result.residual_tests
 

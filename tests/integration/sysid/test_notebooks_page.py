@@ -39,12 +39,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run_cell(source: str, names: dict[str, Any]) -> Any:
     """Run a cell as a notebook does; gives the value of its last line."""
-    body = ast.parse(source).body
-    last = body.pop() if body and isinstance(body[-1], ast.Expr) else None
-    exec(compile(ast.Module(body, []), "cell", "exec"), names)
-    return (
-        None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), names)
-    )
+    *body, last = ast.parse(source).body
+    ends_in_value = isinstance(last, ast.Expr)
+    exec(compile(ast.Module(body if ends_in_value else [*body, last], []), "cell", "exec"), names)
+    if not isinstance(last, ast.Expr):
+        return None
+    return eval(compile(ast.Expression(last.value), "cell", "eval"), names)
 
 
 def test_four_lines_give_the_answer_and_its_plot(folder: Path) -> None:

@@ -152,8 +152,22 @@ def test_a_table_is_a_recording(table: object) -> None:
         assert np.array_equal(channel.values, values)
 
 
+def test_a_table_of_polars_is_a_recording() -> None:
+    polars = pytest.importorskip("polars")
+    table = polars.DataFrame({"when": DATES, "P1 [bar]": [1.0, None, 3.0, 4.0]})
+    recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
+    [channel] = recording.channels
+    assert (channel.name, channel.unit) == ("P1", "bar")
+    assert np.array_equal(channel.times, TIMES)
+    assert np.array_equal(np.isnan(channel.values), [False, True, False, False])
+    assert recording.started_at == pd.Timestamp(START, tz="CET")
+    assert recording.started_at.hour == START.hour
+
+
 def test_the_clock_of_dates_is_kept_by_a_recording() -> None:
-    assert Recording(frame().set_index(BERLIN)).started_at == BERLIN[0]
+    started = Recording(frame().set_index(BERLIN)).started_at
+    assert started == BERLIN[0]
+    assert started.hour == START.hour
     assert Recording(frame().set_index(pd.DatetimeIndex(DATES))).started_at == START
     assert Recording(frame()).started_at is None
 

@@ -88,6 +88,13 @@ def test_the_sides_of_a_record_say_what_is_input_and_output() -> None:
     assert names(renamed) == (["P1", "u"], ["y"])
 
 
+def test_a_channel_of_the_other_side_is_refused() -> None:
+    with pytest.raises(InvalidSettings, match="'P2' is not among the inputs of the record"):
+        assign_record(MODEL, record(["P1"], ["P2"]), {"u": "P2"})
+    with pytest.raises(InvalidSettings, match="'P1' is not among the outputs of the record"):
+        assign_record(MODEL, record(["P1"], ["P2"]), {"y": "P1"})
+
+
 def test_exchanged_sides_are_left_to_the_checks_of_the_problem() -> None:
     one = record(["y"], ["u"])
     assert assign_record(MODEL, one) == (one, "")
