@@ -14,9 +14,10 @@ from service.figures.csv import to_csv
 from service.pages import figures as results
 from service.pages import pages, report
 from service.pages import render as assets
-from service.pages.figures import FigureChoice, FigureName
+from service.pages.figures import FigureChoice
 from service.pages.simulate import simulate_page as simulate
 from sysid.figures.plotly import Figure, apply_theme
+from sysid.identification.figures import FigureName
 
 router = APIRouter()
 

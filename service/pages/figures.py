@@ -27,10 +27,7 @@ from sysid.figures import plotly, signals
 from sysid.figures.plotly import Abscissa, Figure
 from sysid.figures.posterior import plot_posterior
 from sysid.figures.theme import Theme
-
-FigureName = Literal[
-    "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
-]
+from sysid.identification.figures import FigureName
 
 
 class FigureChoice(BaseModel):

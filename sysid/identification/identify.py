@@ -53,9 +53,9 @@ def identify(
     settings : GeneticAlgorithm
         The improved algorithm with its defaults if not given.
     channels : mapping of str to str
-        Model's signal → name of its channel. Signals that are not given take the channel of their
-        name. If none has it and as many are left, their order decides, inputs first; a warning of
-        the result says so.
+        Model's signal → name of its channel. A signal that is not given takes the channel of its
+        name. If as many channels are left as signals, their order decides, inputs first. A warning
+        of the result says so.
     seed : int
         The same seed gives the same result, bit for bit.
     parameters : mapping

@@ -152,7 +152,8 @@ def _read_measured(measured: tuple[Channel, ...], name: str, times: FloatArray) 
         if channel.name == name and np.any(finite):
             known = channel.times[finite]
             later = times - times[0] + channel.times[0]
-            return np.interp(later, known, channel.values[finite])
+            values: FloatArray = np.interp(later, known, channel.values[finite])
+            return values
     return np.full(times.size, np.nan)
 
 
