@@ -72,7 +72,7 @@ class _Part:
         legend = f"legend{self._number if self._number > 1 else ''}"
         layout[legend] = {
             **self._layout["legend"],
-            "y": self._top,
+            "y": self._upward(self._layout["legend"]["y"]),
             "visible": self._layout.get("showlegend", True),
         }
         stacked["data"] += [self._move_trace(trace, legend) for trace in self._figure["data"]]
@@ -116,9 +116,8 @@ class _Part:
             **trace,
             "xaxis": self._renumber(trace.get("xaxis", "x")),
             "yaxis": self._renumber(trace.get("yaxis", "y")),
+            "legend": legend,
         }
-        if trace["type"] not in ("heatmap", "contour"):
-            moved["legend"] = legend
         if "legendgroup" in trace:
             moved["legendgroup"] = f"{trace['legendgroup']} {self._number}"
         if "colorbar" in trace:

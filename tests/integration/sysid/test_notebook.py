@@ -34,10 +34,14 @@ from sysid.core.errors import (
     UnreadableResult,
 )
 from sysid.identification.figures import FIGURES, draw_figures, list_experiments
+from sysid.identification.result import InputHold
 from sysid.identification.saved_result import FORMAT
 from sysid.identification.summary import summarise_result
-from sysid.models.model import Model
+from sysid.models.model import Model, replace_substeps
 from sysid.residuals.residual_tests import judge_tests
+from sysid.uncertainty.estimates import Posterior
+from tests.polynomials import TRUTH as POLYNOMIAL
+from tests.polynomials import document, frols, record_of
 
 N = 240
 T = np.arange(N) * 0.5
@@ -45,6 +49,9 @@ STEPS = np.where((T // 20) % 2 == 0, 0.0, 20.0)
 TRUTH = {"K": 0.8, "T": 6.0, "L": 3.2, "y0": 20.0, "x(0)": 0.0}
 QUICK = GeneticAlgorithm(population=32, generations=60)
 FEW = {"y0": 20.0, "K": (0.1, 2.0), "T": (1.0, 20.0), "L": (0.0, 10.0), "x(0)": 0.0}
+
+
+NO_SAMPLES = Posterior((), np.zeros((0, 3)), np.zeros((0, 0)), 0, 0, 0.0, 0, False, "no budget")
 
 
 def make_frame() -> pd.DataFrame:
@@ -189,7 +196,7 @@ def test_a_result_is_saved_and_read_bit_for_bit(
 
 def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path) -> None:
     odd = replace(found, rms=float("inf"), fit_percent=float("nan"), simulated=((np.zeros(0),),))
-    odd = replace(odd, posterior=None, uncertainty=None, data=None)
+    odd = replace(odd, posterior=NO_SAMPLES, uncertainty=None, data=None)
     path = tmp_path / "odd.json"
     odd.save(path)
     assert same(Identification.load(path), odd)
@@ -266,6 +273,33 @@ def test_simulation_of_a_table_reads_the_input_as_the_identification_did(
     assert not np.allclose(held, answer, rtol=1e-3)
 
 
+def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
+    record, model = found.data.records[0], load_model("fopdt")
+    finer = simulate(model, record, replace(found, substeps=7)).channel("y").values
+    asked = simulate(replace_substeps(model, 7), record, found.parameter_values)
+    assert np.array_equal(finer, asked.channel("y").values)
+    assert not np.array_equal(finer, found.simulated[0][0])
+
+
+def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
+    inputs, values = Channel("u", T, STEPS), found.parameter_values
+    assert inputs.resolved_hold == "zero"
+    lines = replace(found, input_holds=(InputHold("u", "first", None),))
+    answer = simulate("fopdt", inputs, lines).channel("y").values
+    asked = replace_substeps(load_model("fopdt"), found.substeps)
+    expected = simulate(asked, replace(inputs, hold="first"), values).channel("y").values
+    assert np.array_equal(answer, expected)
+
+
+def test_simulation_has_the_terms_of_the_result() -> None:
+    model = document(frols(5))
+    record = record_of(POLYNOMIAL, samples=200)
+    result = identify(model, record, QUICK)
+    assert len(result.selection) == 5
+    answer = simulate(model, record, result).channel("y").values
+    assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
+
+
 def test_simulation_of_several_records_starts_as_the_first(sampled: Identification) -> None:
     record = sampled.data.records[0]
     answer = simulate("fopdt", record, sampled).channel("y").values
@@ -283,6 +317,8 @@ def test_simulation_starts_where_the_measurement_started(name: str) -> None:
     for inputs in (record, record.inputs):
         answer = simulate(name, inputs, result).channel("y").values
         assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
+    later = simulate(name, Channel("u", T + 500.0, STEPS), result).channel("y").values
+    assert np.allclose(later, result.simulated[0][0], rtol=0, atol=1e-6)
     with pytest.raises(InvalidSettings, match=r"/parameters/y\(0\): a value is missing"):
         simulate(name, record.inputs, replace(result, data=None))
 
@@ -359,6 +395,17 @@ def test_figures_of_every_record(sampled: Identification) -> None:
         sampled.plot(experiment=3)
     with pytest.raises(InvalidSettings, match=r"'respons'; did you mean 'response'\?"):
         sampled.plot("respons")
+
+
+def test_residuals_are_drawn_for_each_tested_record(frame: pd.DataFrame) -> None:
+    parts = [frame.iloc[:120], frame.iloc[120:]]
+    result = identify("fopdt", parts, QUICK, parameters=FEW)
+    for number in (0, 1):
+        [(title, figure)] = draw_figures(result, ["residuals"], number)
+        assert title.endswith(f": estimation {number + 1}")
+        bars = [trace["y"] for trace in figure["data"] if trace["type"] == "bar"]
+        tested = [c for c in result.data.correlations if c.test.experiment == number]
+        assert bars[1] == pytest.approx(tested[1].values, rel=1e-5)
 
 
 def test_a_result_without_data_draws_what_it_has(found: Identification) -> None:

@@ -42,12 +42,14 @@ def test_what_is_given_or_has_the_name_needs_no_note(channels, given, assigned) 
         (["P1", "P2"], {}, {"u": "P1", "y": "P2"}),
         (["P1", "u"], {}, {"u": "u", "y": "P1"}),
         (["P1", "P2"], {"u": "P2"}, {"u": "P2", "y": "P1"}),
+        (["u", "P2"], {"y": "u"}, {"u": "P2", "y": "u"}),
     ],
 )
 def test_the_order_decides_where_as_many_are_left_and_is_told(channels, given, assigned) -> None:
     found, note = assign_channels(MODEL, channels, given)
     assert found == assigned
-    assert f"'y': {assigned['y']!r}" in note
+    told = [signal for signal in assigned if f"{signal!r}: {assigned[signal]!r}" in note]
+    assert told == [s for s in assigned if s not in given and assigned[s] != s]
 
 
 def test_a_signal_without_a_channel_is_told_with_all_channels() -> None:
