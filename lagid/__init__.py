@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         catalogue,
         export_model,
         identify,
+        load_identified,
         load_model,
         simulate,
     )
@@ -80,6 +81,7 @@ __all__ = [
     "catalogue",
     "export_model",
     "identify",
+    "load_identified",
     "load_model",
     "read_recording",
     "simulate",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sysid.data.noise import Noise
     from sysid.data.records import Channel, History, Record, Recording
     from sysid.export.export import export_model
+    from sysid.export.load import load_identified
     from sysid.identification.identify import identify
     from sysid.identification.result import Identification
     from sysid.models.catalogue.load import catalogue, load_model
@@ -48,6 +49,7 @@ __all__ = [
     "catalogue",
     "export_model",
     "identify",
+    "load_identified",
     "load_model",
     "simulate",
 ]
@@ -68,6 +70,7 @@ _PUBLIC_NAMES = {
     "data.noise": ("Noise",),
     "data.records": ("Channel", "History", "Record", "Recording"),
     "export.export": ("export_model",),
+    "export.load": ("load_identified",),
     "identification.identify": ("identify",),
     "identification.result": ("Identification",),
     "models.catalogue.load": ("catalogue", "load_model"),

@@ -10,12 +10,14 @@ from service.api.html import HtmlPage
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.states import JobState
-from service.figures import plotly as figures
+from service.figures.csv import to_csv
 from service.pages import figures as results
 from service.pages import pages, report
 from service.pages import render as assets
-from service.pages.figures import FigureChoice, FigureName
+from service.pages.figures import FigureChoice
 from service.pages.simulate import simulate_page as simulate
+from sysid.figures.plotly import Figure, apply_theme
+from sysid.identification.figures import FigureName
 
 router = APIRouter()
 
@@ -163,14 +165,14 @@ def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSess
     """Export the job as one HTML file that needs no server: tables, figures, the exact request."""
     text = report.render_job_report(session, parts.store, job_id, str(request.base_url))
     # A file cannot say who may frame it: this directive works in a header only.
-    policy = f"{report.security_policy()}; frame-ancestors 'none'"
+    policy = f"{assets.security_policy()}; frame-ancestors 'none'"
     return HTMLResponse(text, headers={"Content-Security-Policy": policy})
 
 
-def _figure_response(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
+def _figure_response(figure: Figure, name: str, choice: FigureChoice) -> Response:
     if choice.format == "csv":
-        return _csv_response(figures.to_csv(figure), name)
-    return JSONResponse(figures.apply_theme(figure, choice.theme))
+        return _csv_response(to_csv(figure), name)
+    return JSONResponse(apply_theme(figure, choice.theme))
 
 
 def _csv_response(text: str, name: str) -> Response:

@@ -10,9 +10,7 @@ from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
 from service.core.errors import NotFound
-from service.figures.plotly import apply_theme
 from service.figures.profiles import plot_profiles as profile_figure
-from service.figures.theme import Theme
 from service.repositories.runs import RunRepository
 from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
 from service.runs.schemas import (
@@ -29,6 +27,8 @@ from service.runs.schemas import (
     RunOut,
 )
 from sysid.export.export import MAX_PADE_ORDER, ExportFormat
+from sysid.figures.plotly import apply_theme
+from sysid.figures.theme import Theme
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"], route_class=JsonRoute)
 

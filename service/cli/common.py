@@ -21,8 +21,9 @@ from rich.table import Table
 from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
 from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
-from service.core.text import DASH, format_value, plain_estimate
+from service.core.text import format_value
 from sysid.core.errors import join_pointer, split_pointer
+from sysid.core.text import DASH, plain_estimate
 
 if TYPE_CHECKING:
     from service.client.client import Client

@@ -42,8 +42,8 @@ from service.cli.common import (
     show_examples,
 )
 from service.client.calls import DEFAULT_URL
-from service.core.text import append_unit
 from sysid.core.errors import suggest_name
+from sysid.core.text import append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

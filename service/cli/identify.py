@@ -37,16 +37,15 @@ from service.cli.common import (
     split_setting_path,
     write_file,
 )
-from service.core.text import plain_unit
 from sysid.core.errors import suggest_name
 from sysid.core.settings import NOISE_MODELS
+from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
     from service.jobs.schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.result import Identification
     from sysid.models.model import Model
-    from sysid.residuals.residual_tests import ResidualTests
     from sysid.uncertainty.estimates import Posterior
 
 
@@ -123,6 +122,14 @@ def identify(
     ] = False,
     segments: Segments = None,
     sample_time: SampleTime = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write a report as one HTML file, with tables and figures.",
+            rich_help_panel=OUTPUT_PANEL,
+        ),
+    ] = None,
     output: ResultFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -133,6 +140,8 @@ def identify(
         changes.append(f"loss.noise_model={noise_model}")
     if posterior:
         changes.append("posterior=true")
+    if report is not None:
+        _check_report(report)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
@@ -149,7 +158,39 @@ def identify(
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
         result = _run_identification(loaded, records, validation_records, body, quiet=as_json)
-    print_result(loaded, result, read_clock() - begun, output, as_json=as_json)
+    seconds = read_clock() - begun
+    print_result(loaded, result, seconds, output, as_json=as_json)
+    if report is not None:
+        _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
+
+
+def _check_report(path: Path) -> None:
+    """End the command before the search if no report could be written after it."""
+    from importlib.util import find_spec
+
+    missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
+    if missing:
+        fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
+    if not path.parent.is_dir():
+        fail_usage(f"--report {path}: there is no folder {path.parent}")
+
+
+def _write_report(
+    path: Path,
+    data: Path,
+    model: "Model",
+    result: "Identification",
+    seconds: float,
+    body: "JobIn",
+) -> None:
+    """Write the report with the figures of a job's report."""
+    from service.pages.identification_report import render_identification_report
+
+    title = f"{model.title or model.name}: {data.name}"
+    facts = {"Model": model.name, "Recording": data.name}
+    request = json.dumps(body.to_normal_form(), indent=2, ensure_ascii=False)
+    write_file(path, render_identification_report(result, title, facts, seconds, request))
+    err.print(f"report written to {path}", markup=False, soft_wrap=True)
 
 
 def _build_body(
@@ -268,6 +309,7 @@ def print_result(
 ) -> None:
     """Print the estimates, as tables or as JSON; `output` is a file of the JSON."""
     from service.runs.result import to_result_document
+    from sysid.identification.summary import describe_residuals
 
     document = to_result_document(result, seconds)
     if output is not None:
@@ -310,7 +352,7 @@ def print_result(
             markup=False,
         )
     if result.residual_tests is not None and result.residual_tests.passed is not None:
-        out.print(_residual_verdict(result.residual_tests), markup=False, soft_wrap=True)
+        out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
     _print_posterior(result.posterior)
     for warning in result.warnings:
         err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
@@ -333,21 +375,6 @@ def _print_posterior(posterior: "Posterior | None") -> None:
         ),
         empty="no parameters",
     )
-
-
-def _residual_verdict(tests: "ResidualTests") -> str:
-    """Say whether the residuals pass their tests; failed tests have their p-value.
-
-    Warnings cover only p < 0.001, so most failed tests are reported only here.
-    """
-    failed = [
-        f"{test.output} {'is not white' if test.input is None else f'depends on {test.input}'}"
-        + ("" if test.p is None else f" (p = {test.p:.2g})" if test.p >= 1e-3 else " (p < 0.001)")
-        for test in tests.tests
-        if test.outcome == "failed"
-    ]
-    verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
-    return f"residuals on {tests.data} data: {verdict}"
 
 
 def _format_bounds(result: "Identification") -> str:
@@ -428,12 +455,13 @@ def _assign_other_channels(
 ) -> dict[str, str]:
     """Assign the channels that are left to the signals that are left, in order, inputs first.
 
-    Only if no signal that is left has a channel of its name, and there are as many of both.
+    Only if there are as many of both, after those of the same name are matched.
     """
+    from sysid.models.signals import match_names
+
     names = [signal.name for signal in model.inputs] + [signal.name for signal in model.outputs]
-    signals = [name for name in names if name not in channels]
-    left = [name for name in recording.names if name not in channels.values()]
-    if len(signals) != len(left) or set(signals) & set(left):
+    _, signals, left = match_names(names, recording.names, channels)
+    if not signals or len(signals) != len(left):
         return {}
     assigned = dict(zip(signals, left, strict=True))
     pairs = ",".join(f"{signal}={name}" for signal, name in assigned.items())

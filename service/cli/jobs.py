@@ -46,8 +46,8 @@ from service.cli.tables import (
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.states import JobState
-from service.core.text import append_unit
 from service.formats.file_kinds import SUFFIXES
+from sysid.core.text import append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

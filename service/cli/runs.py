@@ -33,7 +33,7 @@ from service.cli.common import (
 )
 from service.cli.jobs import list_runs as listing
 from service.client.calls import DEFAULT_URL
-from service.core.text import format_p_value
+from sysid.core.text import format_p_value
 from sysid.core.units import multiply_units
 
 LIST_COMMAND = "list"

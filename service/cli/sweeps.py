@@ -31,8 +31,8 @@ from service.cli.common import (
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.job_fields import METHOD_PATH, SIGMA_PATH
-from service.core.text import append_unit
 from sysid.core.settings import SEARCH_METHODS
+from sysid.core.text import append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

@@ -21,8 +21,9 @@ from service.cli.common import (
 )
 from service.client.calls import ProblemError
 from service.core.job_fields import DATASETS_PATH
-from service.core.text import DASH, append_unit, format_labels, plain_unit
+from service.core.text import format_labels
 from service.trends.text import PLAIN, build_tables, format_reference, list_notes
+from sysid.core.text import DASH, append_unit, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

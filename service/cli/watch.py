@@ -15,7 +15,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from service.cli.common import err
 from service.client.calls import TERMINAL_STATES
-from service.core.text import format_duration, format_value, plain_unit
+from service.core.text import format_duration, format_value
+from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client

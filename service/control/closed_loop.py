@@ -15,10 +15,10 @@ from service.control.schemas import (
     TuningOut,
 )
 from service.core.errors import FieldError, InvalidRequest
-from service.core.text import plain_unit
 from service.datasets.schemas import StepInput
 from service.datasets.simulated import check_finite_outputs
 from sysid.core.errors import InvalidSettings, suggest_name
+from sysid.core.text import plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
 from sysid.models.model import Model

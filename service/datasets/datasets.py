@@ -26,7 +26,6 @@ from service.datasets.schemas import (
     SeriesOut,
     SignalsOut,
 )
-from service.formats.decimate import decimate
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.mcap import write_recording
 from service.formats.sandbox import read_untrusted
@@ -43,6 +42,7 @@ from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.core.errors import suggest_name
 from sysid.data.records import Channel, Recording
+from sysid.figures.decimate import decimate
 from sysid.models.units import list_unknown_unit_warnings
 
 

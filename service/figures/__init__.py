@@ -1,1 +1,1 @@
-"""Figures: one Plotly definition each, also drawn as SVG; no rendering of pages."""
+"""Figures of sweeps, trends and loops; any figure as CSV, SVG or part of a page."""

@@ -1,17 +1,27 @@
 """Embed figures in a page: their JSON in script elements that are not executed."""
 
 import json
+from collections.abc import Iterable
 
 from markupsafe import Markup
 
-from service.figures.plotly import Figure
-from service.figures.theme import plotly_template
+from sysid.figures.plotly import Figure, has_points
+from sysid.figures.theme import plotly_template
 
 
 def strip_template(figure: Figure) -> Figure:
     """Remove the template, which a report stores once for all its figures."""
     layout = {name: value for name, value in figure["layout"].items() if name != "template"}
     return {"data": figure["data"], "layout": layout}
+
+
+def write_figures(titled: Iterable[tuple[str, Figure]]) -> list[tuple[str, int, Markup]]:
+    """Title, height (px) and JSON of the figures that have data, for a report."""
+    return [
+        (title, figure["layout"]["height"], to_script_json(strip_template(figure)))
+        for title, figure in titled
+        if has_points(figure)
+    ]
 
 
 def to_script_json(value: object) -> Markup:

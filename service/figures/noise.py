@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.job_fields import SIGMA_PATH
-from service.core.text import append_unit, bracket_unit, format_value
-from service.figures import theme
-from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
-from service.figures.plotly import Figure, base_layout, to_json_numbers
+from service.core.text import format_value
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
+from sysid.core.text import append_unit, bracket_unit
+from sysid.figures import theme
+from sysid.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from sysid.figures.plotly import Figure, base_layout, to_json_numbers
 
 METHOD_PATH = "/algorithm/method"
 MAX_SERIES = 12

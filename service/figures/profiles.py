@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-from service.core.text import append_unit
-from service.figures import theme
-from service.figures.grid import PlotGrid, add_axes
-from service.figures.plotly import MARGIN, Figure, base_layout
 from service.runs.schemas import ProfileOut
+from sysid.core.text import append_unit
+from sysid.figures import theme
+from sysid.figures.grid import PlotGrid, add_axes
+from sysid.figures.plotly import MARGIN, Figure, base_layout
 
 _ROW_PX, _GAP = 230, 0.08
 _MAX_THRESHOLDS = 3.0  # height of the axis in thresholds, so that the minimum stays visible

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from service.control.schemas import ControllerOut, RunSimulationOut, StepMetricsOut
-from service.core.text import bracket_unit
 from service.datasets.schemas import SeriesOut
-from service.figures import theme
-from service.figures.data import SignalTrace
-from service.figures.plotly import Figure
-from service.figures.signals import axis_id, name_axis, signal_line, stack_plots
+from sysid.core.text import bracket_unit
+from sysid.figures import theme
+from sysid.figures.data import SignalTrace
+from sysid.figures.plotly import Figure
+from sysid.figures.signals import axis_id, name_axis, signal_line, stack_plots
 
 _OUTPUT_PX, _INPUT_PX = 260, 120
 _WHOLE_SPAN = slice(None)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from service.core.text import format_number
-from service.figures.plotly import Figure
-from service.figures.theme import stride_indices, thin_indices
+from sysid.core.text import format_number
+from sysid.figures.plotly import Figure
+from sysid.figures.theme import stride_indices, thin_indices
 
 _MarkerPath = Callable[[float, float, float], str]
 

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from service.core.text import append_unit
-from service.figures import theme
-from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
-from service.figures.plotly import Figure, base_layout, to_json_numbers
 from service.trends.schemas import LawOut, LawPointOut, PointOut, QuantityOut, TrendOut
+from sysid.core.text import append_unit
+from sysid.figures import theme
+from sysid.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from sysid.figures.plotly import Figure, base_layout, to_json_numbers
 
 _BAND = "rgba(42,131,196,0.15)"
 _ESTIMATES_LABEL, _LAW_LABEL, _OTHER_LABEL = (

@@ -10,11 +10,12 @@ from sqlalchemy.orm import Session
 
 from service.core.job_fields import SIGMA_PATH
 from service.core.states import JobState
-from service.core.text import format_count, format_number, format_value
+from service.core.text import format_count, format_value
 from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity
 from service.storage.columns import to_json
 from service.storage.tables import Job
 from service.sweeps.groups import get_groups
+from sysid.core.text import format_number
 
 MAX_LISTED_RUNS = 50
 """Most runs that a page lists; for more it shows the grid."""

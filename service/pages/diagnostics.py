@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
-from service.figures.data import CorrelationTrace
-from service.figures.plotly import Figure
-from service.figures.residuals import plot_residuals
-from service.runs.residuals import ResidualAnalysis
-from sysid.residuals.residual_tests import CorrelationFunction
+from sysid.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
+from sysid.figures.plotly import Figure
+from sysid.figures.residuals import plot_residuals
+from sysid.identification.figures import to_correlation_trace
+
+if TYPE_CHECKING:  # a report without a database has diagnostics too
+    from service.runs.residuals import ResidualAnalysis
 
 Document = Mapping[str, Any]
 
@@ -94,24 +95,7 @@ def to_diagnostics(result: Document) -> Diagnostics:
     )
 
 
-def to_correlation_trace(correlation: CorrelationFunction) -> CorrelationTrace:
-    """Convert a correlation function to the data of its figure."""
-    test = correlation.test
-    of = "" if test.input is None else f" with {test.input}"
-    kind = "autocorrelation" if test.input is None else "correlation"
-    title = f"{kind} of the residual of {test.output}{of}: {test.outcome}"
-    return CorrelationTrace(
-        title,
-        test.input is None,
-        correlation.period,
-        correlation.lags,
-        correlation.values,
-        correlation.band95,
-        correlation.band99,
-    )
-
-
-def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int = 2) -> Figure:
+def plot_residual_tests(tested: "ResidualAnalysis", experiment: int, columns: int = 2) -> Figure:
     """Draw the residual correlations of one experiment; empty if none was tested."""
     functions = [
         to_correlation_trace(correlation)

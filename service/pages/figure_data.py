@@ -10,16 +10,6 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.datasets.recordings import load_recording
-from service.figures.data import (
-    CornerParameter,
-    ExperimentTraces,
-    Floats,
-    FreeParameter,
-    IslandImprovement,
-    OutputTraces,
-    RunFigureData,
-    SignalTrace,
-)
 from service.formats.mcap import FitRole, FittedOutput
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
@@ -29,14 +19,18 @@ from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.data.records import Channel
+from sysid.figures.data import (
+    CornerParameter,
+    ExperimentTraces,
+    Floats,
+    FreeParameter,
+    IslandImprovement,
+    OutputTraces,
+    RunFigureData,
+    SignalTrace,
+)
+from sysid.identification.figures import join_validation, label_fitness, to_signal_trace
 from sysid.models.parameters import Parameter, ParameterScale
-
-
-def fitness_label(body: Mapping[str, Any]) -> str:
-    """Label of the minimised fitness; with soft-l1 it is not J."""
-    robust = (body.get("loss") or {}).get("kind") == "soft-l1"
-    return "soft-l1 loss, as RMS" if robust else "RMS"
 
 
 def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:
@@ -65,7 +59,7 @@ def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
     return RunFigureData(
         id=run.id,
         unit=stored.rms_unit(session),
-        fitness_label=fitness_label(body),
+        fitness_label=label_fitness(body["loss"]["kind"]),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations,
         history=history,
@@ -187,7 +181,7 @@ def _to_free_parameter(parameter: Parameter) -> FreeParameter:
 
 def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrace]:
     """Read the channels of a dataset."""
-    return [_to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
+    return [to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
 
 
 def read_run_experiments(
@@ -208,7 +202,7 @@ def read_run_experiments(
     ]
     if validation_settings.get("fraction") is not None:
         return [
-            _join_validation(experiment, validation.get(n, ()))
+            join_validation(experiment, _to_output_traces(validation.get(n, ())))
             for n, experiment in enumerate(experiments, 1)
         ]
     other = list(_read_inputs(session, store, stored, validation_settings.get("datasets") or []))
@@ -237,35 +231,6 @@ def _to_output_traces(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]
     )
 
 
-def _join_validation(
-    experiment: ExperimentTraces, later: Sequence[FittedOutput]
-) -> ExperimentTraces:
-    """Join the parts of a record whose last part was used for validation."""
-    if not later:
-        return experiment
-    outputs = tuple(
-        OutputTraces(
-            SignalTrace(
-                first.measured.name,
-                first.measured.unit,
-                _concatenate(first.measured.times, rest.times),
-                _concatenate(first.measured.values, rest.measured),
-            ),
-            _concatenate(first.identified, rest.simulated),
-        )
-        for first, rest in zip(experiment.outputs, later, strict=True)
-    )
-    since = min(float(output.times[0]) for output in later)
-    return ExperimentTraces(
-        experiment.name.replace("estimation", "record"), outputs, experiment.inputs, since
-    )
-
-
-def _concatenate(first: Floats, rest: Floats) -> Floats:
-    joined: Floats = np.concatenate([first, rest])
-    return joined
-
-
 def _get_inputs(inputs: Sequence[tuple[SignalTrace, ...]], number: int) -> tuple[SignalTrace, ...]:
     return inputs[number - 1] if number <= len(inputs) else ()
 
@@ -277,15 +242,6 @@ def _read_inputs(
     for name in datasets:
         try:
             for record in stored.read_datasets(session, store, [name]):
-                yield tuple(_to_signal_trace(channel) for channel in record.inputs)
+                yield tuple(to_signal_trace(channel) for channel in record.inputs)
         except (StorageError, SysidError):
             yield ()
-
-
-def _to_signal_trace(channel: Channel) -> SignalTrace:
-    held, before = channel.resolved_hold == "zero", None
-    if channel.history is not None:  # including the first sample, so that the lines meet
-        pairs = zip(channel.history, (channel.times, channel.values), strict=True)
-        times, values = (np.append(history, samples[0]) for history, samples in pairs)
-        before = SignalTrace(channel.name, channel.unit, times, values, held)
-    return SignalTrace(channel.name, channel.unit, channel.times, channel.values, held, before)

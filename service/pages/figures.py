@@ -7,11 +7,7 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import plotly, signals
 from service.figures.noise import noise_group_keys, plot_noise_sweep
-from service.figures.plotly import Abscissa, Figure
-from service.figures.posterior import plot_posterior
-from service.figures.theme import Theme
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import load_run
 from service.pages.diagnostics import plot_residual_tests
@@ -27,10 +23,11 @@ from service.repositories.jobs import JobRepository
 from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.sweeps.summary import summarise_job
-
-FigureName = Literal[
-    "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
-]
+from sysid.figures import plotly, signals
+from sysid.figures.plotly import Abscissa, Figure
+from sysid.figures.posterior import plot_posterior
+from sysid.figures.theme import Theme
+from sysid.identification.figures import FigureName
 
 
 class FigureChoice(BaseModel):

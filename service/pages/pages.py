@@ -10,13 +10,8 @@ import yaml
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.core.text import join_estimate
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import signals
 from service.figures.noise import noise_group_keys, noise_sweep_height
-from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
-from service.figures.posterior import posterior_height
-from service.figures.residuals import residuals_height
 from service.formats.file_kinds import SUFFIXES
 from service.jobs.stored_run import StoredRun
 from service.models import models
@@ -48,6 +43,11 @@ from service.runs.runs import parse_filters
 from service.storage.tables import Dataset, Job, Run
 from service.sweeps.schemas import NoiseSweepIn
 from sysid.core.settings import SEARCH_METHODS
+from sysid.core.text import join_estimate
+from sysid.figures import signals
+from sysid.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
+from sysid.figures.posterior import posterior_height
+from sysid.figures.residuals import residuals_height
 
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100

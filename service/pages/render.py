@@ -4,6 +4,7 @@ The files are the package's own, and Plotly from its installed wheel. Nothing is
 servers.
 """
 
+import base64
 import gzip
 import hashlib
 from dataclasses import dataclass
@@ -91,3 +92,35 @@ def render_template(template: str, **context: Any) -> str:
 def load_stylesheet() -> Markup:
     """Load the style sheet of pages and reports."""
     return Markup((STATIC_FOLDER / "lagid.css").read_text(encoding="utf-8"))
+
+
+@cache
+def security_policy() -> str:
+    """Content security policy: only the report's two scripts, identified by hashes."""
+    hashes = " ".join(
+        f"'sha256-{_script_hash(script)}'" for script in (plotly_script(), draw_script())
+    )
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
+    )
+
+
+@cache
+def plotly_script() -> Markup:
+    """Load the Plotly bundle as the content of a script element."""
+    return _to_script(plotly_path().read_text(encoding="utf-8"))
+
+
+@cache
+def draw_script() -> Markup:
+    """Load the script that draws the figures, as the content of a script element."""
+    return _to_script((STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
+
+
+def _to_script(text: str) -> Markup:
+    # In a string or a regular expression, <\/ means </ and does not end the element.
+    return Markup(text.replace("</script", "<\\/script"))
+
+
+def _script_hash(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(str(script).encode()).digest()).decode()

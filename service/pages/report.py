@@ -5,11 +5,8 @@ summary and the best and worst runs. It has SVG figures and no scripts, so that 
 runs remain available at the service as CSV and JSON.
 """
 
-import base64
-import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
 from typing import Any
 
 from markupsafe import Markup
@@ -17,14 +14,10 @@ from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
-from service.figures import plotly, signals
-from service.figures.embed import strip_template, templates_json, to_script_json
-from service.figures.plotly import Figure
-from service.figures.posterior import plot_posterior
+from service.figures.embed import strip_template, templates_json, to_script_json, write_figures
 from service.figures.svg import is_drawable, to_svg
 from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
-from service.pages import render
 from service.pages.cell_grid import MAX_LISTED_RUNS, GridView, build_cell_grid
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
 from service.pages.diagnostics import plot_residual_tests
@@ -35,7 +28,13 @@ from service.pages.figure_data import (
 )
 from service.pages.figures import FigureChoice, load_noise_figure
 from service.pages.pages import load_full_run, load_run_row
-from service.pages.render import load_stylesheet, render_template
+from service.pages.render import (
+    draw_script,
+    load_stylesheet,
+    plotly_script,
+    render_template,
+    security_policy,
+)
 from service.pages.trend import load_trend, to_trend_view
 from service.pages.views import RunView, to_job_view
 from service.repositories.jobs import JobRepository
@@ -44,6 +43,9 @@ from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
+from sysid.figures import plotly, signals
+from sysid.figures.plotly import Figure
+from sysid.figures.posterior import plot_posterior
 
 MAX_RANKED_RUNS = 10
 MAX_FAILED_RUNS = 20
@@ -213,17 +215,6 @@ def render_job_report(session: Session, store: ObjectStore, job_id: str, base_ur
     )
 
 
-@cache
-def security_policy() -> str:
-    """Content security policy: only the report's two scripts, identified by hashes."""
-    hashes = " ".join(
-        f"'sha256-{_script_hash(script)}'" for script in (plotly_script(), draw_script())
-    )
-    return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
-    )
-
-
 def _overview_figures(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of the figures that cover all runs."""
     figure = load_noise_figure(session, job.id, FigureChoice(columns=2))
@@ -259,33 +250,4 @@ def _run_figures(
         ("Posterior", plot_posterior(*read_corner_parameters(stored))),
         ("What each island found", plotly.plot_waterfall(data)),
     ]
-    return [
-        (title, figure["layout"]["height"], to_script_json(strip_template(figure)))
-        for title, figure in titled
-        if any(_has_points(trace) for trace in figure["data"])
-    ]
-
-
-def _has_points(trace: dict[str, Any]) -> bool:
-    return len(trace["x"]) > 0
-
-
-@cache
-def plotly_script() -> Markup:
-    """Load the Plotly bundle as the content of a script element."""
-    return _to_script(render.plotly_path().read_text(encoding="utf-8"))
-
-
-@cache
-def draw_script() -> Markup:
-    """Load the script that draws the figures, as the content of a script element."""
-    return _to_script((render.STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
-
-
-def _to_script(text: str) -> Markup:
-    # In a string or a regular expression, <\/ means </ and does not end the element.
-    return Markup(text.replace("</script", "<\\/script"))
-
-
-def _script_hash(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(str(script).encode()).digest()).decode()
+    return write_figures(titled)

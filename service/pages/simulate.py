@@ -18,14 +18,10 @@ from service.core.errors import (
     Unavailable,
     to_field_errors,
 )
-from service.core.text import bracket_unit
 from service.core.validation import explain_errors
-from service.figures.data import ExperimentTraces, OutputTraces, SignalTrace
+from service.figures.csv import to_csv
 from service.figures.embed import strip_template, templates_json, to_script_json
-from service.figures.plotly import Figure, to_csv
-from service.figures.signals import plot_response
 from service.figures.simulation import apply_units, plot_simulation
-from service.figures.theme import MAX_POINTS
 from service.jobs.stored_run import StoredRun, load_run
 from service.pages.render import render_template
 from service.pages.simulate_form import (
@@ -49,8 +45,13 @@ from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
+from sysid.core.text import bracket_unit
 from sysid.core.units import multiply_units
 from sysid.data.records import Record
+from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
+from sysid.figures.plotly import Figure
+from sysid.figures.signals import plot_response
+from sysid.figures.theme import MAX_POINTS
 from sysid.models.model import Model
 
 MAX_LISTED_DATASETS = 200

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
-from service.core.text import format_number
 from service.figures.trend import trend_height
 from service.storage.tables import Job
 from service.trends.schemas import TrendOut
@@ -19,6 +18,7 @@ from service.trends.text import (
     list_notes,
 )
 from service.trends.trend import compute_trend, has_trend
+from sysid.core.text import format_number
 
 
 @dataclass(frozen=True, slots=True)

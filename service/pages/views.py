@@ -8,39 +8,20 @@ from typing import Any
 
 from service.core.job_fields import DATASETS_PATH
 from service.core.states import OPEN_STATES, StateName
-from service.core.text import format_count, format_estimate, format_interval, format_value
+from service.core.text import format_count, format_value
 from service.core.wire import Answer
 from service.jobs.schemas import JobOut
 from service.jobs.submit import to_job_out
 from service.pages.diagnostics import Diagnostics, to_diagnostics
+from service.pages.result_view import (
+    EstimateView,
+    PosteriorView,
+    to_estimate_view,
+    to_posterior_views,
+)
 from service.storage.tables import Event, Job, Run
 
 Document = Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateView:
-    """One row of the table of estimates."""
-
-    name: str
-    unit: str
-    value_text: str
-    stderr_text: str
-    interval_text: str
-    bounds_text: str
-    status: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class PosteriorView:
-    """One row of the table of the posterior."""
-
-    name: str
-    unit: str
-    median_text: str
-    interval_text: str
-    effective_samples: float
 
 
 class RunView(Answer):
@@ -167,39 +148,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         has_signals=run.signals_sha256 is not None,
         heights=heights,
         diagnostics=to_diagnostics(result),
-        posterior=[
-            _to_posterior_view(parameter)
-            for parameter in (result.get("posterior") or {}).get("parameters", ())
-        ],
-    )
-
-
-def _to_posterior_view(parameter: Document) -> PosteriorView:
-    low, high = parameter["interval95"]
-    spread = (high - low) / 4.0  # about a standard deviation, which gives the digits
-    return PosteriorView(
-        name=parameter["name"],
-        unit=parameter["unit"],
-        median_text=format_estimate(parameter["median"], spread)[0],
-        interval_text=format_interval((low, high), spread),
-        effective_samples=parameter["effective_samples"],
-    )
-
-
-def to_estimate_view(estimate: Document) -> EstimateView:
-    """Build a row of the table from an entry of the result's ``parameters``."""
-    stderr = estimate["stderr"]
-    value, error = format_estimate(estimate["value"], stderr)
-    bounds = [estimate[name] for name in ("lower", "upper") if estimate[name] is not None]
-    return EstimateView(
-        name=estimate["name"],
-        unit=estimate["unit"],
-        value_text=value,
-        stderr_text=error,
-        interval_text=format_interval(estimate["interval95"], stderr),
-        bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=estimate["status"],
-        reason=estimate["reason"] or "",
+        posterior=to_posterior_views(result),
     )
 
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from service.core.text import format_number
-from service.figures import theme
 from service.paper import figures, published
 from service.paper.bench import METHODS, MethodRun, StudyBench
 from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.oscillators import format_estimate
+from sysid.core.text import format_number
+from sysid.figures import theme
 
 TITLE = "Table 4, Figures 20 and 21: pneumatic actuator"
 # The paper's proposed column, with k_b = k_a: only then P_a and θ determine the parameters. The

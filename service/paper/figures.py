@@ -1,4 +1,4 @@
-"""Draw the study's figures that compare methods, in the layout of `service.figures.plotly`."""
+"""Draw the study's figures that compare methods, in the layout of `sysid.figures.plotly`."""
 
 from collections.abc import Mapping, Sequence
 from math import ceil, floor, log10
@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from service.core.text import append_unit
-from service.figures import theme
-from service.figures.data import Floats
-from service.figures.plotly import Figure, base_layout, to_json_numbers
 from service.paper.bench import MethodRun
+from sysid.core.text import append_unit
+from sysid.figures import theme
+from sysid.figures.data import Floats
+from sysid.figures.plotly import Figure, base_layout, to_json_numbers
 
 Line = dict[str, Any]
 _METHOD_STYLES: Mapping[str, dict[str, Any]] = {

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from service.figures import theme
 from service.paper import figures, force_noise, published
 from service.paper.bench import METHODS, StudyBench
 from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.oscillators import EXAMPLE_1, list_readings, record_body
+from sysid.figures import theme
 
 SIGMAS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 QUANTILES = (0.1, 0.5, 0.9)

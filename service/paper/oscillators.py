@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from service.core.text import format_number, join_estimate
-from service.figures.data import Floats
 from service.paper import figures, published
 from service.paper.bench import METHODS, MethodRun, StudyBench
 from service.paper.cramer_rao import cramer_rao_bound
 from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.published import PublishedColumns
+from sysid.core.text import format_number, join_estimate
 from sysid.data.records import Channel
+from sysid.figures.data import Floats
 from sysid.models.catalogue.load import load_model
 
 

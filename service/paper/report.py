@@ -6,8 +6,13 @@ from datetime import UTC, datetime
 from markupsafe import Markup
 
 from service.figures.embed import strip_template, templates_json, to_script_json
-from service.pages import report
-from service.pages.render import load_stylesheet, render_template
+from service.pages.render import (
+    draw_script,
+    load_stylesheet,
+    plotly_script,
+    render_template,
+    security_policy,
+)
 from service.paper.document import Plot, Section, describe_check
 
 
@@ -18,10 +23,10 @@ def render_report(sections: Sequence[Section], *, quick: bool) -> str:
         sections=sections,
         made=datetime.now(UTC),
         quick=quick,
-        policy=report.security_policy(),
+        policy=security_policy(),
         style=load_stylesheet(),
-        plotly_code=report.plotly_script(),
-        draw=report.draw_script(),
+        plotly_code=plotly_script(),
+        draw=draw_script(),
         templates=templates_json(),
         figure_json=_figure_json,
         verdict=describe_check,

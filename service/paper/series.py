@@ -3,11 +3,11 @@
 from math import exp, factorial
 from typing import Any
 
-from service.core.text import format_number
-from service.figures import theme
 from service.paper import figures
 from service.paper.bench import StudyBench
 from service.paper.document import Plot, ReportTable, Section
+from sysid.core.text import format_number
+from sysid.figures import theme
 
 RATE, END_TIME = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)

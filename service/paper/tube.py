@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.figures import theme
 from service.paper import figures, published
 from service.paper.bench import METHODS, MethodRun, StudyBench
 from service.paper.document import Check, Plot, ReportTable, Section
 from service.paper.oscillators import format_estimate
+from sysid.figures import theme
 
 LENGTH_M = 40
 PARAMETER_NAMES = ("K", "T", "L")

@@ -7,7 +7,6 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.text import plain_estimate, plain_unit
 from service.jobs.results import read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import (
@@ -17,6 +16,7 @@ from service.runs.schemas import (
     ComparisonOut,
 )
 from service.storage.errors import RowNotFound
+from sysid.core.text import plain_estimate, plain_unit
 
 ResultDocument = Mapping[str, Any]
 

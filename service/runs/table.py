@@ -7,12 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.text import append_unit, escape_formula
+from service.core.text import escape_formula
 from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
+from sysid.core.text import append_unit
 
 RUNS_PER_PART = 500
 COLUMNS = (

@@ -6,7 +6,7 @@ All functions take the document of ``GET /v1/jobs/{id}/trend``.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from service.core.text import (
+from sysid.core.text import (
     DASH,
     append_unit,
     format_number,

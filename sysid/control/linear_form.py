@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from sysid.core.errors import SysidError
+from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Hold
 from sysid.kernels.reads import is_difference
@@ -46,7 +47,7 @@ class Covariance:
     matrix: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class IdentifiedModel:
     """A model with values for all its parameters.
 
@@ -74,8 +75,15 @@ class IdentifiedModel:
     version: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        values = (
+            f"  {value.name} = {plain_estimate(value.value, value.stderr)}{plain_unit(value.unit)}"
+            for value in self.values
+        )
+        return "\n".join([f"Identified model {self.model.name!r}", *values])
+
     @property
-    def value_by_name(self) -> dict[str, float]:
+    def parameter_values(self) -> dict[str, float]:
         """Values by name."""
         return {value.name: value.value for value in self.values}
 
@@ -144,7 +152,7 @@ def to_linear_form(identified: IdentifiedModel, period: float | None) -> LinearF
     """
     model = identified.model
     clock = "k" if is_difference(model) else "t"
-    numbers = identified.value_by_name
+    numbers = identified.parameter_values
 
     def substitute_known(node: Expression) -> Expression | None:
         match node:

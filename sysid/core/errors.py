@@ -9,6 +9,9 @@
     - InvalidSettings      a setting of the search or of the problem is invalid
     - DivergedEverywhere   every candidate of a search diverged
     - NothingIdentifiable  no free parameter has an effect on the output
+    - UnknownParameter     a result has no parameter of that name
+    - UnreadableResult     a file of a result or of an identified model cannot be used
+    - MissingLibrary       a call needs a library that is not installed
 
 A message says what was wrong, what was read, and what would be right. Numerical kernels never
 raise. They return ``nan`` or ``inf``, and the caller decides.
@@ -23,7 +26,16 @@ _MAX_NAMES = 30
 
 
 class SysidError(Exception):
-    """Base class of the errors that the numerical core raises on purpose."""
+    """Base class of the errors that the numerical core raises on purpose.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_model("fopd")
+    ... except SysidError as error:
+    ...     print(error)
+    there is no model 'fopd'; did you mean 'fopdt'?
+    """
 
 
 class InvalidBounds(SysidError, ValueError):
@@ -118,6 +130,34 @@ class NothingIdentifiable(SysidError, ValueError):
         super().__init__(
             f"none of {', '.join(names)} has an effect on the output in these data. Check the "
             "inputs: an input that is always zero excites nothing."
+        )
+
+
+class UnknownParameter(SysidError, KeyError):
+    """A result has no parameter of that name."""
+
+    def __init__(self, name: str, valid: Iterable[str]) -> None:
+        self.message = f"there is no parameter {name!r}{suggest_name(name, valid)}"
+        super().__init__(self.message)
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class UnreadableResult(SysidError, ValueError):
+    """A file of a result or of an identified model cannot be read or written."""
+
+    def __init__(self, path: object, detail: str) -> None:
+        super().__init__(f"{path}: {detail}")
+
+
+class MissingLibrary(SysidError, ImportError):
+    """A call needs a library that is not installed."""
+
+    def __init__(self, call: str, library: str) -> None:
+        super().__init__(
+            f"{call} needs {library}, which is not installed. Install it with "
+            "pip install 'lagid[notebook]'"
         )
 
 

@@ -39,6 +39,11 @@ class SequenceSearch:
     With ``kind="paper"`` the step stays fixed. With ``kind="adaptive"`` the search learns step
     sizes and directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the
     range.
+
+    Examples
+    --------
+    >>> GeneticAlgorithm(sequence=SequenceSearch(kind="paper", beta=0.02)).sequence.beta
+    0.02
     """
 
     kind: SequenceKind = "adaptive"
@@ -53,7 +58,13 @@ class SequenceSearch:
 
 @dataclass(frozen=True, slots=True)
 class Migration:
-    """Migration between islands: interval in generations, topology, number of migrants."""
+    """Migration between islands: interval in generations, topology, number of migrants.
+
+    Examples
+    --------
+    >>> GeneticAlgorithm(migration=Migration(every=50, migrants=1)).migration.topology
+    'one-way-ring'
+    """
 
     every: int = 25
     topology: TopologyName = "one-way-ring"
@@ -87,6 +98,11 @@ class Stop:
       random restarts and nine of ten of those nearby.
 
     Only the adaptive sequence search makes restarts, so the paper's methods never stop by it.
+
+    Examples
+    --------
+    >>> GeneticAlgorithm(stop=Stop(seconds=10)).stop.settled
+    6
     """
 
     evaluations: int | None = None
@@ -108,7 +124,13 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class IslandChange:
-    """Settings of one island that differ from the archipelago's; None: the same."""
+    """Settings of one island that differ from the archipelago's; None: the same.
+
+    Examples
+    --------
+    >>> GeneticAlgorithm(islands=(IslandChange(), IslandChange(bits=12))).n_islands
+    2
+    """
 
     method: SearchMethod | None = None
     bits: int | None = None
@@ -136,6 +158,13 @@ class GeneticAlgorithm:
         None: 4 for ``improved``, 1 for the two methods of the paper, which has no islands.
     safe_limit : float or None
         Fitness above which an individual is invalid (section 3), in the output's unit.
+
+    Examples
+    --------
+    A larger search than the default, for a model with many minima:
+
+    >>> GeneticAlgorithm(population=200, generations=1000, islands=8).n_islands
+    8
     """
 
     method: SearchMethod = "improved"
@@ -206,6 +235,13 @@ class Loss:
     (`sysid.identification.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
     squares with coloured residuals and an integrating model
     (`sysid.identification.noise_model_choice`), else ``white``.
+
+    Examples
+    --------
+    Outliers beyond about 0.5 of the output's unit count less:
+
+    >>> Loss("soft-l1", scale=0.5).kind
+    'soft-l1'
     """
 
     kind: LossKind = "squares"

@@ -32,6 +32,11 @@ class Noise:
         N ≥ 3 of Eq. 20.
     mean : float
         χ of Eq. 19.
+
+    Examples
+    --------
+    >>> Noise(sigma=0.05, seed=1)
+    Noise(sigma=0.05, seed=1, kind='gaussian', terms=12, mean=0.0)
     """
 
     sigma: float = 0.0

@@ -1,11 +1,12 @@
 """Recordings: channels on their own times, segments, and records for a model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
-from typing import NamedTuple
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
@@ -13,6 +14,17 @@ from sysid.data.holds import HOLDS as HOLDS
 from sysid.data.holds import Hold as Hold
 from sysid.data.holds import HoldChoice, choose_hold
 from sysid.data.holds import HoldSetting as HoldSetting
+from sysid.data.tables import (
+    Column,
+    Labelled,
+    align_starts,
+    describe_object,
+    is_labelled,
+    read_columns,
+    read_numbers,
+    read_times,
+    split_series,
+)
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -50,15 +62,25 @@ def measure_sampling(times: FloatArray, within: float = REGULARITY_TOLERANCE) ->
 
 
 class History(NamedTuple):
-    """Samples before a channel's first: times (s, not decreasing) and values."""
+    """Samples before a channel's first: times (s, not decreasing) and values.
+
+    Examples
+    --------
+    >>> Channel("u", [0, 1], [2, 3], history=History([-2, -1], [1, 1])).total_samples
+    4
+    """
 
     times: FloatArray
     values: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Channel:
     """One measured signal on its own times.
+
+    Times and values may be lists or arrays of any library, of shape (N,) or (N, 1); they are kept
+    as arrays of float64. ``Channel(name, series)`` takes both from a series of pandas or xarray.
+    Dates become seconds from the first one.
 
     Attributes
     ----------
@@ -78,19 +100,38 @@ class Channel:
     Raises
     ------
     InvalidRecord
-        If the arrays differ in length or are empty, or the times decrease or are not finite. The
-        same holds for the history.
+        If the arrays hold no numbers, differ in length or are empty, or the times decrease or are
+        not finite. The same holds for the history.
+
+    Examples
+    --------
+    >>> Channel("P1", [0.0, 0.1, 0.2], [1.0, 1.2, 1.1], unit="bar")
+    Channel 'P1' [bar]: 3 samples, every 0.1 s, from 0 to 0.2 s, values from 1 to 1.2
     """
 
     name: str
     times: FloatArray
-    values: FloatArray
+    values: FloatArray = field(default=None)  # type: ignore[arg-type]  # of a series: in `times`
     unit: str = "1"
     hold: HoldSetting = "auto"
     history: History | None = None
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
+    _started_at: datetime | None = field(default=None, init=False, repr=False)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            name: str,
+            times: ArrayLike | Labelled,
+            values: ArrayLike | None = None,
+            unit: str = "1",
+            hold: HoldSetting = "auto",
+            history: History | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
+        self._read_arrays()
         if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
             raise InvalidRecord(
                 f"channel {self.name!r} has times of shape {self.times.shape} and values of shape "
@@ -100,6 +141,34 @@ class Channel:
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
         if self.history is not None:
             self._check_history(self.history)
+
+    def __repr__(self) -> str:
+        unit = "" if self.unit == "1" else f" [{self.unit}]"
+        return f"Channel {self.name!r}{unit}: {_describe_samples(self)}"
+
+    def _read_arrays(self) -> None:
+        """Read times and values of any kind, once; arrays of float64 are kept as they are."""
+        name: object = self.name
+        if not isinstance(name, str):
+            raise InvalidRecord(f"a channel has the name {name!r}; need a text")
+        owner, times, unit = f"channel {self.name!r}", self.times, None
+        values: Any = self.values
+        if values is None:
+            axis, values, unit = split_series(times, owner)
+        else:
+            axis = read_times(times, f"the times of {owner}")
+        object.__setattr__(self, "times", axis.seconds)
+        object.__setattr__(self, "values", read_numbers(values, owner))
+        object.__setattr__(self, "_started_at", axis.started_at)
+        if unit is not None and self.unit == "1":
+            object.__setattr__(self, "unit", unit)
+        if self.history is not None:
+            before, earlier = self.history
+            history = History(
+                read_numbers(before, f"the history of {owner}"),
+                read_numbers(earlier, f"the history of {owner}"),
+            )
+            object.__setattr__(self, "history", history)
 
     def _check_history(self, history: History) -> None:
         before, values = history
@@ -181,6 +250,102 @@ class Channel:
         return replace(self, history=history)
 
 
+Channels: TypeAlias = Channel | Sequence[Channel] | Labelled
+"""What is read as channels: one, several, or a table or series of another library."""
+
+_MAX_LISTED = 12  # channels in the text of a record
+
+
+def to_channels(groups: Sequence[tuple[Channels, str]]) -> list[tuple[Channel, ...]]:
+    """Read groups of channels on one time axis; each group has a name for messages.
+
+    Series of dates keep their distance: all are in seconds from the first date of any of them.
+
+    Raises
+    ------
+    InvalidRecord
+        If an object is no channel and has none, or times or values cannot be read.
+    """
+    read = [tuple(_iterate_channels(group, owner)) for group, owner in groups]
+    starts = [channel._started_at for group in read for channel in group]
+    shifts = align_starts(starts)
+    if any(shifts):
+        shifted = iter(shifts)
+        read = [tuple(_shift_clock(channel, next(shifted)) for channel in one) for one in read]
+    return read
+
+
+def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
+    if isinstance(group, Channel):
+        yield group
+    elif is_labelled(group):
+        columns = read_columns(group, owner)
+        for column in columns:
+            yield to_channel(column, f"signal{columns.index(column) + 1}")
+    elif isinstance(group, Sequence) and not isinstance(group, str):
+        for item in group:
+            if not (isinstance(item, Channel) or is_labelled(item)):
+                raise InvalidRecord(
+                    f"{owner} has {describe_object(item)} in its list; need channels"
+                )
+            yield from _iterate_channels(item, owner)
+    else:
+        raise InvalidRecord(
+            f"{owner}: found {describe_object(group)}; need a channel, several, or a table or "
+            "series with names and times"
+        )
+
+
+def to_channel(column: Column, otherwise: str = "") -> Channel:
+    """Read a column of a table as a channel; `otherwise` is its name if it has none."""
+    axis = column.axis
+    channel = Channel(column.name or otherwise, axis.seconds, column.values, column.unit)
+    object.__setattr__(channel, "_started_at", axis.started_at)
+    return channel
+
+
+def _shift_clock(channel: Channel, seconds: float) -> Channel:
+    """Return the same channel with its times from an earlier date."""
+    if channel._started_at is None or not seconds:
+        return channel
+    history = channel.history
+    if history is not None:
+        history = history._replace(times=history.times + seconds)
+    shifted = replace(channel, times=channel.times + seconds, history=history)
+    object.__setattr__(shifted, "_started_at", channel._started_at - timedelta(seconds=seconds))
+    return shifted
+
+
+def _describe_samples(channel: Channel) -> str:
+    finite = channel.values[np.isfinite(channel.values)]
+    missing = channel.values.size - finite.size
+    text = f"{channel.sampling}, {_describe_range(channel.times[0], channel.times[-1])} s"
+    if finite.size:
+        text += f", values {_describe_range(np.min(finite), np.max(finite))}"
+    if missing:
+        text += f", {missing} missing"
+    before = channel.history
+    return text if before is None else f"{text}, {before.times.size} samples before"
+
+
+def _describe_span(record: "Record | Recording") -> str:
+    return f"{_describe_range(record.start, record.stop)} s"
+
+
+def _describe_range(first: float, last: float) -> str:
+    return f"from {first:.4g} to {last:.4g}"
+
+
+def _list_channels(role: str, channels: Sequence[Channel]) -> list[str]:
+    lines = [
+        f"  {role}{channel.name}{'' if channel.unit == '1' else f' [{channel.unit}]'}: "
+        f"{_describe_samples(channel)}"
+        for channel in channels[:_MAX_LISTED]
+    ]
+    left = len(channels) - _MAX_LISTED
+    return [*lines, f"  and {left} more"] if left > 0 else lines
+
+
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A part of a recording that was measured on its own, such as one repeat of a test.
@@ -195,9 +360,13 @@ class Segment:
     labels: Mapping[str, float | str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Recording:
     """All channels of one dataset, without roles; without segments it is one measurement.
+
+    The channels may be a table of pandas, xarray or polars, or a mapping of lists. Its times are
+    the index, or the column ``t`` or ``time``, in seconds or as dates. Dates become seconds from
+    the first one, which is kept.
 
     Attributes
     ----------
@@ -206,11 +375,43 @@ class Recording:
     started_at : datetime or None
         Time 0 s on the clock that recorded; None if it is not known. Without a zone it is local
         time of an unknown zone.
+
+    Examples
+    --------
+    >>> Recording({"t": [0.0, 0.5, 1.0], "P1 [bar]": [1.0, 1.2, 1.1], "P2 [bar]": [0.0, 0.1, 0.3]})
+    Recording of 2 channels, from 0 to 1 s
+      P1 [bar]: 3 samples, every 0.5 s, from 0 to 1 s, values from 1 to 1.2
+      P2 [bar]: 3 samples, every 0.5 s, from 0 to 1 s, values from 0 to 0.3
     """
 
     channels: tuple[Channel, ...]
     segments: tuple[Segment, ...] = ()
     started_at: datetime | None = None
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            channels: Channels,
+            segments: tuple[Segment, ...] = (),
+            started_at: datetime | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        channels = to_channels([(self.channels, "the recording")])[0]
+        object.__setattr__(self, "channels", channels)
+        if self.started_at is None:
+            starts = (channel._started_at for channel in channels)
+            first = next((start for start in starts if start is not None), None)
+            object.__setattr__(self, "started_at", first)
+
+    def __repr__(self) -> str:
+        parts = f", {len(self.segments)} segments" if self.segments else ""
+        count = len(self.channels)
+        head = f"Recording of {count} channel{'s' if count != 1 else ''}{parts}"
+        if not count:
+            return head
+        return "\n".join([f"{head}, {_describe_span(self)}", *_list_channels("", self.channels)])
 
     def channel(self, name: str) -> Channel:
         """Return the channel of a name.
@@ -394,13 +595,42 @@ def _to_output(channel: Channel, role: str) -> Channel:
     return replace(channel, name=role, history=None)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Record:
-    """One experiment of a model: channels have the names of the model's signals."""
+    """One experiment of a model: inputs and outputs, each one channel or several.
+
+    A side may be a channel, a sequence of channels, or a table or series of pandas, xarray or
+    polars. If the times are dates, all channels are in seconds from the first date of any of them.
+    Only a `Recording` keeps the date. Channels usually have the names of the model's signals.
+
+    Examples
+    --------
+    >>> t = [0.0, 0.1, 0.2, 0.3]
+    >>> Record(Channel("u", t, [0, 1, 1, 1], unit="%"), Channel("y", t, [20.0, 20.0, 20.4, 20.7]))
+    Record, from 0 to 0.3 s
+      input u [%]: 4 samples, every 0.1 s, from 0 to 0.3 s, values from 0 to 1
+      output y: 4 samples, every 0.1 s, from 0 to 0.3 s, values from 20 to 20.7
+    """
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+
+    if TYPE_CHECKING:
+
+        def __init__(self, inputs: Channels, outputs: Channels, name: str = "") -> None: ...
+
+    def __post_init__(self) -> None:
+        sides = [(self.inputs, "the input side"), (self.outputs, "the output side")]
+        inputs, outputs = to_channels(sides)
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "outputs", outputs)
+
+    def __repr__(self) -> str:
+        title = f"Record {self.name!r}" if self.name else "Record"
+        sides = (*_list_channels("input ", self.inputs), *_list_channels("output ", self.outputs))
+        span = f", {_describe_span(self)}" if sides else ", without channels"
+        return "\n".join([title + span, *sides])
 
     @property
     def history_duration(self) -> float:

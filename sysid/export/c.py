@@ -185,7 +185,7 @@ def _write_array_size(program: GeneratedProgram, name: str) -> str:
 def _write_identified_function(program: GeneratedProgram, stem: str) -> str:
     identified = program.identified
     lines = [f"{stem}_parameters {stem}_identified(void)", "{", f"    {stem}_parameters p;"]
-    numbers = identified.value_by_name
+    numbers = identified.parameter_values
     lines += [
         f"    p.{program.parameter_names[item.name]} = {write_number(numbers[item.name])};"
         for item in identified.model.parameters

@@ -69,6 +69,12 @@ def export_model(
         If a value is missing or unknown, or an option cannot be used.
     NotLinear
         If the format is ``control`` and the model has no transfer function.
+
+    Examples
+    --------
+    >>> values = {"K": 3.0, "T": 1.0, "L": 0.5, "y0": 0.0, "x(0)": 0.0}
+    >>> "tf(" in export_model(load_model("fopdt"), values, "control")
+    True
     """
     holds = dict(hold or {})
     if isinstance(result, Identification):

@@ -140,7 +140,7 @@ def _write_docstring(identified: IdentifiedModel) -> str:
 
 def _write_signature(program: GeneratedProgram) -> str:
     identified = program.identified
-    numbers = identified.value_by_name
+    numbers = identified.parameter_values
     required = [
         program.start_names[state.name]
         for i, state in enumerate(identified.model.states)

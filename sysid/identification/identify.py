@@ -1,18 +1,19 @@
 """Identify a model from records, in this process."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
 
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
 from sysid.data.noise import Noise
-from sysid.data.records import Record
+from sysid.identification.arguments import Change, Data, check_kinds, read_changes, read_records
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
+from sysid.identification.fitted_data import collect_fitted_data
 from sysid.identification.result import Identification
 from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.state import RunState
+from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.delays import check_unused_settings
-from sysid.models.model import Model
 from sysid.models.units import check_signal_units
 from sysid.simulation.problem import Problem
 
@@ -20,17 +21,18 @@ _PROGRESS_SECONDS = 0.25
 
 
 def identify(
-    model: Model,
-    records: Record | Sequence[Record],
+    model: ModelSource,
+    records: Data | Sequence[Data],
     settings: GeneticAlgorithm | None = None,
     *,
+    channels: Mapping[str, str] | None = None,
     seed: int = 1,
-    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    parameters: Mapping[str, Change] | None = None,
     prediction: PredictionKind = "simulation",
     loss: Loss | None = None,
     weights: Mapping[str, float] | None = None,
     skip: int = 0,
-    validation: Record | Sequence[Record] | None = None,
+    validation: Data | Sequence[Data] | None = None,
     validation_fraction: float | None = None,
     noise: Noise | None = None,
     warm: Mapping[str, float] | None = None,
@@ -43,15 +45,31 @@ def identify(
 
     Parameters
     ----------
-    records : Record or sequence of Record
-        Experiments that are fitted jointly.
+    model : Model, str, Path or mapping
+        A name of the catalogue such as ``"fopdt"``, a YAML or JSON file, a document, or a model.
+    records : Record, Recording, table, or sequence of them
+        Experiments that are fitted jointly. A table is one of pandas, xarray or polars, or a
+        mapping of lists, with its time as index or in a column ``t`` or ``time``.
     settings : GeneticAlgorithm
         The improved algorithm with its defaults if not given.
+    channels : mapping of str to str
+        Model's signal → name of its channel. A signal that is not given takes the channel of its
+        name. If as many channels are left as signals, their order decides, inputs first. A warning
+        of the result says so.
     seed : int
         The same seed gives the same result, bit for bit.
-    parameters, prediction, loss, weights, skip
-        See `sysid.core.settings.FitSettings`.
-    validation : Record or sequence of Record
+    parameters : mapping
+        Changes by parameter: its bounds ``{"L": (0, 2)}``, a fixed value ``{"K": 1.5}``, or fields
+        ``{"T": {"upper": 2, "scale": "log"}}`` (lower, upper, scale, fixed, tied).
+    prediction : {"simulation", "one-step"}
+        Fit the free run, or predictions one sample ahead.
+    loss : Loss
+        Squares by default, or soft-l1 for data with outliers; the noise model.
+    weights : mapping of str to float
+        Weight of each output. Default: 1 for one output, else 1 / its standard deviation.
+    skip : int
+        First samples of each output that are not compared.
+    validation : Record, Recording, table, or sequence of them
         Data that are not used for the estimate.
     validation_fraction : float
         Instead of `validation`: the last part of each record. Simulation covers the whole record.
@@ -64,30 +82,64 @@ def identify(
     progress : callable
         Receives the run's state several times a second.
 
+    Returns
+    -------
+    Identification
+        Estimates with their errors and statuses, and the evidence; `Identification.plot` draws it.
+
     Raises
     ------
     DivergedEverywhere
         If no candidate gave a finite simulation.
+    UnknownModel, InvalidModel
+        If the model cannot be found or has faults.
     InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
         If an argument cannot be used.
+
+    Examples
+    --------
+    A step of 2 % at 1 s; the answer follows 0.5 s later with a time constant of 1 s.
+
+    >>> t = [0.1 * k for k in range(100)]
+    >>> u = [2.0 if time >= 1 else 0.0 for time in t]
+    >>> y = [3 * (1 - 2.718281828 ** -(time - 1.5)) if time > 1.5 else 0.0 for time in t]
+    >>> found = identify("fopdt", {"t": t, "u": u, "y": y})
+    >>> round(found["L"].value, 2)
+    0.5
     """
-    algorithm = settings or GeneticAlgorithm()
-    whole, validation_records = (
-        _to_records(records),
-        None if validation is None else _to_records(validation),
+    check_kinds(
+        {
+            "settings": settings,
+            "loss": loss,
+            "noise": noise,
+            "seed": seed,
+            "skip": skip,
+            "weights": weights,
+            "warm": warm,
+            "validation_fraction": validation_fraction,
+        }
     )
-    check_unused_settings(model, len(whole), parameters, weights)
+    algorithm = settings or GeneticAlgorithm()
+    model = resolve_model(model)
+    whole, notes = read_records(model, records, channels)
+    validation_records = (
+        None if validation is None else read_records(model, validation, channels)[0]
+    )
+    changes = read_changes(parameters)
+    check_unused_settings(model, len(whole), changes, weights)
     check_signal_units(model, (*whole, *(validation_records or ())))
-    fit = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip)
+    fit = FitSettings(changes, prediction, loss or Loss(), weights, skip)
     prepared = prepare_records(whole, validation_records, validation_fraction, noise)
-    problem, validation_problem = build_problems(model, prepared, fit)
-    return conclude_run(
+    problem, validation_problem = problems = build_problems(model, prepared, fit)
+    found = conclude_run(
         problem,
         algorithm,
         _run_search(problem, algorithm, seed, warm, progress),
         validation_problem,
         posterior=posterior,
     )
+    data = collect_fitted_data(model, prepared, problems, found)
+    return replace(found, warnings=(*notes, *found.warnings), data=data)
 
 
 def _run_search(
@@ -103,7 +155,3 @@ def _run_search(
         if progress is not None:
             progress(state)
     return state
-
-
-def _to_records(records: Record | Sequence[Record]) -> tuple[Record, ...]:
-    return (records,) if isinstance(records, Record) else tuple(records)

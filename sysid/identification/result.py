@@ -2,16 +2,24 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal
 
+from sysid.core.errors import UnknownParameter
+from sysid.core.settings import LossKind
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
-from sysid.models.model import SelectedTerm
+from sysid.data.records import Record
+from sysid.models.model import Model, SelectedTerm
 from sysid.residuals.onset_delay import OnsetDelay
-from sysid.residuals.residual_tests import ResidualTests
+from sysid.residuals.residual_tests import CorrelationFunction, ResidualTests
 from sysid.search.state import Improvement, IslandSummary, Migrant
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Posterior, Uncertainty
+
+if TYPE_CHECKING:
+    from sysid.figures.theme import Theme
+    from sysid.identification.figures import FigureName
 
 CHI_SQUARE_95 = 3.841
 """Quantile of χ² with one degree of freedom."""
@@ -102,8 +110,36 @@ class InputHold:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FittedData:
+    """What an identification was made from, for its figures and to simulate it again.
+
+    Attributes
+    ----------
+    model : Model
+        The model as it was given, before terms were selected.
+    records, validation : tuple of Record
+        Signals of the model in its order. With added noise, as they were compared.
+    is_part : bool
+        Whether the outputs of `validation` are the last parts of those in `records`. The inputs
+        are then those of the whole record.
+    correlations : tuple of CorrelationFunction
+        Correlation functions of the residuals that were tested.
+    loss : {"squares", "soft-l1"}
+    """
+
+    model: Model
+    records: tuple[Record, ...]
+    validation: tuple[Record, ...]
+    is_part: bool
+    correlations: tuple[CorrelationFunction, ...]
+    loss: LossKind = "squares"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Identification:
     """The result of one identification.
+
+    In a notebook it shows a table of the estimates, the fit, the verdicts and the warnings.
 
     Attributes
     ----------
@@ -137,6 +173,19 @@ class Identification:
         that, the first value is assumed.
     posterior : Posterior or None
         None if it was not requested.
+    data : FittedData or None
+        Model and records, from `identify`; None in a result of the service's workers.
+
+    Examples
+    --------
+    >>> t = [0.1 * k for k in range(100)]
+    >>> u = [1.0 if time >= 1 else 0.0 for time in t]
+    >>> y = [3 * (1 - 2.718281828 ** -(time - 1.5)) if time > 1.5 else 0.0 for time in t]
+    >>> found = identify("fopdt", {"t": t, "u": u, "y": y})
+    >>> found["K"].status
+    'identified'
+    >>> sorted(found.parameter_values)
+    ['K', 'L', 'T', 'x(0)', 'y0']
     """
 
     estimates: tuple[Estimate, ...]
@@ -169,6 +218,98 @@ class Identification:
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
     posterior: Posterior | None = None
+    data: FittedData | None = None
+
+    def __getitem__(self, name: str) -> Estimate:
+        """Return the estimate of a parameter.
+
+        Raises
+        ------
+        UnknownParameter
+            If there is none; the message suggests the nearest.
+        """
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
+        raise UnknownParameter(str(name), [estimate.name for estimate in self.estimates])
+
+    def __repr__(self) -> str:
+        from sysid.identification.summary import summarise_result
+
+        return summarise_result(self)
+
+    def _repr_html_(self) -> str:
+        from sysid.identification.summary import to_html
+
+        return to_html(self)
+
+    @property
+    def parameter_values(self) -> dict[str, float]:
+        """Values of all parameters by name, as `simulate` takes them."""
+        return {estimate.name: estimate.value for estimate in self.estimates}
+
+    def plot(self, *names: "FigureName", experiment: int = 0, theme: "Theme" = "light") -> Any:
+        """Draw figures one below the other, as a figure of Plotly.
+
+        Without names: measured against identified output with the residuals, their correlation
+        functions, the correlation of the estimates, and what each island of the search found.
+
+        Parameters
+        ----------
+        *names : {"response", "residuals", "correlation", "waterfall", "history", "convergence", \
+"posterior"}
+            The figures to draw.
+        experiment : int
+            Which record, from 0, if there are several.
+        theme : {"light", "dark"}
+
+        Raises
+        ------
+        MissingLibrary
+            If Plotly is not installed.
+        InvalidSettings
+            If there is no such figure or record.
+        """
+        from sysid.identification.figures import plot_result
+
+        return plot_result(self, names, experiment, theme)
+
+    def to_pandas(self) -> Any:
+        """Return the estimates as a table of pandas, one row for each parameter.
+
+        Raises
+        ------
+        MissingLibrary
+            If pandas is not installed.
+        """
+        from sysid.identification.summary import to_frame
+
+        return to_frame(self)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the result with model and records to a JSON file.
+
+        Raises
+        ------
+        UnreadableResult
+            If the file cannot be written.
+        """
+        from sysid.identification.saved_result import write_result
+
+        write_result(self, path)
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> "Identification":
+        """Read a result that `save` wrote; every number is the same.
+
+        Raises
+        ------
+        UnreadableResult
+            If the file cannot be read, or is something else.
+        """
+        from sysid.identification.saved_result import read_result
+
+        return read_result(path)
 
     @property
     def holds(self) -> dict[str, Hold]:

@@ -42,6 +42,11 @@ class Parameter:
     InvalidBounds
         If a bound is not finite, ``lower >= upper``, a log scale starts at or below zero, or
         `fixed` lies outside the bounds.
+
+    Examples
+    --------
+    >>> Parameter("L", 0.0, 5.0, unit="s").is_free
+    True
     """
 
     name: str

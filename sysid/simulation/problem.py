@@ -61,6 +61,14 @@ class Problem:
         Weight of each output, from the settings or computed from the records.
     simulates_only : bool
         Whether every parameter is fixed and nothing is compared with the records.
+
+    Examples
+    --------
+    >>> t = [0.1 * k for k in range(100)]
+    >>> record = Record(Channel("u", t, [k > 9 for k in range(100)]), Channel("y", t, t))
+    >>> problem = Problem.build(load_model("fopdt"), [record], parameters={"y0": {"fixed": 0}})
+    >>> [parameter.name for parameter in problem.free_parameters]
+    ['K', 'T', 'L', 'x(0)']
     """
 
     model: Model

@@ -30,6 +30,12 @@ class Estimate:
         Standard error, in `unit`. If it is None, `reason` says why.
     interval95 : tuple of float or None
         95 % interval by the t distribution.
+
+    Examples
+    --------
+    >>> lag = Estimate("L", "s", 0.52, 0.0, 5.0, 0.01, (0.50, 0.54), "identified")
+    >>> f"{lag.name} = {lag.value} ± {lag.stderr} {lag.unit}"
+    'L = 0.52 ± 0.01 s'
     """
 
     name: str
@@ -41,6 +47,11 @@ class Estimate:
     interval95: tuple[float, float] | None
     status: EstimateStatus
     reason: str = ""
+
+    @property
+    def is_free(self) -> bool:
+        """Whether it was estimated, that is, neither fixed nor tied."""
+        return self.status not in ("fixed", "tied")
 
 
 @dataclass(frozen=True, slots=True)

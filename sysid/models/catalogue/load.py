@@ -4,19 +4,26 @@ from collections.abc import Mapping
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from sysid.core.errors import Fault, InvalidModel, UnknownModel
 from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 _CATALOGUE_FOLDER = Path(__file__).parent
 
 
 @cache
 def catalogue() -> tuple[str, ...]:
-    """List the names of the built-in models, in alphabetical order."""
+    """List the names of the built-in models, in alphabetical order.
+
+    Examples
+    --------
+    >>> "fopdt" in catalogue()
+    True
+    """
     return tuple(sorted(path.stem for path in _CATALOGUE_FOLDER.glob("*.yaml")))
 
 
@@ -43,12 +50,51 @@ def load_model(source: str | Mapping[str, Any] | Path) -> Model:
         If the catalogue has no such name.
     InvalidModel
         If the file or the document has faults.
+
+    Examples
+    --------
+    >>> [parameter.name for parameter in load_model("fopdt").parameters]
+    ['K', 'T', 'L', 'y0']
     """
     if isinstance(source, Path):
         return parse_model(read_document(source))
     if isinstance(source, str):
         return _load_catalogue_model(source)
     return parse_model(source)
+
+
+ModelSource: TypeAlias = Model | str | Path | Mapping[str, Any]
+"""A model, its name in the catalogue, its file, or its document."""
+
+
+def resolve_model(source: ModelSource) -> Model:
+    """Load a model as `load_model` does, and also from a text that names a file.
+
+    A text that ends in ``.yaml``, ``.yml`` or ``.json`` is a file. It must come from the user of
+    this process, not from a request.
+
+    Raises
+    ------
+    UnknownModel
+        If the catalogue has no such name.
+    InvalidModel
+        If the file or the document has faults, or the object is nothing of these.
+    """
+    if isinstance(source, Model):
+        return source
+    given: object = source
+    if not isinstance(given, str | Path | Mapping):
+        kind = type(given).__name__
+        raise InvalidModel(
+            [
+                Fault(
+                    "",
+                    f"found an object of type {kind}; need a model, a name, a file or a document",
+                )
+            ]
+        )
+    is_file = isinstance(source, str) and source.lower().endswith(MODEL_SUFFIXES)
+    return load_model(Path(source) if is_file else source)  # type: ignore[arg-type]
 
 
 def read_document(path: Path) -> Any:

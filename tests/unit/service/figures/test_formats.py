@@ -2,15 +2,8 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.core.text import (
-    format_age,
-    format_count,
-    format_duration,
-    format_estimate,
-    format_interval,
-    format_number,
-    format_unit,
-)
+from service.core.text import format_age, format_count, format_duration
+from sysid.core.text import format_estimate, format_interval, format_number, format_unit
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from service.figures.plotly import base_layout
 from service.figures.svg import (
     MAX_LINE_POINTS,
     build_axes,
@@ -15,6 +14,7 @@ from service.figures.svg import (
     to_markup,
     to_svg,
 )
+from sysid.figures.plotly import base_layout
 
 BOX = (100.0, 500.0, 20.0, 220.0)
 SVG = "{http://www.w3.org/2000/svg}"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from service.core.text import plain_estimate
 from service.runs.comparison import find_furthest_pair
+from sysid.core.text import plain_estimate
 
 
 def estimate(value: float, stderr: float | None) -> dict[str, object]:

@@ -5,9 +5,9 @@ import typer
 
 from service.cli.sweeps import build_sweep_tables, parse_sigma_grid
 from service.figures.noise import QUANTILE_95, noise_group_keys, plot_noise_sweep
-from service.figures.theme import SERIES_DASHES
 from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
+from sysid.figures.theme import SERIES_DASHES
 
 SIGMAS = (0.0, 0.5, 1.0)
 

@@ -188,7 +188,7 @@ def test_the_loop_swings_where_the_gain_margin_says(gain: float, is_stable: bool
     step = Channel(
         loop.reference, np.array([-1e-9, 0.0, times[-1]]), np.array([5.0, 6.0, 6.0]), hold="zero"
     )
-    values = {**FOPDT.value_by_name, "x(0)": 0.0}
+    values = {**FOPDT.parameter_values, "x(0)": 0.0}
     found = loop.simulate([step], values, times=times).channel("y").values
     metrics = measure_step_response(times, found, at=0.0, before=5.0, after=6.0)
     assert metrics.is_settled == is_stable

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from service.core.text import bracket_unit
-from service.figures import theme
-from service.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTrace
-from service.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
-from service.figures.theme import MAX_POINTS, thin_indices, window_slice
+from sysid.core.text import bracket_unit
+from sysid.figures import theme
+from sysid.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTrace
+from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
+from sysid.figures.theme import MAX_POINTS, thin_indices, window_slice
 
 _GAP_PX = 20
 _HISTORY_FRACTION = 0.1  # drawn input history before the record, as a share of its duration

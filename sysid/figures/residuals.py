@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from service.figures import theme
-from service.figures.data import CorrelationTrace, Floats
-from service.figures.grid import Place, PlotGrid, add_axes, add_caption
-from service.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
+from sysid.figures import theme
+from sysid.figures.data import CorrelationTrace, Floats
+from sysid.figures.grid import Place, PlotGrid, add_axes, add_caption
+from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 
 _MARGIN = {**MARGIN, "t": 34, "b": 6}
 _BAND95 = "rgba(138,146,155,0.22)"

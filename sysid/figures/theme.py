@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.figures.data import Floats
-from service.formats.decimate import find_extremes
+from sysid.figures.data import Floats
+from sysid.figures.decimate import find_extremes
 
 Theme = Literal["light", "dark"]
 

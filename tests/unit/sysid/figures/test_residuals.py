@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.core.text import format_p_value
-from service.figures import plotly
-from service.figures.data import CorrelationTrace
-from service.figures.residuals import plot_residuals, residuals_height
+from service.figures.csv import to_csv
 from service.pages.diagnostics import to_diagnostics
+from sysid.core.text import format_p_value
+from sysid.figures.data import CorrelationTrace
+from sysid.figures.residuals import plot_residuals, residuals_height
 
 
 def trace(
@@ -77,7 +77,7 @@ def test_the_axis_says_what_a_lag_is() -> None:
 def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
     figure = plot_residuals([trace(), trace(is_auto=False)])
     json.dumps(figure, allow_nan=False)
-    rows = plotly.to_csv(figure).splitlines()
+    rows = to_csv(figure).splitlines()
     assert rows[0] == "series,x,y"
     assert sum(row.startswith("of y,") for row in rows) == 25 + 51
 

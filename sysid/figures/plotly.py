@@ -1,27 +1,19 @@
-"""Draw the figures of a run as Plotly JSON: one definition for pages, REST route and report.
+"""Draw the figures of a run as Plotly JSON: one definition for notebook, page, REST and report.
 
 A figure is a plain ``{"data": […], "layout": {…}}``. Colours that depend on the background come
-from the template (`service.figures.theme`). No line has more than `theme.MAX_POINTS` points.
+from the template (`sysid.figures.theme`). No line has more than `theme.MAX_POINTS` points.
 """
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
-from service.core.text import (
-    append_unit,
-    bracket_unit,
-    escape_formula,
-    join_estimate,
-    plain_unit,
-)
-from service.figures import theme
-from service.figures.data import Floats, FreeParameter, IslandImprovement, RunFigureData
-from service.figures.grid import Place, PlotGrid, add_axes, add_caption
-from service.figures.theme import stride_indices
+from sysid.core.text import append_unit, bracket_unit, join_estimate, plain_unit
+from sysid.figures import theme
+from sysid.figures.data import Floats, FreeParameter, IslandImprovement, RunFigureData
+from sysid.figures.grid import Place, PlotGrid, add_axes, add_caption
+from sysid.figures.theme import stride_indices
 
 Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
@@ -59,6 +51,11 @@ def base_layout(height: int, **options: Any) -> dict[str, Any]:
 def empty_figure() -> Figure:
     """Build a figure without data."""
     return {"data": [], "layout": base_layout(200)}
+
+
+def has_points(figure: Figure) -> bool:
+    """Test whether a figure has anything to show."""
+    return any(len(trace["x"]) > 0 for trace in figure["data"])
 
 
 def apply_theme(figure: Figure, paper: theme.Theme) -> Figure:
@@ -198,26 +195,6 @@ def plot_waterfall(run: RunFigureData) -> Figure:
             yaxis=_fitness_axis(run, data),
         ),
     }
-
-
-def to_csv(figure: Figure) -> str:
-    """Write the drawn numbers as CSV, one per row: series, x, y (and z of a matrix).
-
-    Contours are left out: they are drawn from numbers of other series.
-    """
-    sink = io.StringIO()
-    rows = csv.writer(sink, lineterminator="\n")
-    traces = [trace for trace in figure["data"] if trace["type"] != "contour"]
-    matrix = any("z" in trace for trace in traces)
-    rows.writerow(["series", "x", "y", *(["z"] if matrix else [])])
-    for trace in traces:
-        name = escape_formula(trace.get("name", ""))
-        if "z" in trace:
-            for y, line in zip(trace["y"], trace["z"], strict=True):
-                rows.writerows((name, x, y, z) for x, z in zip(trace["x"], line, strict=True))
-        else:
-            rows.writerows((name, x, y) for x, y in zip(trace["x"], trace["y"], strict=True))
-    return sink.getvalue()
 
 
 def _abscissa_value(point: IslandImprovement, abscissa: Abscissa) -> int:

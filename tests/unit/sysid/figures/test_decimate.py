@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.formats.decimate import decimate
+from sysid.figures.decimate import decimate
 
 
 @given(st.integers(1, 500), st.integers(2, 60), st.integers(0, 2**32 - 1))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from service.figures.data import CornerParameter, Floats
-from service.figures.plotly import to_csv
-from service.figures.posterior import (
+from service.figures.csv import to_csv
+from sysid.figures.data import CornerParameter, Floats
+from sysid.figures.posterior import (
     MAX_SHOWN,
     choose_shown,
     estimate_region,

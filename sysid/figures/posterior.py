@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from service.core.text import append_unit
-from service.figures import theme
-from service.figures.data import CornerParameter, Floats
-from service.figures.grid import add_axes
-from service.figures.plotly import Figure, base_layout, empty_figure, to_json_numbers
-from service.figures.theme import stride_indices
+from sysid.core.text import append_unit
+from sysid.figures import theme
+from sysid.figures.data import CornerParameter, Floats
+from sysid.figures.grid import add_axes
+from sysid.figures.plotly import Figure, base_layout, empty_figure, to_json_numbers
+from sysid.figures.theme import stride_indices
 
 MAX_SHOWN = 6
 """Parameters that a corner plot shows."""

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.figures import plotly, signals
-from service.figures.data import (
+from service.figures.csv import to_csv
+from sysid.figures import plotly, signals
+from sysid.figures.data import (
     ExperimentTraces,
     FreeParameter,
     IslandImprovement,
@@ -15,7 +16,7 @@ from service.figures.data import (
     RunFigureData,
     SignalTrace,
 )
-from service.figures.theme import (
+from sysid.figures.theme import (
     MAX_POINTS,
     SERIES_COLOURS,
     SERIES_DASHES,
@@ -24,7 +25,7 @@ from service.figures.theme import (
     thin_indices,
     window_slice,
 )
-from service.pages.figure_data import fitness_label
+from sysid.identification.figures import label_fitness
 
 
 def island(points: int, start: float = 100.0) -> list[IslandImprovement]:
@@ -232,11 +233,11 @@ def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
-    lines = plotly.to_csv(signals.plot_signals([signal(3, "a,b")])).splitlines()
+    lines = to_csv(signals.plot_signals([signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
-    assert plotly.to_csv(plotly.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
-    line = plotly.to_csv(signals.plot_signals([signal(3, "=1+1")])).splitlines()[1]
+    assert to_csv(plotly.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
+    line = to_csv(signals.plot_signals([signal(3, "=1+1")])).splitlines()[1]
     assert line.startswith("'=1+1")  # no formula in a spreadsheet
 
 
@@ -282,8 +283,8 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
 
 @pytest.mark.parametrize("draw", [plotly.plot_history, plotly.plot_waterfall])
 def test_a_robust_loss_is_not_called_the_rms(draw):
-    robust = fitness_label({"loss": {"kind": "soft-l1", "scale": 0.1}})
+    robust = label_fitness("soft-l1")
     shown = draw(run(fitness_label=robust))["layout"]["yaxis"]["title"]["text"]
     assert shown == "soft-l1 loss, as RMS [kPa]"
-    plain = draw(run(fitness_label=fitness_label({})))
+    plain = draw(run(fitness_label=label_fitness("squares")))
     assert plain["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"

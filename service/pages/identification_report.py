@@ -1,0 +1,70 @@
+"""Render an identification of this process as one HTML file, without a job or a database."""
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import yaml
+
+from service.figures.embed import templates_json, write_figures
+from service.pages.render import (
+    draw_script,
+    load_stylesheet,
+    plotly_script,
+    render_template,
+    security_policy,
+)
+from service.pages.result_view import to_result_view
+from service.runs.result import to_result_document
+from sysid.identification.figures import draw_figures, list_experiments
+from sysid.identification.result import Identification
+from sysid.identification.summary import find_output_unit
+
+MAX_EXPERIMENTS = 4
+
+
+def render_identification_report(
+    found: Identification, title: str, facts: Mapping[str, str], seconds: float, request: str
+) -> str:
+    """Render the report of a result with its data: tables, figures, model, request.
+
+    Parameters
+    ----------
+    facts : mapping of str to str
+        What else the first section shows, such as the file of the recording.
+    request : str
+        The request as text.
+    """
+    assert found.data is not None
+    unit = find_output_unit(found)
+    document = yaml.safe_dump(
+        dict(found.data.model.document), sort_keys=False, allow_unicode=True, width=100
+    )
+    return render_template(
+        "report_identification.html",
+        run=to_result_view(to_result_document(found, seconds), unit, title),
+        facts=list(facts.items()),
+        figures=write_figures(_draw_all(found)),
+        model=document,
+        request=request,
+        version=version("lagid"),
+        policy=security_policy(),
+        style=load_stylesheet(),
+        plotly_code=plotly_script(),
+        draw=draw_script(),
+        templates=templates_json(),
+    )
+
+
+def _draw_all(found: Identification) -> list[tuple[str, dict[str, Any]]]:
+    """Draw the figures of a job's report, in its order."""
+    experiments = range(min(len(list_experiments(found)), MAX_EXPERIMENTS))
+    each = [
+        titled
+        for name in ("response", "residuals")
+        for experiment in experiments
+        for titled in draw_figures(found, [name], experiment)
+    ]
+    others = draw_figures(found, ["convergence", "correlation", "posterior", "waterfall"])
+    distinct = dict(each)
+    return [*draw_figures(found, ["history"]), *distinct.items(), *others]

@@ -1,0 +1,384 @@
+"""Read arrays and tables of other libraries as channels: pandas, xarray, polars, lists.
+
+No such library is imported. An object is recognised by what it offers: a table has `columns`, a
+series has an `index`, an array of xarray has `dims`. A name such as ``P1 [bar]`` is split into
+name and unit; of xarray and pandas the attribute ``units`` is the unit.
+
+Times are seconds. Dates become seconds from the first of them, and time spans become seconds.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any, NamedTuple, TypeAlias
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.core.errors import InvalidRecord, suggest_name
+from sysid.core.types import FloatArray
+from sysid.core.units import find_conversion_factor
+
+Labelled: TypeAlias = Any
+"""A table, series or array of another library, with names and times."""
+
+_NAME_WITH_UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]+)\]\s*")
+_TIME_NAMES = ("t", "time")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MIXED_ZONES = "some dates have a time zone and others have none; give all of them one"
+_NEED_TIMES = "need seconds, dates or time spans"
+
+
+class TimeAxis(NamedTuple):
+    """Times (s), and the first date if they were dates; it has a zone if they have."""
+
+    seconds: FloatArray
+    started_at: datetime | None = None
+
+
+class Column(NamedTuple):
+    """A named series of values with its times; the values are not read yet."""
+
+    name: str
+    unit: str
+    axis: TimeAxis
+    values: Any
+
+
+def read_numbers(source: ArrayLike, owner: str) -> FloatArray:
+    """Read numbers of shape (N,) or (N, 1) as an array (N,) of float64 that compiled code takes.
+
+    Raises
+    ------
+    InvalidRecord
+        If there is text, a date or a complex number, or another shape; `owner` begins the message.
+    """
+    if type(source) is np.ndarray and source.dtype == np.float64:
+        array = source
+    else:
+        array = _convert_numbers(source, owner)
+    if array.ndim == 2 and array.shape[1] == 1:
+        array = array[:, 0]
+    return np.require(array, np.float64, ["C", "A", "W"])
+
+
+def _convert_numbers(source: ArrayLike, owner: str) -> FloatArray:
+    kind = _find_kind(source)
+    if kind in "mMUSTcV":
+        what = {"m": "time spans", "M": "dates", "c": "complex numbers", "V": "records"}
+        raise InvalidRecord(f"{owner} has {what.get(kind, 'text')}; need numbers")
+    if isinstance(source, np.ma.MaskedArray):
+        return np.asarray(np.ma.filled(source.astype(np.float64), np.nan))
+    try:
+        return np.asarray(source, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        numbers = _read_missing_as_nan(source)
+        if numbers is None:
+            raise InvalidRecord(f"{owner} cannot be read as numbers: {error}") from None
+        return numbers
+
+
+def _read_missing_as_nan(source: Any) -> FloatArray | None:
+    """Read a series of pandas in which a missing value is no number."""
+    try:
+        return np.asarray(source.to_numpy(dtype=np.float64, na_value=np.nan))
+    except (AttributeError, TypeError, ValueError):
+        return None
+
+
+def _find_kind(source: Any) -> str:
+    """Find the kind of an array's elements as NumPy letters do; ``T`` is any text."""
+    name = str(getattr(source, "dtype", ""))
+    if name.startswith("datetime64"):
+        return "M"
+    try:
+        array = np.asarray(source)
+    except (TypeError, ValueError):  # rows of different length
+        return "O"
+    if array.dtype.kind != "O":
+        return array.dtype.kind
+    first = next((item for item in array.flat if item is not None and item == item), None)
+    if isinstance(first, str | bytes):
+        return "T"
+    return "M" if isinstance(first, datetime) else "m" if isinstance(first, timedelta) else "O"
+
+
+def read_times(source: Any, owner: str) -> TimeAxis:
+    """Read seconds, dates or time spans of shape (N,) or (N, 1).
+
+    Raises
+    ------
+    InvalidRecord
+        If they are none of these, or one is missing; `owner` begins the message.
+    """
+    if type(source) is np.ndarray and source.dtype == np.float64:
+        return TimeAxis(read_numbers(source, owner))
+    kind = _find_kind(source)
+    if kind == "M":
+        return _read_dates(source, owner)
+    if kind == "m":
+        spans = np.asarray(source, dtype="timedelta64[ns]").ravel()
+        _refuse_missing(spans, owner)
+        return TimeAxis(np.asarray(spans.astype(np.int64) * 1e-9, dtype=np.float64))
+    if kind in "UST":
+        first = str(next(iter(np.asarray(source).flat)))
+        raise InvalidRecord(
+            f"{owner} are text such as {first!r}; {_NEED_TIMES}. pandas.to_datetime reads dates."
+        )
+    return TimeAxis(read_numbers(source, owner))
+
+
+def _read_dates(source: Any, owner: str) -> TimeAxis:
+    if str(getattr(source, "dtype", "object")) == "object":
+        return _read_date_objects(source, owner)
+    dates = np.asarray(source, dtype="datetime64[ns]").ravel()
+    _refuse_missing(dates, owner)
+    if not dates.size:
+        return TimeAxis(np.zeros(0))
+    nanoseconds = dates.astype(np.int64)
+    first = _EPOCH + timedelta(microseconds=int(nanoseconds[0]) // 1000)
+    kind = getattr(source, "dtype", None)
+    named = getattr(kind, "time_zone", None)  # of polars; pandas has the zone itself
+    zone = ZoneInfo(named) if isinstance(named, str) else getattr(kind, "tz", None)
+    started = first.replace(tzinfo=None) if zone is None else first.astimezone(zone)
+    return TimeAxis(np.asarray((nanoseconds - nanoseconds[0]) * 1e-9, dtype=np.float64), started)
+
+
+def _read_date_objects(source: Any, owner: str) -> TimeAxis:
+    dates = list(np.asarray(source, dtype=object).flat)
+    for date in dates:
+        if not isinstance(date, datetime) or date != date:
+            raise InvalidRecord(f"{owner} have {date!r} among dates; need a date at every sample")
+    try:
+        seconds = [(date - dates[0]).total_seconds() for date in dates]
+    except TypeError:
+        raise InvalidRecord(f"{owner}: {_MIXED_ZONES}") from None
+    first = dates[0].to_pydatetime() if hasattr(dates[0], "to_pydatetime") else dates[0]
+    return TimeAxis(np.array(seconds, dtype=np.float64), first)
+
+
+def _refuse_missing(times: NDArray[Any], owner: str) -> None:
+    missing = np.flatnonzero(np.isnat(times))
+    if missing.size:
+        raise InvalidRecord(
+            f"{owner} have {missing.size} missing dates, the first at sample {missing[0] + 1}; "
+            "need a date at every sample"
+        )
+
+
+def is_labelled(source: Any) -> bool:
+    """Test whether an object is a table, series or array with names, and no plain array."""
+    return _find_reader(source) is not None
+
+
+def split_series(source: Any, owner: str) -> tuple[TimeAxis, Any, str]:
+    """Split a single series with its own times into times, values and unit.
+
+    Raises
+    ------
+    InvalidRecord
+        If it is none, or has no times.
+    """
+    columns = read_columns(source, owner) if is_labelled(source) else []
+    if len(columns) != 1:
+        raise InvalidRecord(
+            f"{owner} has no values. Give times and values, or one series whose index is the time."
+        )
+    return columns[0].axis, columns[0].values, columns[0].unit
+
+
+def read_columns(source: Labelled, owner: str, names: Sequence[str] | None = None) -> list[Column]:
+    """Read the columns of a table, series, array of xarray or mapping of arrays.
+
+    The values stay unread. With `names` only these columns are listed, in this order.
+
+    Raises
+    ------
+    InvalidRecord
+        If the object is not labelled or has no times, a name is missing or occurs twice.
+    """
+    reader = _find_reader(source)
+    if reader is None:
+        raise InvalidRecord(f"{owner}: {describe_object(source)} has no names of channels")
+    columns = reader(source, owner)
+    by_name = {column.name: column for column in columns}
+    if len(by_name) < len(columns):
+        twice = next(c.name for c in columns if sum(d.name == c.name for d in columns) > 1)
+        raise InvalidRecord(f"{owner} has more than one column {twice!r}; rename one")
+    if names is None:
+        return columns
+    for name in names:
+        if name not in by_name:
+            raise InvalidRecord(f"{owner} has no column {name!r}{suggest_name(name, by_name)}")
+    return [by_name[name] for name in names]
+
+
+def describe_object(source: Any) -> str:
+    """Describe a wrong object in a few words, such as ``the text 'a.csv'``."""
+    if isinstance(source, str):
+        return f"the text {source if len(source) < 60 else source[:57] + '…'!r}"
+    shape = getattr(source, "shape", None)
+    size = f" of shape {tuple(shape)}" if isinstance(shape, tuple) else ""
+    return f"an object of type {type(source).__name__}{size}"
+
+
+def _find_reader(source: Any) -> Callable[[Any, str], list[Column]] | None:
+    if isinstance(source, type):
+        return None
+    if hasattr(source, "data_vars"):
+        return _read_dataset
+    if hasattr(source, "dims") and hasattr(source, "coords"):
+        return _read_data_array
+    if hasattr(source, "columns") and hasattr(source, "__getitem__"):
+        return _read_frame
+    if hasattr(source, "index") and hasattr(source, "name") and hasattr(source, "to_numpy"):
+        return _read_series
+    if isinstance(source, Mapping):
+        return lambda table, owner: _read_mapping(table, owner)
+    return _read_structured if getattr(getattr(source, "dtype", None), "names", None) else None
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Split a name such as ``P1 [bar]`` into name and unit."""
+    match = _NAME_WITH_UNIT.fullmatch(name)
+    return (match[1], match[2].strip()) if match else (name, None)
+
+
+def _read_series(series: Any, owner: str) -> list[Column]:
+    axis = _read_index(series.index, owner)
+    if axis is None:
+        raise InvalidRecord(
+            f"{owner}: the index of the series counts its rows. Set the time as its index, in "
+            "seconds or as dates."
+        )
+    name, unit = _name_column(series.name, series, "")
+    return [Column(name, unit, axis, series)]
+
+
+def _read_frame(frame: Any, owner: str) -> list[Column]:
+    names = list(frame.columns)
+    if any(isinstance(name, tuple) for name in names):
+        raise InvalidRecord(f"{owner}: the table has names of several levels; flatten them")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InvalidRecord(f"{owner} has more than one column {twice!r}; rename one")
+    index = getattr(frame, "index", None)
+    axis = None if index is None else _read_index(index, owner)
+    return _read_mapping({name: frame[name] for name in names}, owner, axis)
+
+
+def _read_structured(array: Any, owner: str) -> list[Column]:
+    return _read_mapping({name: array[name] for name in array.dtype.names}, owner)
+
+
+def _read_mapping(
+    table: Mapping[Any, Any], owner: str, axis: TimeAxis | None = None
+) -> list[Column]:
+    """Read columns over an axis, else over the column that has the times."""
+    names = list(table)
+    if axis is None:
+        name = _find_time_column(table)
+        if name is None:
+            raise InvalidRecord(
+                f"{owner} has no times. Name the column of seconds or dates 't' or 'time', or make "
+                f"it the index. Columns: {', '.join(map(str, names)) or 'none'}"
+            )
+        axis = _read_labelled_times(name, table[name], f"the times of {owner}")
+        names.remove(name)
+    named = [(*_name_column(name, table[name], str(name)), table[name]) for name in names]
+    return [Column(name, unit, axis, values) for name, unit, values in named]
+
+
+def _find_time_column(table: Mapping[Any, Any]) -> Any | None:
+    """Find the column of times by its name, else the only one that has dates."""
+    for name in table:
+        if split_unit(str(name))[0].lower() in _TIME_NAMES:
+            return name
+    dated = [name for name, values in table.items() if _find_kind(values) == "M"]
+    return dated[0] if len(dated) == 1 else None
+
+
+def _read_index(index: Any, owner: str) -> TimeAxis | None:
+    """Read the times of an index; None if it only counts rows."""
+    name = getattr(index, "name", None)
+    label = "" if name is None else str(name)
+    counts_rows = _find_kind(index) in "iu" and split_unit(label)[0].lower() not in _TIME_NAMES
+    if counts_rows or getattr(index, "nlevels", 1) > 1:
+        return None
+    return _read_labelled_times(label, index, f"the index of {owner}: its times")
+
+
+def _read_labelled_times(label: Any, source: Any, owner: str) -> TimeAxis:
+    """Read times whose label may have their unit, such as ``t [ms]``."""
+    axis, unit = read_times(source, owner), split_unit(str(label))[1]
+    if unit is None or axis.started_at is not None or _find_kind(source) == "m":
+        return axis
+    size = find_conversion_factor(unit, "s")
+    if size is None:
+        raise InvalidRecord(f"{owner} are in {unit!r}, which is no unit of time such as s or min")
+    return TimeAxis(axis.seconds * size)
+
+
+def _read_dataset(dataset: Any, owner: str) -> list[Column]:
+    return [
+        column for name in dataset.data_vars for column in _read_data_array(dataset[name], owner)
+    ]
+
+
+def _read_data_array(array: Any, owner: str) -> list[Column]:
+    """Read an array of xarray over its dimension of time; another one lists channels."""
+    label = f"array {array.name!r} of {owner}" if array.name is not None else owner
+    times = [name for name in array.dims if _is_time(array, name)]
+    others = [name for name in array.dims if name not in times[:1]]
+    if not times or len(others) > 1:
+        raise InvalidRecord(
+            f"{label} has dimensions {', '.join(map(str, array.dims)) or 'none'}; need one of time "
+            "with its coordinate, and at most one of channels"
+        )
+    axis = _read_labelled_times(times[0], array.coords[times[0]], f"the times of {label}")
+    if not others:
+        return [Column(*_name_column(array.name, array, ""), axis, array)]
+    parts = [array.isel({others[0]: number}) for number in range(array.sizes[others[0]])]
+    names = (
+        [str(part.coords[others[0]].item()) for part in parts]
+        if others[0] in array.coords
+        else [f"{array.name or others[0]}{number + 1}" for number in range(len(parts))]
+    )
+    return [
+        Column(*_name_column(name, part, name), axis, part)
+        for name, part in zip(names, parts, strict=True)
+    ]
+
+
+def _is_time(array: Any, name: Any) -> bool:
+    if name not in array.coords:
+        return False
+    is_named = split_unit(str(name))[0].lower() in _TIME_NAMES
+    return is_named or _find_kind(array.coords[name]) in "mMf"
+
+
+def _name_column(name: Any, values: Any, otherwise: str) -> tuple[str, str]:
+    """Name and unit of a column, from its label and its attributes."""
+    plain, unit = split_unit(otherwise if name is None else str(name))
+    attributes = getattr(values, "attrs", None) or {}
+    unit = unit or attributes.get("units") or attributes.get("unit")
+    return plain, str(unit or "1")
+
+
+def align_starts(starts: Iterable[datetime | None]) -> list[float]:
+    """Compute the seconds by which series of dates start after the first of them.
+
+    Series of seconds are not shifted.
+
+    Raises
+    ------
+    InvalidRecord
+        If only some of the dates have a time zone.
+    """
+    known = list(starts)
+    try:
+        first = min((start for start in known if start is not None), default=_EPOCH)
+        return [0.0 if start is None else (start - first).total_seconds() for start in known]
+    except TypeError:
+        raise InvalidRecord(_MIXED_ZONES) from None

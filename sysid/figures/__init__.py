@@ -1,0 +1,1 @@
+"""Figures of one run, as plain Plotly JSON: one definition for all who draw them."""

@@ -1,0 +1,134 @@
+"""Read what a user gives to `identify`: recordings and tables, channels, changes of parameters."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from numbers import Integral, Real
+from typing import Any, TypeAlias
+
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.data.noise import Noise
+from sysid.data.records import Channel, Record, Recording, to_channel
+from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns, split_unit
+from sysid.models.model import Model
+from sysid.models.signals import assign_channels, assign_record
+
+Data: TypeAlias = Record | Recording | Labelled
+"""One recording: a record, a recording without roles, or a table of another library."""
+Change: TypeAlias = Mapping[str, Any] | Sequence[float] | float
+"""Change of a parameter: its fields, its two bounds, or its fixed value."""
+
+
+def read_records(
+    model: Model, data: Data | Sequence[Data], channels: Mapping[str, str] | None
+) -> tuple[tuple[Record, ...], tuple[str, ...]]:
+    """Read recordings as records of a model, with notes about what was assumed.
+
+    A recording of several segments gives one record for each.
+
+    Raises
+    ------
+    InvalidRecord
+        If an object is no recording, or a signal has no channel.
+    InvalidSettings
+        If `channels` names a signal or channel that does not exist.
+    """
+    check_kinds({"channels": channels})
+    each = data if isinstance(data, list | tuple) else [data]
+    parts = [part for one in each for part in _read_one(model, one, channels)]
+    notes = dict.fromkeys(note for _, note in parts if note)
+    return tuple(record for record, _ in parts), tuple(notes)
+
+
+def _read_one(
+    model: Model, data: Data, channels: Mapping[str, str] | None
+) -> Iterator[tuple[Record, str]]:
+    if isinstance(data, Record):
+        yield assign_record(model, data, channels)
+        return
+    if isinstance(data, Recording):
+        assigned = assign_channels(model, data.names, channels)
+        recording = data
+    elif is_labelled(data):
+        columns = read_columns(data, "the table")
+        plain = {key: split_unit(str(name))[0] for key, name in (channels or {}).items()}
+        assigned = assign_channels(model, [column.name for column in columns], plain)
+        used = set(assigned.by_signal.values())
+        recording = Recording(tuple(to_channel(c) for c in columns if c.name in used))
+    else:
+        raise InvalidRecord(_describe_wrong_data(data))
+    inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
+    outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
+    for record in recording.to_records(inputs, outputs):
+        yield record, assigned.note
+
+
+def _describe_wrong_data(data: object) -> str:
+    found = f"found {describe_object(data)}; need a record, a recording or a table"
+    if isinstance(data, str):
+        return f"{found}. Read a file first, with read_recording"
+    if isinstance(data, Channel):
+        return f"{found}. Join channels in a record: Record(inputs, outputs)"
+    return f"{found} with named columns"
+
+
+def check_kinds(values: Mapping[str, object]) -> None:
+    """Check the kinds of the arguments of `identify` that are values of their own.
+
+    Raises
+    ------
+    InvalidSettings
+        If one is of another kind; the message says what it may be.
+    """
+    for name, value in values.items():
+        kinds, need = _KINDS[name]
+        is_flag = isinstance(value, bool) and bool not in kinds
+        if value is not None and (is_flag or not isinstance(value, kinds)):
+            raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
+
+
+_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+    "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
+    "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
+    "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
+    "loss": ((Loss,), "Loss(…), such as Loss('soft-l1', scale=0.5)"),
+    "noise": ((Noise,), "Noise(…), such as Noise(sigma=0.1)"),
+    "seed": ((Integral,), "a whole number"),
+    "skip": ((Integral,), "a number of samples"),
+    "weights": ((Mapping,), "a mapping of outputs to numbers"),
+    "warm": ((Mapping,), "a mapping of parameters to values"),
+    "validation_fraction": ((Real,), "a number between 0 and 1"),
+}
+
+
+def read_changes(
+    parameters: Mapping[str, Change] | None,
+) -> dict[str, Mapping[str, Any]]:
+    """Read changes of parameters: ``{"L": (0, 2)}`` are bounds, ``{"K": 1.5}`` fixes a value.
+
+    Raises
+    ------
+    InvalidSettings
+        If a change is neither of these nor a mapping of a parameter's fields.
+    """
+    if parameters is None:
+        return {}
+    check_kinds({"parameters": parameters})
+    return {name: _read_change(name, change) for name, change in parameters.items()}
+
+
+def _read_change(name: str, change: object) -> Mapping[str, Any]:
+    if isinstance(change, Mapping):
+        return change
+    if _is_number(change):
+        return {"fixed": change}
+    if isinstance(change, list | tuple) and len(change) == 2 and all(map(_is_number, change)):
+        return {"lower": change[0], "upper": change[1]}
+    raise InvalidSettings(
+        f"/parameters/{name}",
+        f"found {change!r}; need bounds (lower, upper), one number that fixes it, or fields such "
+        "as {'upper': 2}",
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)

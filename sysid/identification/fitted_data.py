@@ -1,0 +1,67 @@
+"""Collect what an identification was made from, with the correlation of its residuals."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+from sysid.identification.fit_problems import FitRecords, ProblemPair
+from sysid.identification.result import FittedData, Identification
+from sysid.models.model import Model
+from sysid.residuals.past_outputs import count_past_output_coefficients
+from sysid.residuals.residual_tests import compute_correlations, list_residual_series
+from sysid.simulation.problem import Problem
+
+
+def collect_fitted_data(
+    model: Model, records: FitRecords, problems: ProblemPair, found: Identification
+) -> FittedData:
+    """Collect model and records of a result, and correlate its residuals with both sides' lags."""
+    problem, validation_problem = problems
+    validation = tuple(
+        replace(_select_signals(model, record), inputs=_select_signals(model, run).inputs)
+        for record, run in zip(records.validation or (), records.validation_runs or (), strict=True)
+    )
+    tested, simulated = (
+        (problem, found.simulated)
+        if validation_problem is None
+        else (validation_problem, found.simulated_validation)
+    )
+    counts = {}
+    if problem.prediction == "one-step" and validation_problem is None:
+        counts = count_past_output_coefficients(problem.model, problem.all_parameters)
+    series = list_residual_series(tested, _join_outputs(tested, simulated), found.correlation_times)
+    correlations = compute_correlations(
+        [one._replace(coefficients=counts.get(one.output, 0)) for one in series]
+    )
+    return FittedData(
+        model,
+        tuple(_select_signals(model, record) for record in records.estimation),
+        validation,
+        records.scored_from is not None,
+        tuple(correlations),
+        problem.loss.kind,
+    )
+
+
+def _select_signals(model: Model, record: Record) -> Record:
+    """Select the signals of a model, in its order."""
+    inputs = {channel.name: channel for channel in record.inputs}
+    outputs = {channel.name: channel for channel in record.outputs}
+    return replace(
+        record,
+        inputs=tuple(inputs[signal.name] for signal in model.inputs),
+        outputs=tuple(outputs[output.name] for output in model.outputs),
+    )
+
+
+def _join_outputs(problem: Problem, simulated: Sequence[Sequence[FloatArray]]) -> FloatArray:
+    """Join simulated outputs to values (M,) of a problem; parts that are not scored are missing."""
+    values = np.full(problem.evaluator.measured.size, np.nan)
+    places = problem.split_by_output(np.arange(values.size, dtype=np.float64))
+    for rows, outputs in zip(places, simulated, strict=True):
+        for row, part in zip(rows.values(), outputs, strict=True):
+            values[row[row.size - part.size :].astype(np.int64)] = part
+    return values

@@ -1,0 +1,90 @@
+"""`lagid identify --report`: one file with the tables and figures of the result."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.pages.render import plotly_script
+from tests.commands import check_refusal, run_lagid
+from tests.rest import recording
+
+QUICK = ("--set", "algorithm.population=40", "--set", "algorithm.generations=60")
+WORDS = ("--model", "fopdt", "--set", "validation.fraction=0.3", *QUICK)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "steps <b>.csv"
+    path.write_bytes(recording())
+    return path
+
+
+@pytest.fixture(scope="module")
+def report(data: Path) -> str:
+    path = data.parent / "report.html"
+    done = run_lagid("identify", str(data), *WORDS, "--report", str(path))
+    assert done.code == 0, done.stderr
+    assert f"report written to {path}" in done.stderr
+    return path.read_text(encoding="utf-8")
+
+
+def read_figures(report: str) -> dict[str, dict]:
+    """Figures by their titles, from the JSON that the report carries."""
+    places = re.findall(
+        r'<h2>([^<]*)</h2></header><div class="plot"[^>]*data-source="([^"]*)"', report
+    )
+    texts = dict(
+        re.findall(r'<script type="application/json" id="([^"]*)">(.*?)</script>', report, re.S)
+    )
+    return {title: json.loads(texts[place]) for title, place in places}
+
+
+def test_the_report_has_the_figures_of_a_jobs_report(report: str) -> None:
+    figures = read_figures(report)
+    assert list(figures) == [
+        "Progress of every island",
+        "Measured against identified",
+        "Correlation of the residuals",
+        "Convergence of the parameters",
+        "Correlation of the estimates",
+        "What each island found",
+    ]
+    traces = {trace["name"]: trace for trace in figures["Measured against identified"]["data"]}
+    assert len(traces["u"]["x"]) == len(traces["measured"]["x"])  # also in the validation part
+    assert figures["Measured against identified"]["layout"]["shapes"]
+
+
+def test_the_report_has_tables_model_and_request(report: str) -> None:
+    for name in ("K", "T", "L"):
+        assert f'<th scope="row">{name}</th>' in report
+    assert "independent of u" in report
+    assert "equations:" in report
+    assert "&#34;population&#34;: 40" in report
+
+
+def test_the_report_needs_no_network_and_escapes_names(report: str) -> None:
+    assert str(plotly_script()) in report
+    rest = report.replace(str(plotly_script()), "")
+    assert not re.search(r'(?:src|href)="(?!#|data:)', rest)
+    assert "steps &lt;b&gt;.csv" in rest
+    assert "steps <b>" not in rest
+    assert "default-src &#39;none&#39;" in rest
+
+
+def test_a_place_that_is_no_folder_is_refused_before_the_search(data: Path) -> None:
+    words = ["identify", str(data), "--model", "fopdt", "--report", "absent/a.html"]
+    line = check_refusal(run_lagid(*words), 2)
+    assert "--report absent/a.html: there is no folder absent" in line
+
+
+def test_a_report_without_its_libraries_is_refused_before_the_search(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    words = ["identify", str(data), "--model", "fopdt", "--report", "a.html"]
+    assert "--report needs plotly: pip install 'lagid[server]'" in check_refusal(
+        run_lagid(*words), 2
+    )

@@ -1,0 +1,487 @@
+"""What a notebook does: tables to a result, which shows, draws, saves and simulates itself."""
+
+import json
+import pickle
+import sys
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+import pytest
+
+from sysid import (
+    Channel,
+    GeneticAlgorithm,
+    Identification,
+    Loss,
+    Record,
+    Recording,
+    SysidError,
+    export_model,
+    identify,
+    load_identified,
+    load_model,
+    simulate,
+)
+from sysid.core.errors import (
+    InvalidRecord,
+    InvalidSettings,
+    MissingLibrary,
+    UnknownParameter,
+    UnreadableResult,
+)
+from sysid.identification.figures import FIGURES, draw_figures, list_experiments
+from sysid.identification.result import InputHold
+from sysid.identification.saved_result import FORMAT
+from sysid.identification.summary import summarise_result
+from sysid.models.model import Model, replace_substeps
+from sysid.residuals.residual_tests import judge_tests
+from sysid.uncertainty.estimates import Posterior
+from tests.polynomials import TRUTH as POLYNOMIAL
+from tests.polynomials import document, frols, record_of
+
+N = 240
+T = np.arange(N) * 0.5
+STEPS = np.where((T // 20) % 2 == 0, 0.0, 20.0)
+TRUTH = {"K": 0.8, "T": 6.0, "L": 3.2, "y0": 20.0, "x(0)": 0.0}
+QUICK = GeneticAlgorithm(population=32, generations=60)
+FEW = {"y0": 20.0, "K": (0.1, 2.0), "T": (1.0, 20.0), "L": (0.0, 10.0), "x(0)": 0.0}
+
+
+NO_SAMPLES = Posterior((), np.zeros((0, 3)), np.zeros((0, 0)), 0, 0, 0.0, 0, False, "no budget")
+
+
+def make_frame() -> pd.DataFrame:
+    clean = simulate("fopdt", Channel("u", T, STEPS), TRUTH).channel("y").values
+    noise = np.random.default_rng(5).normal(0.0, 0.15, N)
+    index = pd.date_range("2026-11-20 08:00", periods=N, freq="500ms", tz="Europe/Berlin")
+    table = {"Heizung [%]": STEPS.astype(np.float32), "Temperatur [°C]": clean + noise}
+    return pd.DataFrame(table, index=index)
+
+
+@pytest.fixture(scope="module")
+def frame() -> pd.DataFrame:
+    return make_frame()
+
+
+@pytest.fixture(scope="module")
+def found(frame: pd.DataFrame) -> Identification:
+    return identify("fopdt", frame, QUICK, parameters=FEW, validation_fraction=0.25)
+
+
+@pytest.fixture(scope="module")
+def sampled(frame: pd.DataFrame) -> Identification:
+    """A result of two records, with other validation data and a posterior."""
+    parts = [frame.iloc[:150], frame.iloc[100:]]
+    return identify("fopdt", parts, QUICK, parameters=FEW, validation=frame, posterior=True)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two results have the same numbers, bit for bit."""
+    if isinstance(one, Model):
+        return one.document == other.document
+    if isinstance(one, np.ndarray):
+        return one.shape == other.shape and one.tobytes() == other.tobytes()
+    if is_dataclass(one):
+        names = [field.name for field in fields(one) if field.init]
+        return all(same(getattr(one, name), getattr(other, name)) for name in names)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, float):
+        return isinstance(other, float) and (one == other or (one != one and other != other))
+    return type(one) is type(other) and one == other
+
+
+def test_a_table_of_dates_gives_the_truth_and_says_how_it_was_read(found: Identification) -> None:
+    for name in ("K", "T", "L"):
+        assert found[name].value == pytest.approx(TRUTH[name], rel=0.05)
+    assert "'u': 'Heizung', 'y': 'Temperatur'" in found.warnings[0]
+
+
+def test_every_form_of_the_same_data_gives_the_same_result(frame: pd.DataFrame) -> None:
+    u, y = (frame[name].to_numpy(np.float64) for name in frame)
+    quick = GeneticAlgorithm(population=8, islands=1, generations=3, refine=False)
+    channels = Channel("Heizung", T, u, "%"), Channel("Temperatur", T, y, "°C")
+    forms = [
+        frame,
+        Recording(channels),
+        Record(*channels),
+        {"t": list(T), "u [%]": list(u), "y [°C]": y[:, None]},
+        [frame],
+    ]
+    model = load_model("fopdt")
+    document = dict(model.document)
+    results = [identify("fopdt", form, quick, parameters=FEW) for form in forms]
+    results += [identify(source, frame, quick, parameters=FEW) for source in (model, document)]
+    results.append(identify("fopdt", frame, quick, parameters=FEW, channels={"u": "Heizung [%]"}))
+    assert {result.parameter_values["L"] for result in results} == {
+        results[0].parameter_values["L"]
+    }
+
+
+def test_bounds_and_fixed_values_have_a_short_form(found: Identification) -> None:
+    assert (found["L"].lower, found["L"].upper) == (0.0, 10.0)
+    assert (found["y0"].value, found["y0"].status) == (20.0, "fixed")
+
+
+def test_a_result_is_a_few_lines(found: Identification) -> None:
+    text = repr(found)
+    head, *rows = text.splitlines()
+    assert head.startswith(f"Identification of 'fopdt', fit {found.fit_percent:.2f} %, RMS 0.1")
+    assert "°C, validation fit" in head
+    assert rows[0].split()[:3] == ["K", *summarise_estimate(found, "K")]
+    assert all(f"  {estimate.name}" in text for estimate in found.estimates)
+    assert "residuals on validation data: " in text
+    assert len(text) < 1500
+    many = replace(found, warnings=tuple(f"number {n} " + "x" * 500 for n in range(9)))
+    assert len(repr(many)) < 1800
+    assert "and 6 more in `warnings`" in repr(many)
+
+
+def summarise_estimate(found: Identification, name: str) -> list[str]:
+    estimate = found[name]
+    row = next(line for line in summarise_result(found).splitlines() if f" {name} " in line)
+    value = float(row.split()[1])
+    assert value == pytest.approx(estimate.value, abs=estimate.stderr)
+    return row.split()[1:3]
+
+
+def test_the_html_of_a_result_is_complete_and_escaped(found: Identification) -> None:
+    evil = replace(found, warnings=("<script>alert(1)</script>", *found.warnings))
+    html = evil._repr_html_()
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html
+    for estimate in found.estimates:
+        assert f"<b>{estimate.name}</b>" in html
+    assert html.count("<li>") == len(evil.warnings)
+    assert "residuals on validation data" in html
+
+
+def test_an_estimate_has_its_name(found: Identification) -> None:
+    assert found["T"] is found.estimates[1]
+    assert found.parameter_values["T"] == found["T"].value
+    with pytest.raises(UnknownParameter, match=r"there is no parameter 'TT'; did you mean 'T'\?"):
+        found["TT"]
+    with pytest.raises(KeyError):
+        found["TT"]
+
+
+def test_estimates_are_a_table_of_pandas(found: Identification) -> None:
+    table = found.to_pandas()
+    assert list(table.index) == [estimate.name for estimate in found.estimates]
+    assert table.loc["L", "value"] == found["L"].value
+    assert table.loc["L", "low95"] == found["L"].interval95[0]
+    assert np.isnan(table.loc["y0", "stderr"])
+    assert table.loc["y0", "status"] == "fixed"
+
+
+@pytest.mark.parametrize("which", ["found", "sampled"])
+def test_a_result_is_saved_and_read_bit_for_bit(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    result = request.getfixturevalue(which)
+    path = tmp_path / "found.json"
+    result.save(path)
+    again = Identification.load(path)
+    assert same(again, result)
+    assert repr(again) == repr(result)
+    assert json.loads(path.read_text())["format"] == FORMAT
+    assert same(pickle.loads(pickle.dumps(result)), result)
+
+
+def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path) -> None:
+    odd = replace(found, rms=float("inf"), fit_percent=float("nan"), simulated=((np.zeros(0),),))
+    odd = replace(odd, posterior=NO_SAMPLES, uncertainty=None, data=None)
+    path = tmp_path / "odd.json"
+    odd.save(path)
+    assert same(Identification.load(path), odd)
+
+
+DAMAGES = [
+    (lambda d: d.update(format="lagid-model/1"), "read it with load_identified"),
+    (lambda d: d.update(format="other/7"), "its format is 'other/7'; need 'lagid-identification"),
+    (lambda d: d.pop("rms"), "/rms: found None; need this field"),
+    (lambda d: d.update(rms="many"), "/rms: found 'many'; need a number"),
+    (lambda d: d.update(rms=True), "/rms: found True; need a number"),
+    (lambda d: d.update(evaluations=1.5), "/evaluations: found 1.5; need a whole number"),
+    (lambda d: d.update(extra=1), "/: found 'extra'; need one of the fields"),
+    (lambda d: d["estimates"][0].update(status="sure"), "/estimates/0/status: found 'sure'"),
+    (lambda d: d["estimates"][0].update(interval95=[1]), "/estimates/0/interval95.*2 entries"),
+    (lambda d: d.update(warnings="none"), "/warnings: found 'none'; need a list"),
+    (lambda d: d["simulated"][0].__setitem__(0, {"shape": [3]}), "shape of an empty array"),
+    (lambda d: d["simulated"][0].__setitem__(0, ["a"]), "/simulated/0/0.*need a list of numbers"),
+    (lambda d: d["data"]["model"].pop("equations"), "equations"),
+    (lambda d: d["data"]["records"][0]["inputs"][0].update(values=[1.0]), "values of shape"),
+]
+
+
+@pytest.mark.parametrize(("damage", "told"), DAMAGES)
+def test_a_damaged_file_is_told_by_its_field(
+    found: Identification, tmp_path: Path, damage, told: str
+) -> None:
+    path = tmp_path / "found.json"
+    found.save(path)
+    document = json.loads(path.read_text())
+    damage(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(UnreadableResult, match=told) as caught:
+        Identification.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "it cannot be read: No such file"),
+        ("{", "it is not JSON"),
+        ("[1]", "found no object"),
+        ('{"parameters": [], "fit_percent": {}}', "the document of a run"),
+    ],
+)
+def test_another_file_is_told(tmp_path: Path, content: str | None, told: str) -> None:
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UnreadableResult, match=told):
+        Identification.load(path)
+
+
+def test_a_place_that_cannot_be_written_is_told(found: Identification, tmp_path: Path) -> None:
+    with pytest.raises(UnreadableResult, match="cannot be written: No such file"):
+        found.save(tmp_path / "absent" / "found.json")
+
+
+def test_simulation_repeats_what_was_identified(found: Identification) -> None:
+    record = found.data.records[0]
+    assert np.array_equal(
+        simulate("fopdt", record, found).channel("y").values, found.simulated[0][0]
+    )
+
+
+def test_simulation_of_a_table_reads_the_input_as_the_identification_did(
+    found: Identification, frame: pd.DataFrame
+) -> None:
+    answer = simulate("fopdt", frame["Heizung [%]"], found).channel("y").values
+    estimated = found.simulated[0][0]
+    assert np.allclose(answer[: estimated.size], estimated, rtol=0, atol=1e-9)
+    held = simulate("fopdt", Channel("u", T, STEPS, hold="first"), found).channel("y").values
+    assert not np.allclose(held, answer, rtol=1e-3)
+
+
+def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
+    record, model = found.data.records[0], load_model("fopdt")
+    finer = simulate(model, record, replace(found, substeps=7)).channel("y").values
+    asked = simulate(replace_substeps(model, 7), record, found.parameter_values)
+    assert np.array_equal(finer, asked.channel("y").values)
+    assert not np.array_equal(finer, found.simulated[0][0])
+
+
+def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
+    inputs, values = Channel("u", T, STEPS), found.parameter_values
+    assert inputs.resolved_hold == "zero"
+    lines = replace(found, input_holds=(InputHold("u", "first", None),))
+    answer = simulate("fopdt", inputs, lines).channel("y").values
+    asked = replace_substeps(load_model("fopdt"), found.substeps)
+    expected = simulate(asked, replace(inputs, hold="first"), values).channel("y").values
+    assert np.array_equal(answer, expected)
+
+
+def test_simulation_has_the_terms_of_the_result() -> None:
+    model = document(frols(5))
+    record = record_of(POLYNOMIAL, samples=200)
+    result = identify(model, record, QUICK)
+    assert len(result.selection) == 5
+    answer = simulate(model, record, result).channel("y").values
+    assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
+
+
+def test_simulation_of_several_records_starts_as_the_first(sampled: Identification) -> None:
+    record = sampled.data.records[0]
+    answer = simulate("fopdt", record, sampled).channel("y").values
+    assert np.array_equal(answer, sampled.simulated[0][0])
+
+
+@pytest.mark.parametrize("name", ["tube", "narx"])
+def test_simulation_starts_where_the_measurement_started(name: str) -> None:
+    y = np.zeros(N)
+    for k in range(3, N):
+        y[k] = 0.6 * y[k - 1] + 0.02 * STEPS[k - 3]
+    y += 1.0 + np.random.default_rng(2).normal(0.0, 0.01, N)
+    record = Record(Channel("u", T, STEPS), Channel("y", T, y))
+    result = identify(name, record, QUICK)
+    for inputs in (record, record.inputs):
+        answer = simulate(name, inputs, result).channel("y").values
+        assert np.allclose(answer, result.simulated[0][0], rtol=0, atol=1e-9)
+    later = simulate(name, Channel("u", T + 500.0, STEPS), result).channel("y").values
+    assert np.allclose(later, result.simulated[0][0], rtol=0, atol=1e-6)
+    with pytest.raises(InvalidSettings, match=r"/parameters/y\(0\): a value is missing"):
+        simulate(name, record.inputs, replace(result, data=None))
+
+
+def test_an_exported_model_is_read_and_simulated(found: Identification, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(export_model(load_model("fopdt"), found, "json"), encoding="utf-8")
+    model = load_identified(path)
+    assert model.parameter_values == found.parameter_values
+    assert model.holds == found.holds
+    assert "L = " in repr(model)
+    assert len(repr(model)) < 300
+    record = found.data.records[0]
+    answer = simulate(model.model, record, model).channel("y").values
+    assert np.allclose(answer, found.simulated[0][0], rtol=0, atol=1e-9)
+    assert export_model(model.model, model.parameter_values, "json")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("{}", "its format is None, not 'lagid-model/1'"),
+        (f'{{"format": "{FORMAT}"}}', "read it with Identification.load"),
+        ('{"format": "lagid-model/1"}', "it is damaged"),
+        (
+            '{"format": "lagid-model/1", "model": {}, "values": [], "covariance": null}',
+            "damaged|faults",
+        ),
+    ],
+)
+def test_a_file_that_is_no_identified_model_is_told(
+    tmp_path: Path, content: str, told: str
+) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(content)
+    with pytest.raises(UnreadableResult, match=told):
+        load_identified(path)
+
+
+def test_the_usual_figure_has_response_residuals_correlation_and_waterfall(
+    found: Identification,
+) -> None:
+    figure = found.plot()
+    assert isinstance(figure, go.Figure)
+    titles = [note.text for note in figure.layout.annotations if note.text.startswith("<b>")]
+    assert titles == [
+        "<b>Measured against identified</b>",
+        "<b>Correlation of the residuals</b>",
+        "<b>Correlation of the estimates</b>",
+        "<b>What each island found</b>",
+    ]
+    drawn = {trace.name: trace for trace in figure.data}
+    measured = np.array(drawn["measured"].y)
+    assert measured.size == N  # both parts of the record
+    assert np.array(drawn["u"].y).size == N
+    assert np.array(drawn["identified"].y)[: found.simulated[0][0].size] == pytest.approx(
+        found.simulated[0][0], rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_can_be_drawn_alone(sampled: Identification, name: str) -> None:
+    figure = sampled.plot(name, theme="dark")
+    assert figure.data
+    assert figure.layout.template.layout.font.color == "#c6ced6"
+
+
+def test_figures_of_every_record(sampled: Identification) -> None:
+    names = [experiment.name for experiment in list_experiments(sampled)]
+    assert names == ["estimation 1", "estimation 2", "validation 1"]
+    [(title, _)] = draw_figures(sampled, ["response"], 2)
+    assert title == "Measured against identified: validation 1"
+    with pytest.raises(InvalidSettings, match=r"found 3; the records are 0 \(estimation 1\)"):
+        sampled.plot(experiment=3)
+    with pytest.raises(InvalidSettings, match=r"'respons'; did you mean 'response'\?"):
+        sampled.plot("respons")
+
+
+def test_residuals_are_drawn_for_each_tested_record(frame: pd.DataFrame) -> None:
+    parts = [frame.iloc[:120], frame.iloc[120:]]
+    result = identify("fopdt", parts, QUICK, parameters=FEW)
+    for number in (0, 1):
+        [(title, figure)] = draw_figures(result, ["residuals"], number)
+        assert title.endswith(f": estimation {number + 1}")
+        bars = [trace["y"] for trace in figure["data"] if trace["type"] == "bar"]
+        tested = [c for c in result.data.correlations if c.test.experiment == number]
+        assert bars[1] == pytest.approx(tested[1].values, rel=1e-5)
+
+
+def test_a_result_without_data_draws_what_it_has(found: Identification) -> None:
+    bare = replace(found, data=None)
+    titles = [title for title, _ in draw_figures(bare, FIGURES)]
+    assert "Measured against identified" not in titles
+    assert "What each island found" in titles
+    assert repr(bare).startswith("Identification, fit")
+
+
+@pytest.mark.parametrize(("library", "call"), [("pandas", "to_pandas"), ("plotly", "plot")])
+def test_a_missing_library_is_told(
+    found: Identification, monkeypatch: pytest.MonkeyPatch, library: str, call: str
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    if library == "plotly":
+        monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(MissingLibrary, match=rf"{call}\(\) needs {library}, which is not inst"):
+        getattr(found, call)()
+
+
+def test_drawn_residuals_are_those_that_were_tested(
+    found: Identification, sampled: Identification, frame: pd.DataFrame
+) -> None:
+    robust = identify(
+        "fopdt", frame, QUICK, parameters=FEW, loss=Loss("soft-l1", scale=0.2), skip=7
+    )
+    one_step = identify("narx", frame, QUICK, prediction="one-step")
+    for result in (found, sampled, robust, one_step):
+        verdict = judge_tests(result.data.correlations, result.residual_tests.data)
+        assert verdict == result.residual_tests
+
+
+ARGUMENTS = [
+    ({"records": "heating.csv"}, "found the text 'heating.csv'.*read_recording"),
+    ({"records": T}, "type ndarray of shape .240,..*with named columns"),
+    ({"records": Channel("u", T, T)}, "Join channels in a record: Record"),
+    ({"records": []}, "there is no record"),
+    ({"settings": "fast"}, "/settings: found 'fast'; need GeneticAlgorithm"),
+    ({"loss": "soft-l1"}, "/loss: found 'soft-l1'; need Loss"),
+    ({"noise": 0.1}, "/noise: found 0.1; need Noise"),
+    ({"seed": "a"}, "/seed: found 'a'; need a whole number"),
+    ({"seed": True}, "/seed: found True"),
+    ({"skip": 0.5}, "/skip: found 0.5; need a number of samples"),
+    ({"weights": 3}, "/weights: found 3; need a mapping"),
+    ({"warm": [1]}, r"/warm: found \[1\]; need a mapping"),
+    ({"validation_fraction": "a"}, "/validation_fraction: found 'a'; need a number"),
+    ({"channels": "u=P1"}, "/channels: found 'u=P1'; need a mapping"),
+    ({"parameters": ["L"]}, r"/parameters: found \['L'\]; need a mapping"),
+    ({"parameters": {"L": (0, 1, 2)}}, r"/parameters/L: found \(0, 1, 2\); need bounds"),
+    ({"parameters": {"L": True}}, "/parameters/L: found True"),
+    ({"parameters": {"L": (2, 0)}}, r"'L' has bounds \[2, 0\]"),
+    ({"parameters": {"LL": (0, 2)}}, "no parameter 'LL'; did you mean 'L'?"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "told"), ARGUMENTS)
+def test_a_wrong_argument_is_told_in_one_line(
+    frame: pd.DataFrame, wrong: dict[str, Any], told: str
+) -> None:
+    arguments = {"records": frame, **wrong}
+    with pytest.raises(SysidError, match=told) as caught:
+        identify("fopdt", **arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "values", "more", "told"),
+    [
+        (T, TRUTH, {}, "the inputs: found an object of type ndarray"),
+        (Channel("u", T, T), 5, {}, "/values: found an object of type int; need values by name"),
+        (Channel("u", T, T), {**TRUTH, "K": "a"}, {}, "/parameters/K: 'a' is not a finite number"),
+        (Channel("u", T, T), TRUTH, {"times": [1.0]}, "Need two times or more"),
+        ((), TRUTH, {}, "give the times of the outputs"),
+    ],
+)
+def test_a_wrong_argument_of_a_simulation_is_told(inputs, values, more, told: str) -> None:
+    with pytest.raises((InvalidRecord, InvalidSettings), match=told):
+        simulate("fopdt", inputs, values, **more)

@@ -1,0 +1,105 @@
+"""docs/notebooks.md and its notebook: every snippet and every cell runs, one after the other."""
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+import pytest
+
+from sysid import Channel, Identification, simulate
+from sysid.control.linear_form import IdentifiedModel
+from tests.repository import ROOT
+
+pytest.importorskip("lagid")
+
+PAGE = (ROOT / "docs/notebooks.md").read_text(encoding="utf-8")
+SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+README = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+NOTEBOOK = json.loads((ROOT / "docs/notebooks/first_time_lag.ipynb").read_text(encoding="utf-8"))
+TRUTH = {"K": 0.8, "T": 40.0, "L": 12.0, "y0": 20.0, "x(0)": 0.0}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the file of the page: an oven behind its heater."""
+    t = np.arange(1200.0)
+    heater = np.where((t // 100) % 2 == 0, 0.0, 20.0)
+    oven = simulate("fopdt", Channel("u", t, heater), TRUTH).channel("y").values
+    oven = oven + np.random.default_rng(4).normal(0.0, 0.15, t.size)
+    table = pd.DataFrame({"t": t, "heater [%]": heater, "oven [°C]": oven.round(3)})
+    table.to_csv(tmp_path / "heating.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_cell(source: str, names: dict[str, Any]) -> Any:
+    """Run a cell as a notebook does; gives the value of its last line."""
+    *body, last = ast.parse(source).body
+    ends_in_value = isinstance(last, ast.Expr)
+    exec(compile(ast.Module(body if ends_in_value else [*body, last], []), "cell", "exec"), names)
+    if not isinstance(last, ast.Expr):
+        return None
+    return eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+
+
+def test_four_lines_give_the_answer_and_its_plot(folder: Path) -> None:
+    [lines] = [one for one in README if "read_recording" in one]
+    assert lines.strip() in SNIPPETS[0]
+    assert len([line for line in lines.splitlines() if line]) == 4
+    names: dict[str, Any] = {}
+    figure = run_cell(lines, names)
+    assert isinstance(figure, go.Figure)
+    for name in ("K", "T", "L"):
+        estimate = names["found"][name]
+        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.stderr
+
+
+def test_every_snippet_of_the_page_runs(folder: Path) -> None:
+    names: dict[str, Any] = {}
+    for snippet in SNIPPETS:
+        run_cell(snippet, names)
+    assert names["same"].inputs[0].unit == "%"
+    assert names["table"].loc["y0", "status"] == "fixed"
+    saved = Identification.load("found.json")
+    assert saved.parameter_values == names["found"].parameter_values
+    assert isinstance(names["model"], IdentifiedModel)
+    answers = [names[name].channel("y").values for name in ("answer", "again")]
+    assert np.allclose(*answers, rtol=0, atol=1e-6)
+
+
+def test_the_text_of_a_result_on_the_page_is_the_one_that_is_printed(folder: Path) -> None:
+    names: dict[str, Any] = {}
+    run_cell(SNIPPETS[0], names)
+    [shown] = re.findall(r"```\n(Identification of.*?)```", PAGE, re.DOTALL)
+    printed = repr(names["found"]).splitlines()
+    for line, expected in zip(shown.splitlines(), printed, strict=False):
+        if line.split()[0] in ("K", "T", "L", "y0"):
+            numbers = [[float(text) for text in one.split()[1:4:2]] for one in (line, expected)]
+            assert numbers[0][0] == pytest.approx(numbers[1][0], abs=0.1 * numbers[1][1])
+        else:
+            assert line.split()[0] == expected.split()[0]
+
+
+def test_the_notebook_has_ten_cells_without_outputs() -> None:
+    assert len(NOTEBOOK["cells"]) == 10
+    assert not any(cell.get("outputs") for cell in NOTEBOOK["cells"])
+
+
+def test_the_cells_of_the_notebook_run(folder: Path) -> None:
+    names: dict[str, Any] = {}
+    values = [
+        run_cell("".join(cell["source"]), names)
+        for cell in NOTEBOOK["cells"]
+        if cell["cell_type"] == "code"
+    ]
+    _, found, distances, figure, checked = values
+    assert isinstance(found, Identification)
+    assert all(abs(distance) < 4 for distance in distances.values())
+    assert isinstance(figure, go.Figure)
+    assert isinstance(checked, go.Figure)
+    assert names["checked"].fit_percent_validation > 90

@@ -1,0 +1,260 @@
+"""Arrays and tables of other libraries become channels; what cannot be read is told in a line."""
+
+import math
+from datetime import UTC, timedelta
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from sysid.core.errors import InvalidRecord
+from sysid.data.records import Channel, History, Record, Recording
+
+TIMES = np.array([0.0, 0.5, 1.0, 1.75])
+VALUES = np.array([1.0, 3.0, 2.0, 5.0])
+START = pd.Timestamp("2026-11-20 08:00").to_pydatetime()  # a date without a zone
+DATES = [START + timedelta(seconds=float(time)) for time in TIMES]
+BERLIN = pd.DatetimeIndex(DATES, tz="Europe/Berlin")
+
+
+def frame(**more: object) -> pd.DataFrame:
+    return pd.DataFrame({"P1 [bar]": VALUES, "P2": VALUES + 1, **more}, index=TIMES)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        TIMES,
+        list(TIMES),
+        tuple(TIMES),
+        TIMES[:, None],
+        TIMES.astype(np.float32),
+        TIMES.astype(">f8"),
+        pd.Series(TIMES),
+        pd.Index(TIMES),
+        pd.to_timedelta(TIMES, unit="s"),
+        [timedelta(seconds=float(time)) for time in TIMES],
+        DATES,
+        [date.replace(tzinfo=UTC) for date in DATES],
+        np.array(DATES, dtype="datetime64[us]"),
+        pd.DatetimeIndex(DATES),
+        BERLIN,
+        pd.Series(BERLIN),
+        xr.DataArray(TIMES),
+    ],
+    ids=lambda times: type(times).__name__,
+)
+def test_times_of_any_kind_are_seconds(times: object) -> None:
+    channel = Channel("u", times, VALUES)
+    assert channel.times.dtype == np.float64
+    assert np.array_equal(channel.times, TIMES)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        list(VALUES),
+        VALUES[:, None],
+        VALUES.astype(np.float32),
+        VALUES.astype(np.int16),
+        VALUES.astype(">f8"),
+        np.repeat(VALUES, 2)[::2],
+        pd.Series(VALUES, dtype="Float64"),
+        pd.Series(VALUES, dtype="object"),
+        xr.DataArray(VALUES),
+    ],
+    ids=lambda values: type(values).__name__,
+)
+def test_values_of_any_kind_are_arrays_for_compiled_code(values: object) -> None:
+    channel = Channel("u", TIMES, values)
+    assert np.array_equal(channel.values, VALUES)
+    assert channel.values.dtype.str == np.dtype(np.float64).str
+    assert channel.values.flags.c_contiguous
+    assert channel.values.flags.writeable
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [1.0, math.nan, 3.0],
+        pd.Series([1.0, None, 3.0], dtype="Float64"),
+        pd.Series([1, None, 3], dtype="Int64"),
+        [1.0, None, 3.0],
+        np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False]),
+    ],
+    ids=["nan", "Float64", "Int64", "None", "masked"],
+)
+def test_a_missing_value_is_nan(values: object) -> None:
+    assert np.array_equal(np.isnan(Channel("y", [0, 1, 2], values).values), [False, True, False])
+
+
+def test_arrays_of_float64_are_not_copied() -> None:
+    channel = Channel("u", TIMES, VALUES)
+    assert channel.times is TIMES
+    assert channel.values is VALUES
+
+
+def test_a_history_may_be_lists() -> None:
+    channel = Channel("u", TIMES, VALUES, history=History([-2, -1], [0, 1]))
+    assert channel.history is not None
+    assert channel.history.values.dtype == np.float64
+    assert channel.total_samples == 6
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        frame(),
+        frame().rename_axis("t [s]"),
+        frame().rename_axis("t").reset_index(),
+        frame().set_index(pd.Index(1000 * TIMES, name="time [ms]")),
+        frame().set_index(pd.DatetimeIndex(DATES)),
+        frame().set_index(BERLIN),
+        frame().set_index(BERLIN).rename_axis("Zeit").reset_index(),
+        frame().set_index(pd.to_timedelta(TIMES, unit="s")),
+        {"t": TIMES, "P1 [bar]": VALUES, "P2": list(VALUES + 1)},
+        np.array(
+            list(zip(TIMES, VALUES, VALUES + 1, strict=True)),
+            dtype=[("Time [s]", "f8"), ("P1 [bar]", "f4"), ("P2", "f8")],
+        ),
+        xr.Dataset(
+            {"P1": ("time", VALUES, {"units": "bar"}), "P2": ("time", VALUES + 1)},
+            coords={"time": TIMES},
+        ),
+        xr.DataArray(
+            np.stack([VALUES, VALUES + 1]),
+            dims=("channel", "time"),
+            coords={"channel": ["P1 [bar]", "P2"], "time": np.array(DATES, "datetime64[ns]")},
+        ),
+    ],
+    ids=[
+        "float index",
+        "named index",
+        "column t",
+        "milliseconds",
+        "dates",
+        "dates with zone",
+        "only column of dates",
+        "time spans",
+        "mapping",
+        "structured",
+        "dataset",
+        "array of channels",
+    ],
+)
+def test_a_table_is_a_recording(table: object) -> None:
+    recording = Recording(table)
+    assert recording.names == ("P1", "P2")
+    assert [channel.unit for channel in recording.channels] == ["bar", "1"]
+    for channel, values in zip(recording.channels, (VALUES, VALUES + 1), strict=True):
+        assert np.allclose(channel.times, TIMES, rtol=0, atol=1e-12)
+        assert np.array_equal(channel.values, values)
+
+
+def test_a_table_of_polars_is_a_recording() -> None:
+    polars = pytest.importorskip("polars")
+    table = polars.DataFrame({"when": DATES, "P1 [bar]": [1.0, None, 3.0, 4.0]})
+    recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
+    [channel] = recording.channels
+    assert (channel.name, channel.unit) == ("P1", "bar")
+    assert np.array_equal(channel.times, TIMES)
+    assert np.array_equal(np.isnan(channel.values), [False, True, False, False])
+    assert recording.started_at == pd.Timestamp(START, tz="CET")
+    assert recording.started_at.hour == START.hour
+
+
+def test_the_clock_of_dates_is_kept_by_a_recording() -> None:
+    started = Recording(frame().set_index(BERLIN)).started_at
+    assert started == BERLIN[0]
+    assert started.hour == START.hour
+    assert Recording(frame().set_index(pd.DatetimeIndex(DATES))).started_at == START
+    assert Recording(frame()).started_at is None
+
+
+def test_a_series_is_a_channel_with_its_times() -> None:
+    series = pd.Series(VALUES, index=pd.DatetimeIndex(DATES))
+    series.attrs["units"] = "V"
+    channel = Channel("u", series)
+    assert np.array_equal(channel.times, TIMES)
+    assert channel.unit == "V"
+    assert Channel("u", series, unit="mV").unit == "mV"
+
+
+@pytest.mark.parametrize("as_side", ["series", "frame", "channel", "list"])
+def test_series_of_dates_keep_their_distance(as_side: str) -> None:
+    u = pd.Series(VALUES, index=pd.DatetimeIndex(DATES), name="u")
+    late = u.iloc[2:].rename("y")
+    sides = {
+        "series": (u, late),
+        "frame": (u.to_frame(), late.to_frame()),
+        "channel": (Channel("u", u), Channel("y", late)),
+        "list": ([u], [Channel("y", late)]),
+    }
+    record = Record(*sides[as_side])
+    assert np.array_equal(record.inputs[0].times, TIMES)
+    assert np.array_equal(record.outputs[0].times, TIMES[2:])
+    again = Record(record.inputs, record.outputs)
+    assert np.array_equal(again.outputs[0].times, TIMES[2:])
+
+
+def test_dates_with_and_without_zone_are_not_mixed() -> None:
+    with pytest.raises(InvalidRecord, match="some dates have a time zone and others have none"):
+        Record(Channel("u", BERLIN, VALUES), Channel("y", DATES, VALUES))
+
+
+def test_one_channel_may_stand_for_a_side() -> None:
+    record = Record(Channel("u", TIMES, VALUES), Channel("y", TIMES, VALUES))
+    assert [channel.name for channel in (*record.inputs, *record.outputs)] == ["u", "y"]
+
+
+def test_texts_of_channels_and_records_are_short() -> None:
+    many = {"t": TIMES} | {f"c{number}": VALUES for number in range(40)}
+    text = repr(Recording(many))
+    assert text.startswith("Recording of 40 channels, from 0 to 1.75 s\n  c0: 4 samples, irregular")
+    assert text.endswith("and 28 more")
+    holes = Channel("y", TIMES, [1, 2, math.nan, 3], unit="bar")
+    assert repr(holes).endswith("values from 1 to 3, 1 missing")
+    assert repr(Record((), ())) == "Record, without channels"
+    assert repr(Recording(())) == "Recording of 0 channels"
+
+
+@pytest.mark.parametrize(
+    ("build", "told"),
+    [
+        (lambda: Channel("u", TIMES, ["a", "b", "c", "d"]), "channel 'u' has text; need numbers"),
+        (lambda: Channel("u", TIMES, DATES), "channel 'u' has dates; need numbers"),
+        (lambda: Channel("u", TIMES, VALUES + 1j), "has complex numbers"),
+        (lambda: Channel("u", TIMES, VALUES[None, :]), r"values of shape \(1, 4\)"),
+        (lambda: Channel("u", [0, 1], [[1, 2], [3]]), "cannot be read as numbers"),
+        (lambda: Channel("u", VALUES), "channel 'u' has no values"),
+        (
+            lambda: Channel("u", None, VALUES),
+            "the times of channel 'u' decrease or are not finite|cannot be read|shape",
+        ),
+        (lambda: Channel("u", ["2026-01-01"] * 4, VALUES), "are text such as '2026-01-01'"),
+        (lambda: Channel("u", [*DATES[:3], pd.NaT], VALUES), "have NaT among dates"),
+        (lambda: Channel("u", pd.DatetimeIndex([*DATES[:3], None]), VALUES), "1 missing dates"),
+        (lambda: Channel("u", pd.period_range("2026", periods=4, freq="h"), VALUES), "numbers"),
+        (lambda: Channel(3, TIMES, VALUES), "a channel has the name 3"),
+        (lambda: Channel("u", pd.Series(VALUES)), "index of the series counts its rows"),
+        (lambda: Record(5, 6), "the input side: found an object of type int"),
+        (lambda: Record("heating.csv", ()), "found the text 'heating.csv'"),
+        (lambda: Record(np.ones((4, 2)), ()), r"type ndarray of shape \(4, 2\)"),
+        (lambda: Record([VALUES], ()), "has an object of type ndarray of shape"),
+        (lambda: Recording(pd.DataFrame({"a": VALUES})), "has no times.*Columns: a$"),
+        (lambda: Recording(pd.DataFrame({"t": TIMES, "note": list("abcd")})), "'note' has text"),
+        (lambda: Recording(pd.DataFrame([[0, 1, 2]], columns=["t", "x", "x"])), "column 'x'"),
+        (lambda: Recording({"t": [0, 1], "x": [1, 2], "x [V]": [1, 2]}), "column 'x'"),
+        (lambda: Recording({"t [furlong]": [0, 1], "x": [1, 2]}), "'furlong', which is no unit"),
+        (lambda: Recording(xr.DataArray(np.ones((2, 3)))), "has dimensions dim_0, dim_1"),
+        (
+            lambda: Recording(frame().set_index(pd.MultiIndex.from_product([[0, 1], [2, 3]]))),
+            "has no times",
+        ),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_line(build, told: str) -> None:
+    with pytest.raises(InvalidRecord, match=told) as caught:
+        build()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,129 @@
+"""Channels become signals of a model: as given, by name, else by their order."""
+
+import numpy as np
+import pytest
+
+from sysid.core.errors import InvalidRecord, InvalidSettings, UnknownModel
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model, resolve_model
+from sysid.models.signals import assign_channels, assign_record
+
+MODEL = load_model("fopdt")
+T = np.arange(3.0)
+
+
+def record(inputs: list[str], outputs: list[str]) -> Record:
+    return Record(
+        tuple(Channel(name, T, T) for name in inputs),
+        tuple(Channel(name, T, T) for name in outputs),
+    )
+
+
+def names(one: Record) -> tuple[list[str], list[str]]:
+    return [channel.name for channel in one.inputs], [channel.name for channel in one.outputs]
+
+
+@pytest.mark.parametrize(
+    ("channels", "given", "assigned"),
+    [
+        (["u", "y"], {}, {"u": "u", "y": "y"}),
+        (["y", "u", "T3"], {}, {"u": "u", "y": "y"}),
+        (["P1", "P2", "P3"], {"u": "P3", "y": "P1"}, {"u": "P3", "y": "P1"}),
+        (["y", "u"], {"u": "y", "y": "u"}, {"u": "y", "y": "u"}),
+    ],
+)
+def test_what_is_given_or_has_the_name_needs_no_note(channels, given, assigned) -> None:
+    assert assign_channels(MODEL, channels, given) == (assigned, "")
+
+
+@pytest.mark.parametrize(
+    ("channels", "given", "assigned"),
+    [
+        (["P1", "P2"], {}, {"u": "P1", "y": "P2"}),
+        (["P1", "u"], {}, {"u": "u", "y": "P1"}),
+        (["P1", "P2"], {"u": "P2"}, {"u": "P2", "y": "P1"}),
+        (["u", "P2"], {"y": "u"}, {"u": "P2", "y": "u"}),
+    ],
+)
+def test_the_order_decides_where_as_many_are_left_and_is_told(channels, given, assigned) -> None:
+    found, note = assign_channels(MODEL, channels, given)
+    assert found == assigned
+    told = [signal for signal in assigned if f"{signal!r}: {assigned[signal]!r}" in note]
+    assert told == [s for s in assigned if s not in given and assigned[s] != s]
+
+
+def test_a_signal_without_a_channel_is_told_with_all_channels() -> None:
+    with pytest.raises(InvalidRecord, match=r"inputs u and outputs y.*P1, P2, P3.*'u': …, 'y': …"):
+        assign_channels(MODEL, ["P1", "P2", "P3"])
+    with pytest.raises(InvalidRecord, match="'y': …"):
+        assign_channels(MODEL, ["u"])
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"q": "P1"}, "/channels/q: the model has no signal 'q'; known are u, y"),
+        ({"P1": "u"}, "no signal 'P1'. Write {'u': 'P1'}"),
+        ({"u": "P11"}, "/channels/u: there is no channel 'P11'; did you mean 'P1'?"),
+    ],
+)
+def test_a_wrong_name_is_told(given: dict[str, str], told: str) -> None:
+    for assign in (
+        lambda: assign_channels(MODEL, ["P1", "P2"], given),
+        lambda: assign_record(MODEL, record(["P1"], ["P2"]), given),
+    ):
+        with pytest.raises(InvalidSettings) as caught:
+            assign()
+        assert told in str(caught.value)
+
+
+def test_a_record_of_the_models_names_is_the_same_object() -> None:
+    one = record(["u", "more"], ["y"])
+    assert assign_record(MODEL, one) == (one, "")
+
+
+def test_the_sides_of_a_record_say_what_is_input_and_output() -> None:
+    renamed, note = assign_record(MODEL, record(["P2"], ["P1"]))
+    assert names(renamed) == (["u"], ["y"])
+    assert "'u': 'P2', 'y': 'P1'" in note
+    renamed, note = assign_record(MODEL, record(["P1", "P2"], ["P3"]), {"u": "P2"})
+    assert names(renamed) == (["P1", "u"], ["y"])
+
+
+def test_a_channel_of_the_other_side_is_refused() -> None:
+    with pytest.raises(InvalidSettings, match="'P2' is not among the inputs of the record"):
+        assign_record(MODEL, record(["P1"], ["P2"]), {"u": "P2"})
+    with pytest.raises(InvalidSettings, match="'P1' is not among the outputs of the record"):
+        assign_record(MODEL, record(["P1"], ["P2"]), {"y": "P1"})
+
+
+def test_exchanged_sides_are_left_to_the_checks_of_the_problem() -> None:
+    one = record(["y"], ["u"])
+    assert assign_record(MODEL, one) == (one, "")
+
+
+def test_a_text_that_ends_like_a_file_is_one(tmp_path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "name: mine\nform: differential\ninputs: {u: V}\nstates: {x: V}\n"
+        "parameters: {T: {lower: 0.1, upper: 9, unit: s}}\n"
+        "equations: {x: (u - x)/T}\noutputs: {y: x}\ninitial: {x: 0}\n"
+    )
+    assert resolve_model(str(path)).name == resolve_model(path).name == "mine"
+    assert resolve_model(dict(MODEL.document)).name == "fopdt"
+    assert resolve_model(MODEL) is MODEL
+    assert resolve_model("fopdt") is MODEL
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("fopd", "did you mean 'fopdt'"),
+        ("absent.yaml", "absent.yaml cannot be read: No such file"),
+        (3, "found an object of type int; need a model, a name, a file or a document"),
+        ({}, "form: is missing"),
+    ],
+)
+def test_a_model_that_cannot_be_found_is_told(source: object, told: str) -> None:
+    with pytest.raises((ValueError, UnknownModel), match=told):
+        resolve_model(source)
