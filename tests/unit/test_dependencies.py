@@ -21,7 +21,7 @@ from tests.sources import list_modules
 PRODUCT = ("lagid", "sysid", "workers", "service", "migrations")
 # Modules that have another name than their distribution.
 MODULES = {"pyyaml": "yaml", "protobuf": "google", "python-multipart": "python_multipart"}
-# Needed by Starlette for forms. Plotly's file is sent to browsers, its Python is for notebooks.
+# Starlette needs it for forms. Of Plotly its file is sent to browsers.
 NOT_IMPORTED = {"python_multipart", "plotly"}
 
 
@@ -58,7 +58,7 @@ def test_what_the_core_imports_is_declared_without_an_extra() -> None:
 
 def test_what_is_declared_is_imported() -> None:
     declared = read_requirements("server", "postgres")
-    assert declared - find_imports(list_modules(PRODUCT)) == NOT_IMPORTED
+    assert declared - find_imports(list_modules(PRODUCT)) <= NOT_IMPORTED
 
 
 def test_what_tests_import_is_declared() -> None:
