@@ -127,6 +127,7 @@ def test_the_library_and_its_commands_need_no_extra(tmp_path: Path) -> None:
         ["models", "--help"],
         ["models", "list", "--json"],
         ["models", "check", str(model)],
+        ["models", "show", "fopd"],
         ["jobs", "--url", "http://127.0.0.1:1"],
         ["doctor", "--json"],
         *served,
@@ -140,12 +141,13 @@ def test_the_library_and_its_commands_need_no_extra(tmp_path: Path) -> None:
         env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(Path.home())},
     )
     assert done.returncode == 0, done.stderr
-    found, _, listed, checked, jobs, doctor, *refused = json.loads(done.stdout)
+    found, _, listed, checked, shown, jobs, doctor, *refused = json.loads(done.stdout)
     assert found[0] == 0, found
     assert {one["name"] for one in json.loads(found[1])["parameters"]} >= {"K", "T", "L"}
     assert "fopdt" in {one["name"] for one in json.loads(listed[1])}
     assert checked[0] == 1
     assert "outputs" in checked[2]
+    assert "did you mean 'fopdt'?" in shown[2]
     assert "lagid serve" in jobs[2]
     checks = {one["check"]: one for one in json.loads(doctor[1])}
     assert doctor[0] == 0
