@@ -364,6 +364,8 @@ def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
         for unit, name in zip(units, names, strict=False)
         if _find_time_word(_split_heading(name, slashes=True)[0]) is not None
     ]
+    if not times and any(_find_time_word(unit) in TIME_NAMES for unit in full):
+        return False  # it names the time, and the row above does not
     return (
         bool(full)
         and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)

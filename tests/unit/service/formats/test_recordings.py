@@ -31,6 +31,7 @@ from tests.recorded_files import (
     write_experiment_sheet,
     write_mat,
     write_npz,
+    write_open_sheet,
     write_parquet,
     write_sheet,
 )
@@ -157,6 +158,8 @@ STAMPS = {
 def test_a_temperature_called_t_is_no_time_if_there_is_another() -> None:
     recording, _ = read_csv(b"T,timestamp,u\n20.5,0,1\n20.6,1,2\n20.4,2,3\n")
     assert recording.names == ("T", "u")
+    below, _ = read_csv(b"Device: Scope 1\n\nt T y\n0 1 2\n1 2 3\n")
+    assert below.names == ("T", "y")
     daily, _ = read_csv(b"day,u\n2026-03-01,1\n2026-03-02,2\n2026-03-04,3\n")
     assert daily.channel("u").times.tolist() == [0, 86400, 259200]
 
@@ -407,6 +410,12 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
         read_bytes(tmp_path, write_sheet(faulty))
     with pytest.raises(InvalidUpload, match="cannot be opened"):
         read_bytes(tmp_path, write_experiment_sheet()[:700])
+
+
+def test_an_open_document_is_a_sheet_too(tmp_path: Path) -> None:
+    rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
+    content = write_open_sheet([["t", "u", "y"], *rows])
+    check_experiment(read_bytes(tmp_path, content)[0])
 
 
 def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
