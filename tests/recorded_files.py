@@ -99,6 +99,35 @@ def write_experiment_sheet(sheets: Sequence[str] = ("Data",)) -> bytes:
     return write_sheet([["t [s]", "u [V]", "y"], *rows], sheets)
 
 
+def write_open_sheet(rows: Sequence[Sequence[object]]) -> bytes:
+    """An OpenDocument spreadsheet (.ods) with the rows."""
+
+    def write(value: object) -> str:
+        if isinstance(value, str):
+            content = f"<text:p>{value}</text:p>"
+            return f'<table:table-cell office:value-type="string">{content}</table:table-cell>'
+        return f'<table:table-cell office:value-type="float" office:value="{value!r}"/>'
+
+    body = "".join(f"<table:table-row>{''.join(map(write, row))}</table:table-row>" for row in rows)
+    name = "urn:oasis:names:tc:opendocument:xmlns"
+    kind = "application/vnd.oasis.opendocument.spreadsheet"
+    parts = {
+        "mimetype": kind,
+        "META-INF/manifest.xml": f'<manifest:manifest xmlns:manifest="{name}:manifest:1.0">'
+        f'<manifest:file-entry manifest:full-path="/" manifest:media-type="{kind}"/>'
+        "</manifest:manifest>",
+        "content.xml": f'<office:document-content xmlns:office="{name}:office:1.0" '
+        f'xmlns:table="{name}:table:1.0" xmlns:text="{name}:text:1.0"><office:body>'
+        f'<office:spreadsheet><table:table table:name="Data">{body}</table:table>'
+        "</office:spreadsheet></office:body></office:document-content>",
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for part, text in parts.items():
+            archive.writestr(part, text)
+    return buffer.getvalue()
+
+
 def write_npz(**arrays: object) -> bytes:
     """Arrays as a NumPy file."""
     buffer = io.BytesIO()

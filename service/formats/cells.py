@@ -11,7 +11,10 @@ CellKind = Literal["empty", "number", "flag", "stamp", "date", "clock", "text", 
 """
 
 MISSING: Final = frozenset(
-    ("", "na", "n/a", "#n/a", "#nv", "#na", "nan", "-nan", "null", "none", "-", "--", "---", "?")
+    (
+        *("", "na", "n/a", "nan", "-nan", "null", "none", "-", "--", "---", "?"),
+        *("#n/a", "#nv", "#na", "#div/0!", "#num!", "#value!", "#ref!"),  # of spreadsheets
+    )
 )
 """Words of a missing value, in small letters."""
 FLAGS: Final = {"true": 1.0, "false": 0.0}
@@ -31,7 +34,8 @@ _CLOCK = (
     r"(?:\s?(?P<half>[AaPp])\.?[Mm]\.?)?"
 )
 _ZONE = r"(?P<zone>Z|z|\s?UTC|\s?GMT|\s?[+-]\d{2}:?\d{2}|[+-]\d{2})"
-STAMP: Final = re.compile(rf"(?:{_DATE})(?P<gap>[Tt]|,?\s+)(?:{_CLOCK}){_ZONE}?")
+_BASIC = r"(?P<basic>\d{8}T\d{6})(?:[.,]\d*)?"
+STAMP: Final = re.compile(rf"(?:(?:{_DATE})(?:[Tt]|,?\s+)(?:{_CLOCK})|{_BASIC}){_ZONE}?")
 DATE_ONLY: Final = re.compile(_DATE)
 CLOCK_TIME: Final = re.compile(_CLOCK)
 

@@ -54,6 +54,7 @@ _MAX_UNIT_CHARACTERS = 12
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
 _PARENTHESES = re.compile(r"^(?P<name>.*?)\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
 _SLASH = re.compile(r"^(?P<name>[^/]+?)\s*(?:/|\s+in\s+)\s*\(?(?P<unit>[^()]+?)\)?$", re.DOTALL)
+_UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
 _DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
 
 ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
@@ -188,13 +189,24 @@ def _split_lines(lines: Sequence[str], separator: str, first: int) -> list[_Row]
     rows, place, cells = [], first, 0
     try:
         for fields in reader:
-            rows.append(_Row(place, fields))
+            rows.append(_Row(place, _join_units(fields) if separator == " " else fields))
             place, cells = first + reader.line_num, cells + len(fields)
             if cells > PEEK_CELLS:
                 break
     except csv.Error as error:
         raise InvalidUpload(f"the first rows cannot be read ({error})") from None
     return rows
+
+
+def _join_units(fields: list[str]) -> list[str]:
+    """Join the units of a header that blanks divide: ``Time (s) u (V)``."""
+    joined: list[str] = []
+    for field in fields:
+        if joined and _UNIT_FIELD.match(field) and not _UNIT_FIELD.match(joined[-1]):
+            joined[-1] += f" {field}"
+        else:
+            joined.append(field)
+    return joined
 
 
 def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
@@ -352,6 +364,8 @@ def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
         for unit, name in zip(units, names, strict=False)
         if _find_time_word(_split_heading(name, slashes=True)[0]) is not None
     ]
+    if not times and any(_find_time_word(unit) in TIME_NAMES for unit in full):
+        return False  # it names the time, and the row above does not
     return (
         bool(full)
         and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)
@@ -550,13 +564,13 @@ def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
         word = _find_time_word(column.name)
         is_stamp = column.kind in ("stamp", "date", "clock")
         if word in TIME_NAMES and column.role == "value":
-            ranks.append((0 if column.name != "T" else 1, i))
+            ranks.append((0 if column.name != "T" else 5, i))  # T is often a temperature
         elif word is not None and (is_stamp or word not in _DATE_WORDS):
             ranks.append((1 if column.kind == "stamp" else 2, i))
         elif is_stamp:
             ranks.append((3 if column.kind == "stamp" else 4, i))
         elif column.role == "nameless" and column.kind == "number" and (i == 0 or column.name):
-            ranks.append((5, i))  # the index of a table, which is its time
+            ranks.append((6, i))  # the index of a table, which is its time
     return min(ranks)[1] if ranks else None
 
 

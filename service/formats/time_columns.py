@@ -191,6 +191,9 @@ def _list_forms(text: str) -> list[str]:
     if match is None:
         return []
     parts = match.groupdict()
+    zone = _ZONE_FORM if parts.get("zone") else ""
+    if parts.get("basic"):
+        return [f"%Y%m%d %H%M%S%.f{zone}"]
     if parts["iso"]:
         days = ["%Y{0}%m{0}%d".format(text[4])]
     elif parts["month"]:
@@ -201,7 +204,6 @@ def _list_forms(text: str) -> list[str]:
         orders = ("%d{0}%m{0}{1}", "%m{0}%d{0}{1}")[: 1 if sign == "." else 2]
         days = [order.format(sign, year) for order in orders]
     clock = "%I:%M:%S%.f %p" if parts.get("half") else "%H:%M:%S%.f"
-    zone = _ZONE_FORM if parts.get("zone") else ""
     return [f"{day} {clock}{zone}" for day in days]
 
 
@@ -213,7 +215,7 @@ def _normalise_stamps(texts: NDArray[np.str_]) -> "pl.Series":
     for pattern, text in (
         (r"^([^T\s]*)[T\s]+", "$1 "),
         (r",\s", " "),
-        (r"(:\d{2}),", "$1."),
+        (r"(\d{2}),(\d+)", "$1.$2"),
         (r"\s?([AaPp])\.?[Mm]\.?$", " ${1}M"),
         (r"\s?(UTC|GMT|z)$", "Z"),
         (r"\s([+-]\d{2}:?\d{2})$", "$1"),

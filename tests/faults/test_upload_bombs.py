@@ -54,6 +54,8 @@ def test_gzip_ends_at_the_size_of_a_file_and_of_a_line(tmp_path: Path) -> None:
     limits = {"file_bytes": 2 * MIB}
     assert "has more than 2097152 bytes" in refuse(tmp_path, pack_zeros(rows, 0), **limits)
     assert "longer than 1000000 char" in refuse(tmp_path, pack_zeros(b"t,u\n0,1\n" + b"1" * MIB, 0))
+    rows = b"t,u\n" + b"".join(b"%d,1\n" % k for k in range(200_000))
+    assert MEMORY in refuse(tmp_path, pack_zeros(rows, 0), memory_bytes=64 * MIB)
     assert "not text" in refuse(tmp_path, pack_zeros(b"\0", 8 * MIB), **limits)
 
 

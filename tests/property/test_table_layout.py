@@ -52,8 +52,6 @@ class Text:
                 self.heading
             ]
             heads = [[form.format(*pair) for pair in zip(names, units, strict=True)]]
-            if separator == " ":
-                heads = [[head.replace(" ", "") for head in heads[0]]]
         rows = [
             [repr(k / 8), *(repr(float(value)) for value in row)]
             for k, row in enumerate(self.values)

@@ -31,6 +31,7 @@ from tests.recorded_files import (
     write_experiment_sheet,
     write_mat,
     write_npz,
+    write_open_sheet,
     write_parquet,
     write_sheet,
 )
@@ -64,6 +65,8 @@ TEXTS = {
     "row of units": join_rows("t,u,y\ns,V,degC"),
     "row of units in parentheses": join_rows("Time,u,y\n(s),(V),(degC)\n"),
     "standard": join_rows("t [s],u [V],y [degC]"),
+    "blanks": join_rows("Time (s)  u (V)   y [degC]", "  "),
+    "bars of a scope": "# Scope\n" + join_rows("t|u|y\n[s]|[V]|[degC]", "|"),
 }
 
 
@@ -134,6 +137,8 @@ def test_a_compressed_text_is_read() -> None:
 
 
 STAMPS = {
+    "iso basic": ("timestamp", stamp("%Y%m%dT%H%M%S.%f")),
+    "comma after the date": ("t", stamp("%d.%m.%Y, %H:%M:%S.%f")),
     "iso": ("timestamp", lambda t: (START + timedelta(seconds=t)).isoformat()),
     "blank": ("time", stamp("%Y-%m-%d %H:%M:%S.%f")),
     "slashes": ("Time", stamp("%Y/%m/%d %H:%M:%S.%f")),
@@ -148,6 +153,15 @@ STAMPS = {
     "two columns": ("Datum;Uhrzeit", stamp("%d.%m.%Y;%H:%M:%S,%f")),
     "times first": ("time;date", stamp("%H:%M:%S.%f;%Y-%m-%d")),
 }
+
+
+def test_a_temperature_called_t_is_no_time_if_there_is_another() -> None:
+    recording, _ = read_csv(b"T,timestamp,u\n20.5,0,1\n20.6,1,2\n20.4,2,3\n")
+    assert recording.names == ("T", "u")
+    below, _ = read_csv(b"Device: Scope 1\n\nt T y\n0 1 2\n1 2 3\n")
+    assert below.names == ("T", "y")
+    daily, _ = read_csv(b"day,u\n2026-03-01,1\n2026-03-02,2\n2026-03-04,3\n")
+    assert daily.channel("u").times.tolist() == [0, 86400, 259200]
 
 
 @pytest.mark.parametrize("case", STAMPS.values(), ids=STAMPS)
@@ -221,7 +235,7 @@ def test_stamps_that_are_too_coarse_or_mixed_are_refused_with_the_way_out() -> N
         read_csv(mixed)
 
 
-@pytest.mark.parametrize("word", ["NA", "N/A", "null", "-", "nan", "#N/A", "None", ""])
+@pytest.mark.parametrize("word", ["NA", "N/A", "null", "-", "nan", "#N/A", "#DIV/0!", "None", ""])
 def test_words_of_missing_values_are_missing(word: str) -> None:
     text = ROWS.replace(f",{OUTPUT[7]:.6f}\n", f",{word}\n")
     recording, notes = read_csv(text.encode())
@@ -396,6 +410,12 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
         read_bytes(tmp_path, write_sheet(faulty))
     with pytest.raises(InvalidUpload, match="cannot be opened"):
         read_bytes(tmp_path, write_experiment_sheet()[:700])
+
+
+def test_an_open_document_is_a_sheet_too(tmp_path: Path) -> None:
+    rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
+    content = write_open_sheet([["t", "u", "y"], *rows])
+    check_experiment(read_bytes(tmp_path, content)[0])
 
 
 def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
