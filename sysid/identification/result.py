@@ -1,6 +1,6 @@
 """Result of an identification: estimates with their uncertainty, and the evidence."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
@@ -232,6 +232,10 @@ class Identification:
             if estimate.name == name:
                 return estimate
         raise UnknownParameter(str(name), [estimate.name for estimate in self.estimates])
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the parameters, so that ``"L" in found`` holds."""
+        return (estimate.name for estimate in self.estimates)
 
     def __repr__(self) -> str:
         from sysid.identification.summary import summarise_result

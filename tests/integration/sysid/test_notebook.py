@@ -164,6 +164,9 @@ def test_the_html_of_a_result_is_complete_and_escaped(found: Identification) -> 
 
 def test_an_estimate_has_its_name(found: Identification) -> None:
     assert found["T"] is found.estimates[1]
+    assert list(found) == [estimate.name for estimate in found.estimates]
+    assert "T" in found
+    assert "TT" not in found
     assert found.parameter_values["T"] == found["T"].value
     with pytest.raises(UnknownParameter, match=r"there is no parameter 'TT'; did you mean 'T'\?"):
         found["TT"]
