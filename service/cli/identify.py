@@ -171,6 +171,8 @@ def _check_report(path: Path) -> None:
     missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
     if missing:
         fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
+    if path.is_dir():
+        fail_usage(f"--report {path}: this is a folder; name a file")
     if not path.parent.is_dir():
         fail_usage(f"--report {path}: there is no folder {path.parent}")
 

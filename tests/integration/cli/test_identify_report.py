@@ -74,10 +74,18 @@ def test_the_report_needs_no_network_and_escapes_names(report: str) -> None:
     assert "default-src &#39;none&#39;" in rest
 
 
-def test_a_place_that_is_no_folder_is_refused_before_the_search(data: Path) -> None:
-    words = ["identify", str(data), "--model", "fopdt", "--report", "absent/a.html"]
-    line = check_refusal(run_lagid(*words), 2)
-    assert "--report absent/a.html: there is no folder absent" in line
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("absent/a.html", "--report absent/a.html: there is no folder absent"),
+        (".", "--report .: this is a folder; name a file"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_refused_before_the_search(
+    data: Path, place: str, told: str
+) -> None:
+    words = ["identify", str(data), "--model", "fopdt", "--report", place]
+    assert told in check_refusal(run_lagid(*words), 2)
 
 
 def test_a_report_without_its_libraries_is_refused_before_the_search(

@@ -86,7 +86,11 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
             {"ray", "workers.tasks", "workers.ray_executor", "numba", "llvmlite"},
         ),
         ("command line", {"numpy"}),
-        ("identify", {"sqlalchemy", "fastapi", "httpx", "asyncio", "mcap", "ray", "polars"}),
+        (
+            "identify",
+            {"sqlalchemy", "fastapi", "httpx", "asyncio", "mcap", "ray", "polars"}
+            | {"pandas", "plotly"},
+        ),
         # They took half a second, four fifths of what its first use in a process does.
         ("colour of a short record", {"scipy.signal"}),
     ],
