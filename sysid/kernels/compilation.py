@@ -39,7 +39,8 @@ def compile_kernel(model: Model, variant: KernelVariant) -> bytes:
         raise _build_error(f"{PROCESSOR_SECONDS:g} s of processor time")
     errors = child.stderr.decode(errors="replace")
     is_ended_by_signal = child.returncode < 0
-    if is_ended_by_signal or "MemoryError" in errors:
+    # Where CPython cannot allocate even an exception, it raises a SystemError instead.
+    if is_ended_by_signal or "MemoryError" in errors or "\nSystemError" in errors:
         raise _build_error(f"{MEMORY_BYTES // 1024**2} MiB of memory")
     raise RuntimeError(f"the compiler ended with code {child.returncode}: {errors[-500:]}")
 
