@@ -18,6 +18,7 @@ BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
 _READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
 _BUSY_OPTION = "lagid_busy_seconds"
+_DATABASE_KEY = "lagid_database"
 
 
 class Database:
@@ -32,7 +33,10 @@ class Database:
         self.engine = _create_engine(url, **options)
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
-            self.engine.execution_options(**_READ_OPTIONS), expire_on_commit=False, autoflush=False
+            self.engine.execution_options(**_READ_OPTIONS),
+            expire_on_commit=False,
+            autoflush=False,
+            info={_DATABASE_KEY: self},
         )
 
     @property
@@ -72,6 +76,12 @@ class Database:
     def dispose(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
+
+
+def find_database(session: Session) -> Database:
+    """Return the database of a reading session, to store what reading it has shown."""
+    database: Database = session.info[_DATABASE_KEY]
+    return database
 
 
 def _create_engine(url: str, **options: Any) -> Engine:
