@@ -280,13 +280,13 @@ def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
         migrate.check_revision(database)
         store = open_store(settings.resolved_store_url)
         with database.read_session() as session:
-            lost = garbage.find_lost_hashes(session, store)
-            orphans = list(garbage.find_orphans(session, store))
+            lost = list(garbage.find_lost_hashes(session, store))
+            n_orphans = sum(1 for _ in garbage.find_orphans(session, store))
         if fix:
             n_deleted, freed = garbage.delete_orphans(database, store)
             out.print(f"deleted {n_deleted} objects, {freed} bytes")
-    out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
-    for sha256 in sorted(lost):
+    out.print(f"tables at head; {len(lost)} objects lost; {n_orphans} objects without a row")
+    for sha256 in lost:
         err.print(f"lost: {sha256}", markup=False)
     if lost:
         raise typer.Exit(1)

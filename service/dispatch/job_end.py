@@ -38,6 +38,7 @@ def _iterate_steps(
         yield None
     try:
         retry_transient(partial(store_summary, database, claim.lease))
+        database.update_statistics()
     except LeaseLost:
         pass  # the end of the job meets it too
     except Exception:  # noqa: BLE001 - the results must not be lost for a summary
