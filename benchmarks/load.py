@@ -277,7 +277,7 @@ def measure_reads(kind: str, served: Served, filled: Filled) -> list[Row]:
         "summary by method": (f"{job}/summary?by=/algorithm/method", 200),
         "CSV, first part": (f"{job}/runs.csv", 200),
         "runs by fit": (f"{job}/runs?limit=20&order=fit_estimation", 200),
-        "summary by seed": (f"{job}/summary?by=/seed", 422),
+        "summary by seed and σ": (f"{job}/summary?by=/seed&by=/noise/sigma", 422),
         "report": (f"{job}/report", 200),
         "metrics": ("/metrics", 200),
         "failed jobs": ("/v1/jobs?limit=20&state=failed", 200),

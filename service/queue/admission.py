@@ -55,11 +55,13 @@ class UnfinishedWork:
 
 def count_unfinished(session: Session, project_id: str) -> UnfinishedWork:
     """Count the unfinished jobs and runs of a project."""
-    query = select(func.count(), func.coalesce(func.sum(Job.n_runs - Job.n_done), 0)).where(
-        is_open(), Job.project_id == project_id
-    )
-    jobs, runs = session.execute(query).one()
-    return UnfinishedWork(int(jobs), int(runs))
+    counts = func.count(), func.sum(Job.n_runs - Job.n_done)
+    # Of all projects: with a condition on one, SQLite may search all jobs that it ever had.
+    query = select(Job.project_id, *counts).where(is_open()).group_by(Job.project_id)
+    for project, jobs, runs in session.execute(query):
+        if project == project_id:
+            return UnfinishedWork(int(jobs), int(runs))
+    return UnfinishedWork(0, 0)
 
 
 def count_running_jobs() -> Subquery:
