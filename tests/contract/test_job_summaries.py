@@ -188,7 +188,7 @@ def test_nothing_is_stored_of_a_job_that_runs_or_was_lost(stored_place: Place) -
 def test_what_was_stored_of_a_job_is_forgotten_when_it_is_resumed(
     stored_place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, lease, (first, *_) = ended(stored_place)
+    job, lease, _ = ended(stored_place)
     finish(stored_place, lease, JobState.FAILED)
     assert summarise(stored_place, job).groups[0].failed == 1
     with stored_place.database.write_session() as session:
@@ -205,9 +205,11 @@ def test_too_many_groups_are_refused_before_a_run_is_read(
 ) -> None:
     job, _, _ = swept(place)
     monkeypatch.setattr("service.sweeps.summary.MAX_GROUPS", 3)
-    with record_statements(place.database) as statements:
-        with pytest.raises(InvalidRequest, match="more than 3 groups"):
-            summarise(place, job, ["/seed"])
+    with (
+        record_statements(place.database) as statements,
+        pytest.raises(InvalidRequest, match="more than 3 groups"),
+    ):
+        summarise(place, job, ["/seed"])
     assert not [one for one, _ in statements if "FROM runs" in one]
     assert len(summarise(place, job, ["/noise/sigma"]).groups) == 2
 
