@@ -469,7 +469,7 @@ def measure_database(
             rows = measure_old_job(kind, served, filled)
         with serve(filled, 1, postmaster) as served:
             rows += measure_reads(kind, served, filled)
-            rows += measure_streams(kind, database, served, filled, 500, 200 if few else 500)
+            rows += measure_streams(kind, database, served, filled, 500, 500)
         with serve(filled, 2, postmaster) as served:
             rows += measure_submissions(kind, served, filled, 200 if few else 1000)
         print(markdown(f"{kind}: {runs} runs, {jobs} old jobs", rows, []), flush=True)

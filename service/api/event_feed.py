@@ -26,9 +26,9 @@ from service.storage.tables import Event
 MAX_BATCH_EVENTS = 500
 SHARE_SECONDS = 1.0
 """How long events that were read are there for other streams at the same event."""
-WOKEN_STREAMS = 20
-"""Streams that are woken at once: some milliseconds of work."""
-PAUSE_SECONDS = 0.005
+WOKEN_STREAMS = 5
+"""Streams that are woken at once: about a millisecond of work."""
+PAUSE_SECONDS = 0.003
 
 
 @dataclass(frozen=True, slots=True)
