@@ -2,23 +2,21 @@
 
 They are computed once for a job that has ended, and stored with it. The dispatcher does this for
 large jobs before it ends them. For others, for cancelled ones and for those of earlier versions the
-first request does. While a job runs, they are computed again only after many times the time that
-this takes.
+first request does. While a job runs, they are remembered for many times the time that they take
+(`service.core.computed`).
 """
 
-import time
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from threading import Lock
-from typing import Any, TypeVar, cast
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from service.core.computed import ComputedValues
 from service.core.states import JobState
 from service.queue.leases import Lease, LeaseQueue
 from service.repositories.summaries import (
@@ -77,15 +75,18 @@ def list_default_keys(spec: Mapping[str, Any]) -> list[GroupKey]:
 
 def load_summary(session: Session, job: Job) -> JobSummary:
     """Load the summary of a job, or compute it."""
-    return _summaries.get(job, "summary", lambda: _load_or_compute(session, job))
+    return _remember(_summaries, job, "summary", lambda: _load_or_compute(session, job))
 
 
 def load_groups(session: Session, job: Job, groups: SweepGroups) -> Sequence[RunGroup]:
     """Load the aggregates of a job's runs by any keys."""
     if list(groups.by) == list_default_keys(job.spec):
         return load_summary(session, job).groups
-    return _summaries.get(
-        job, groups.by, lambda: aggregate_runs(_load_table(session, job), groups, _pending(job))
+    return _remember(
+        _summaries,
+        job,
+        groups.by,
+        lambda: aggregate_runs(_load_table(session, job), groups, _pending(job)),
     )
 
 
@@ -208,7 +209,7 @@ def _load_table(session: Session, job: Job) -> RunTable:
     """Load the columns of a job's runs; those of ended jobs are cached for other keys."""
     if not job.state.is_terminal or job.n_runs > MAX_CACHED_RUNS:
         return _read_table(session, job)
-    return _tables.get(job, "table", lambda: _read_table(session, job))
+    return _remember(_tables, job, "table", lambda: _read_table(session, job))
 
 
 def _read_table(session: Session, job: Job) -> RunTable:
@@ -217,48 +218,10 @@ def _read_table(session: Session, job: Job) -> RunTable:
 
 MAX_CACHED_RUNS = 200_000
 """Columns of more runs are not cached: they take 100 bytes a run."""
-FRESH_SECONDS = 0.05
-"""What took less is computed anew at each request as long as the job runs."""
-REUSE_FACTOR = 20
-"""What took longer is used again for so many times its time."""
+_summaries, _tables = ComputedValues(32), ComputedValues(2)
 
 
-@dataclass(slots=True)
-class _Entry:
-    lock: Lock = field(default_factory=Lock)
-    value: Any = None
-    made_at: float | None = None
-    seconds: float = 0.0
-
-    def is_fresh(self, *, has_ended: bool) -> bool:
-        if self.made_at is None:
-            return False
-        age = time.monotonic() - self.made_at
-        return has_ended or (self.seconds > FRESH_SECONDS and age < REUSE_FACTOR * self.seconds)
-
-
-class _Cache:
-    """Values of the jobs requested last. Requests for one value at once compute it once."""
-
-    def __init__(self, size: int) -> None:
-        self._lock, self._size = Lock(), size
-        self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
-
-    def get(self, job: Job, what: Hashable, compute: Callable[[], T]) -> T:
-        """Return a value of a job; one of a resumed job is computed again when it has ended."""
-        key = job.id, job.attempt, job.finished_at, what
-        with self._lock:
-            entry = self._entries.setdefault(key, _Entry())
-            self._entries.move_to_end(key)
-            while len(self._entries) > self._size:
-                self._entries.popitem(last=False)
-        with entry.lock:
-            if not entry.is_fresh(has_ended=job.state.is_terminal):
-                begun = time.monotonic()
-                entry.value = compute()
-                entry.made_at = time.monotonic()
-                entry.seconds = entry.made_at - begun
-            return cast(T, entry.value)
-
-
-_summaries, _tables = _Cache(32), _Cache(2)
+def _remember(values: ComputedValues, job: Job, what: Hashable, compute: Callable[[], T]) -> T:
+    """Return a value of a job; one of a resumed job is computed again when it has ended."""
+    key = job.id, job.attempt, job.finished_at, what
+    return values.get(key, compute, is_final=job.state.is_terminal)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from service.core import computed
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.dispatch import job_end
@@ -56,8 +57,8 @@ def stored_place(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyP
 
 def forget(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a new process."""
-    monkeypatch.setattr(job_summary, "_summaries", job_summary._Cache(8))
-    monkeypatch.setattr(job_summary, "_tables", job_summary._Cache(2))
+    monkeypatch.setattr(job_summary, "_summaries", computed.ComputedValues(8))
+    monkeypatch.setattr(job_summary, "_tables", computed.ComputedValues(2))
 
 
 def swept(place: Place) -> tuple[str, Lease, list[str]]:
@@ -221,11 +222,11 @@ def test_a_summary_that_takes_long_is_used_again_while_the_job_runs(
     assert summarise(place, job).groups[0].succeeded == 0
     write_results(place.database, lease, {first: conclude(L=(0.5, 0.1))})
     assert summarise(place, job).groups[0].succeeded == 1  # it took less than FRESH_SECONDS
-    monkeypatch.setattr(job_summary, "FRESH_SECONDS", 0.0)
-    monkeypatch.setattr(job_summary, "REUSE_FACTOR", 1e9)
+    monkeypatch.setattr(computed, "FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(computed, "REUSE_FACTOR", 1e9)
     write_results(place.database, lease, {second: conclude(L=(0.5, 0.1))})
     assert summarise_without_runs(place, job).groups[0].succeeded == 1
-    monkeypatch.setattr(job_summary, "REUSE_FACTOR", 0.0)
+    monkeypatch.setattr(computed, "REUSE_FACTOR", 0.0)
     assert summarise(place, job).groups[0].succeeded == 2
 
 
