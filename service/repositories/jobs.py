@@ -13,7 +13,7 @@ from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
 from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
-from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, JobSummary, Run
+from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -166,7 +166,7 @@ class JobRepository:
         job.error = job.finished_at = None
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
-        self._session.execute(delete(JobSummary).where(JobSummary.job_id == job_id))
+        self._session.execute(delete(StoredSummary).where(StoredSummary.job_id == job_id))
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job

@@ -14,7 +14,7 @@ from service.core.states import JobState
 from service.repositories.runs import entry_equals, select_job_id
 from service.storage.columns import Document
 from service.storage.statements import upsert
-from service.storage.tables import DEFAULT_PROJECT, Job, JobSummary, Run
+from service.storage.tables import DEFAULT_PROJECT, Job, Run, StoredSummary
 
 READ_ROWS = 2_000
 """Rows that are held at a time."""
@@ -177,11 +177,11 @@ def find_quietest_run(
 
 def read_summary(session: Session, job: Job) -> Document | None:
     """Read the stored summary of a job's present attempt; None if there is none."""
-    stored = session.get(JobSummary, job.id)
+    stored = session.get(StoredSummary, job.id)
     return None if stored is None or stored.attempt != job.attempt else stored.document
 
 
 def write_summary(session: Session, job: Job, document: Document) -> None:
     """Store the summary of a job's present attempt. The caller locks the row of the job."""
     row = {"job_id": job.id, "attempt": job.attempt, "document": document}
-    upsert(session, JobSummary, [row])
+    upsert(session, StoredSummary, [row])

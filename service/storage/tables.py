@@ -263,7 +263,7 @@ class Run(Base):
     finished_at: Mapped[datetime | None]
 
 
-class JobSummary(Base):
+class StoredSummary(Base):
     """What pages, figures and tables say of an ended job: `service.sweeps.job_summary`.
 
     It holds for this `attempt` of the job. It is deleted when the job is resumed.

@@ -15,10 +15,9 @@ from service.queue.run_writes import RunOutcome
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
-from service.storage.tables import JobSummary
-from service.sweeps import job_summary
+from service.storage.tables import StoredSummary
+from service.sweeps import job_summary, summary
 from service.sweeps.schemas import SummaryOut
-from service.sweeps.summary import summarise_job
 from tests.database import record_statements
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
@@ -72,7 +71,7 @@ def swept(place: Place) -> tuple[str, Lease, list[str]]:
 
 def summarise(place: Place, job: str, by: list[str] | None = None) -> SummaryOut:
     with place.database.read_session() as session:
-        return summarise_job(session, job, by)
+        return summary.summarise_job(session, job, by)
 
 
 def fail(place: Place, lease: Lease, run: str) -> None:
@@ -161,7 +160,7 @@ def test_a_dispatcher_stores_what_the_first_reader_would_compute(
     finish(place, lease)
     stored = summarise_without_runs(place, job)
     with place.database.write_session() as session:
-        session.delete(session.get_one(JobSummary, job))
+        session.delete(session.get_one(StoredSummary, job))
     forget(monkeypatch)
     assert summarise(place, job) == stored
     assert [group.failed for group in stored.groups] == [1, 0]
@@ -183,7 +182,7 @@ def test_nothing_is_stored_of_a_job_that_runs_or_was_lost(stored_place: Place) -
     with pytest.raises(LeaseLost):
         job_summary.store_summary(stored_place.database, Lease(job, lease.attempt + 1, "late"))
     with stored_place.database.read_session() as session:
-        assert session.get(JobSummary, job) is None
+        assert session.get(StoredSummary, job) is None
 
 
 def test_what_was_stored_of_a_job_is_forgotten_when_it_is_resumed(
@@ -194,7 +193,7 @@ def test_what_was_stored_of_a_job_is_forgotten_when_it_is_resumed(
     assert summarise(stored_place, job).groups[0].failed == 1
     with stored_place.database.write_session() as session:
         JobRepository(session).resume(job)
-        assert session.get(JobSummary, job) is None
+        assert session.get(StoredSummary, job) is None
         JobRepository(session).cancel(job)
     forget(monkeypatch)
     group, _ = summarise(stored_place, job).groups
@@ -205,7 +204,7 @@ def test_too_many_groups_are_refused_before_a_run_is_read(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job, _, _ = swept(place)
-    monkeypatch.setattr("service.sweeps.summary.MAX_GROUPS", 3)
+    monkeypatch.setattr(summary, "MAX_GROUPS", 3)
     with (
         record_statements(place.database) as statements,
         pytest.raises(InvalidRequest, match="more than 3 groups"),

@@ -40,9 +40,9 @@ from service.storage.tables import (
     Checkpoint,
     IdempotencyKey,
     Job,
-    JobSummary,
     MigrationLog,
     RunHistory,
+    StoredSummary,
 )
 from tests.database import record_statements
 from tests.stored import claimed, new_dataset
@@ -132,7 +132,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
         session.add(
             IdempotencyKey(key="k", project_id=DEFAULT_PROJECT, request_hash="", job_id=LARGE)
         )
-        session.add(JobSummary(job_id=ended.job.id, attempt=1, document={}))
+        session.add(StoredSummary(job_id=ended.job.id, attempt=1, document={}))
         LineageRepository(session).add_links("job_1", ["ds_1"], "estimation")
         DatasetRepository(session).add(new_dataset())
         history = {"digest": 1, "n_parameters": 1, "generation": 1, "evaluations": 1, "rms": 1.0}

@@ -14,7 +14,7 @@ import migrations
 from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
-from service.storage.tables import Base, Event, Job, JobSummary, Project, Run
+from service.storage.tables import Base, Event, Job, Project, Run, StoredSummary
 from tests.stored import claimed, record_success
 
 HEAD = migrate.find_head_revision()
@@ -58,7 +58,7 @@ def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back
     claim, runs = claimed(empty_database, n_runs=2)
     record_success(empty_database, claim.lease, runs[0], rms=0.5)
     with empty_database.write_session() as session:
-        session.add(JobSummary(job_id=claim.job.id, attempt=1, document={"a": 1}))
+        session.add(StoredSummary(job_id=claim.job.id, attempt=1, document={"a": 1}))
     kinds = (Job, Run, Event)
     before = [rows(empty_database, kind) for kind in kinds]
     migrate.downgrade_database(empty_database, "0001")
@@ -67,7 +67,7 @@ def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back
         assert [tuple(row) for row in connection.execute(query)] == [(1, 0.5)]
     migrate.upgrade_database(empty_database)
     assert [rows(empty_database, kind) for kind in kinds] == before
-    assert rows(empty_database, JobSummary) == []  # the next reader computes it again
+    assert rows(empty_database, StoredSummary) == []  # the next reader computes it again
 
 
 def rows(database, kind):
