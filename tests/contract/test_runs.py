@@ -330,3 +330,12 @@ def test_text_that_only_looks_like_an_escape_is_kept(database):
     (run,) = runs_of(database, got.job.id)
     assert run.result == {"parameters": [], "note": text}
     assert run.error == text
+
+
+def test_a_job_succeeds_although_runs_of_another_one_wait(database):
+    claimed(database, n_runs=2)
+    got, (run_id,) = claimed(database)
+    record_outcomes(database, got.lease, good(run_id))
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
+    assert job_of(database, got.job.id).state is JobState.SUCCEEDED
