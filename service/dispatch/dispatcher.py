@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.errors import Misconfigured
 from service.core.settings import LOG_FORMAT, Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
-from service.dispatch.cramer_rao import build_bounds_maker
+from service.dispatch.job_end import build_end_maker
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.leases import HeldLeases
 from service.dispatch.recorder import RunRecorder
@@ -75,9 +75,7 @@ class Dispatcher:
         self._recorders: dict[Lease, RunRecorder] = {}
         self._priorities: dict[Lease, int] = {}
         self._is_filling = False
-        self._floors: dict[
-            Lease, DocumentMaker
-        ] = {}  # for jobs with noise, built when their runs end
+        self._last_steps: dict[Lease, DocumentMaker] = {}  # taken when the runs of a job end
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._checked_at = 0.0
@@ -162,12 +160,12 @@ class Dispatcher:
 
     def _take_job(self, claim: Claim) -> None:
         source = JobRuns(self._database, claim, self._store)
-        floors = retry_transient(partial(build_bounds_maker, self._database, claim, source))
+        last_steps = build_end_maker(self._database, claim, source)
         recorder = retry_transient(
             partial(RunRecorder, self._database, claim, source.save_signals, source.note_failure)
         )
-        if floors is not None:
-            self._floors[claim.lease] = floors
+        if last_steps is not None:
+            self._last_steps[claim.lease] = last_steps
         self._recorders[claim.lease] = recorder
         job = claim.job
         self._priorities[claim.lease] = job.priority
@@ -183,9 +181,9 @@ class Dispatcher:
         recorder.is_stopped = True
 
     def _end_runs(self, lease: Lease) -> None:
-        """Handle a job whose runs have ended. Its bounds, if any, are computed before it ends."""
-        recorder, floors = self._recorders[lease], self._floors.pop(lease, None)
-        if floors is None or recorder.is_stopped:
+        """Handle a job whose runs have ended. Its last steps, if any, are taken before it ends."""
+        recorder, last_steps = self._recorders[lease], self._last_steps.pop(lease, None)
+        if last_steps is None or recorder.is_stopped:
             self._conclude_job(lease)
             return
         try:
@@ -194,10 +192,10 @@ class Dispatcher:
             self._drop_lost_job(recorder, error)
             self._conclude_job(lease)
         else:
-            self._side_jobs.start_job(lease, floors)
+            self._side_jobs.start_job(lease, last_steps)
 
     def _list_ready_to_conclude(self) -> list[Lease]:
-        """List jobs whose bounds are ready, or are no longer wanted."""
+        """List jobs whose last steps are done, or are no longer wanted."""
         stopped = [key for key in self._side_jobs.pending_keys if self._recorders[key].is_stopped]
         for lease in stopped:
             self._side_jobs.cancel_job(lease)

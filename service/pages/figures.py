@@ -87,7 +87,7 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
         return plotly.empty_figure()
-    summary = summarise_job(session, job.id, keys, errors_only=True)
+    summary = summarise_job(session, job.id, keys)
     return plot_noise_sweep(summary, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
 

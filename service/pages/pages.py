@@ -271,7 +271,7 @@ def _find_best_run(runs: RunRepository, job: Job) -> Run | None:
 
 def _latest_events(session: Session, job: Job) -> list[Any]:
     # The page shows progress already, so the list has only state changes and log lines.
-    return EventRepository(session).list_latest(job.id, EVENTS_SHOWN, kinds=("state", "log", "end"))
+    return EventRepository(session).list_latest(job.id, EVENTS_SHOWN)
 
 
 def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]:
