@@ -12,9 +12,10 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import blake2b
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -31,13 +32,24 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.jobs.schemas import JobIn
 from service.jobs.submit import submit_job
+from service.queue.packed_results import PackedResults, PackedRows
 from service.repositories.jobs import JobRepository
 from service.storage.migrate import upgrade_database
 from service.storage.objects import open_store
 from service.storage.sessions import Database
 from sysid.data.records import Recording
 from workers.inline_executor import InlineExecutor
-from workers.protocol import Executor, ItemResult, PackHandle, Records, WorkItem
+from workers.protocol import (
+    CompleteRun,
+    Encoder,
+    Executor,
+    ItemResult,
+    PackHandle,
+    PackResult,
+    Records,
+    RunEnd,
+    WorkItem,
+)
 
 SIGMAS, METHODS = [0.01, 0.02, 0.03, 0.04, 0.05], ["simple", "improved"]
 RECORDED_RUNS = 40
@@ -62,18 +74,35 @@ def build_sweep(dataset: str, n_runs: int) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class RecordedRuns:
+    """Complete runs that were computed before, and the records that they were computed on."""
+
+    runs: tuple[CompleteRun, ...]
+    records: Mapping[str, Records]
+
+
 class RecordingExecutor(InlineExecutor):
-    """Computes packs in this process, and keeps their results."""
+    """Computes packs in this process, and keeps their complete runs."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.recorded: list[ItemResult] = []
+        self.recording = RecordedRuns((), {})
 
-    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
-        """Return the results of a pack, and keep those of complete runs."""
-        results = super().fetch_results(handle)
-        self.recorded += [result for result in results if result.outcome is not None]
-        return results
+    def submit_pack(
+        self,
+        pack: Sequence[WorkItem],
+        keys: Sequence[str],
+        shared: Sequence[Any],
+        encoder: Encoder,
+    ) -> PackHandle:
+        """Put a pack at the end of the queue."""
+
+        def record_runs(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> Any:
+            self.recording = RecordedRuns((*self.recording.runs, *complete), records)
+            return encoder(complete, records)
+
+        return super().submit_pack(pack, keys, shared, record_runs)
 
 
 class SimulatedCluster:
@@ -81,20 +110,20 @@ class SimulatedCluster:
 
     Parameters
     ----------
-    recorded : sequence of ItemResult
-        Results of runs, which the workers give in turn.
+    recording : RecordedRuns
+        Runs whose results the workers give in turn.
     seconds : float
         Compute time of a run.
     """
 
-    def __init__(self, slots: int, recorded: Sequence[ItemResult], seconds: float) -> None:
+    def __init__(self, slots: int, recording: RecordedRuns, seconds: float) -> None:
         self.slots = slots
         self.answered: list[tuple[float, int]] = []
         """Time of each answer, and the runs in it."""
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._player = context.Process(
-            target=_play_workers, args=(other, slots, tuple(recorded), seconds), daemon=True
+            target=_play_workers, args=(other, slots, recording, seconds), daemon=True
         )
         self._player.start()
         other.close()
@@ -107,11 +136,16 @@ class SimulatedCluster:
         return 0
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self,
+        pack: Sequence[WorkItem],
+        keys: Sequence[str],
+        shared: Sequence[Any],
+        encoder: Encoder,
     ) -> PackHandle:
         """Send a pack, pickled as Ray would."""
         self._next += 1
-        self._pipe.send_bytes(pickle.dumps((self._next, tuple(pack), tuple(keys)), protocol=5))
+        message = (self._next, encoder, tuple(pack), tuple(keys))
+        self._pipe.send_bytes(pickle.dumps(message, protocol=5))
         return self._next
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
@@ -124,11 +158,11 @@ class SimulatedCluster:
             handles.append(handle)
         return tuple(handles)
 
-    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a pack, unpickled as by Ray."""
-        results: tuple[ItemResult, ...] = pickle.loads(memoryview(self._answers.pop(handle))[8:])
-        self.answered.append((time.perf_counter(), len(results)))
-        return results
+        pack: PackResult = pickle.loads(memoryview(self._answers.pop(handle))[8:])
+        self.answered.append((time.perf_counter(), len(pack.results)))
+        return pack
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Packs end by themselves."""
@@ -142,21 +176,24 @@ class SimulatedCluster:
         self._player.join(10.0)
 
 
-def _play_workers(
-    pipe: Connection, slots: int, recorded: Sequence[ItemResult], seconds: float
-) -> None:
+def _play_workers(pipe: Connection, slots: int, recording: RecordedRuns, seconds: float) -> None:
     """Play the workers: each takes the next pack and answers when its time is over."""
     outgoing: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_send_answers, args=(pipe, outgoing), daemon=True).start()
     outgoing.put(b"ready")
     waiting: deque[tuple[int, float, bytes]] = deque()
     computing: list[tuple[float, int, bytes]] = []
+    scripts: dict[Encoder, list[PackedResults]] = {}
     while True:
         pause = computing[0][0] - time.perf_counter() if computing else 1.0
         try:
             if pipe.poll(max(0.0, pause)):
-                handle, pack, _ = pickle.loads(pipe.recv_bytes())
-                answer = handle.to_bytes(8, "little") + _answer_pack(pack, recorded, seconds)
+                handle, encoder, pack, _ = pickle.loads(pipe.recv_bytes())
+                if encoder not in scripts:
+                    scripts[encoder] = _write_script(encoder, recording, seconds)
+                answer = handle.to_bytes(8, "little") + _answer_pack(
+                    pack, scripts[encoder], seconds
+                )
                 waiting.append((handle, seconds * len(pack), answer))
         except (EOFError, OSError):
             return
@@ -180,12 +217,57 @@ def _send_answers(pipe: Connection, outgoing: "SimpleQueue[bytes]") -> None:
             return
 
 
-def _answer_pack(pack: Sequence[WorkItem], recorded: Sequence[ItemResult], seconds: float) -> bytes:
-    results = tuple(
-        ItemResult(item.run, recorded[item.spec.seed % len(recorded)].outcome, seconds)
-        for item in pack
+_RUN, _HASH = "run_" + 26 * "0", 32 * "0"
+"""Stand for the identifier of a run and the hash of its specification in recorded results."""
+
+
+def _write_script(encoder: Encoder, recording: RecordedRuns, seconds: float) -> list[PackedResults]:
+    """Encode each recorded run by itself, under a name that is replaced later."""
+    script = []
+    for run in recording.runs:
+        encoded = encoder([replace(run, run=_RUN, seconds=seconds)], recording.records)
+        packed = encoded
+        known = str(run.spec.reuse_key)
+        rows = tuple(_rename(block, {known: _HASH}) for block in packed.rows)
+        script.append(replace(packed, rows=rows))
+    return script
+
+
+def _answer_pack(
+    pack: Sequence[WorkItem], script: Sequence[PackedResults], seconds: float
+) -> bytes:
+    parts = [script[item.spec.seed % len(script)] for item in pack]
+    tables: list[list[PackedRows]] = [[], [], []]
+    for item, part in zip(pack, parts, strict=True):
+        names = {_RUN: item.run, _HASH: blake2b(item.run.encode(), digest_size=16).hexdigest()}
+        for table, block in zip(tables, part.rows, strict=True):
+            table.append(_rename(block, names))
+    packed = PackedResults(
+        tuple(item.run for item in pack),
+        sum(part.evaluations for part in parts),
+        max(part.generations for part in parts),
+        min(part.best_rms for part in parts if part.best_rms is not None),
+        {},
+        tuple(map(_join_rows, tables)),
+        b"".join(part.signals for part in parts),
+        parts[0].signals_sha256,
     )
-    return pickle.dumps(results, protocol=5)
+    results = tuple(ItemResult(item.run, RunEnd(), seconds) for item in pack)
+    return pickle.dumps(PackResult(results, packed), protocol=5)
+
+
+def _rename(block: PackedRows, names: Mapping[str, str]) -> PackedRows:
+    if isinstance(block, bytes):
+        for old, new in names.items():
+            block = block.replace(old.encode(), new.encode())
+        return block
+    return [tuple(names.get(value, value) for value in row[:2]) + row[2:] for row in block]
+
+
+def _join_rows(blocks: Sequence[PackedRows]) -> PackedRows:
+    if isinstance(blocks[0], bytes):
+        return b"".join(block for block in blocks if isinstance(block, bytes))
+    return [row for block in blocks for row in block]  # type: ignore[misc]
 
 
 class TimedDatabase(Database):
@@ -263,11 +345,11 @@ class Stage:
         ).dataset.id
         recorder = RecordingExecutor()
         self._carry_out(RECORDED_RUNS, recorder)
-        self._recorded = recorder.recorded
+        self._recording = recorder.recording
 
     def play_sweep(self, n_runs: int, slots: int, seconds: float) -> Played:
         """Carry out a sweep on so many workers, with runs of `seconds`."""
-        cluster = SimulatedCluster(slots, self._recorded, seconds)
+        cluster = SimulatedCluster(slots, self._recording, seconds)
         try:
             job = self._submit(n_runs)
             self._database.seconds = 0.0

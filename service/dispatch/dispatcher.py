@@ -164,7 +164,9 @@ class Dispatcher:
         source = JobRuns(self._database, claim, self._store)
         floors = retry_transient(partial(build_bounds_maker, self._database, claim, source))
         recorder = retry_transient(
-            partial(RunRecorder, self._database, claim, source.save_signals, source.note_failure)
+            partial(
+                RunRecorder, self._database, claim, self._store, source.encoder, source.note_end
+            )
         )
         if floors is not None:
             self._floors[claim.lease] = floors

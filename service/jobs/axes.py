@@ -83,13 +83,16 @@ def build_axis_groups(axes: Sequence[SweepAxisIn], groups: list[list[int]]) -> l
 def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> Iterator[SweepCell]:
     """Iterate over the crossed groups' cells from number `start`; without axes one empty cell."""
     lengths = [len(steps) for steps in groups]
+    positions = [-1] * len(groups)
+    cells = [SweepCell()] * len(groups)
     for number in range(start, prod(lengths)):
         values: dict[str, Any] = {}
         labels: dict[str, float | str] = {}
-        for steps, position in zip(groups, locate_cell(number, lengths), strict=True):
-            cell = steps[position].cell
-            values.update(cell.values)
-            labels.update(cell.labels)
+        for group, position in enumerate(locate_cell(number, lengths)):
+            if positions[group] != position:  # mostly of the last group only
+                positions[group], cells[group] = position, groups[group][position].cell
+            values.update(cells[group].values)
+            labels.update(cells[group].labels)
         yield SweepCell(values, labels)
 
 

@@ -7,12 +7,13 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.queue.leases import Lease, LeaseQueue
+from service.queue.leases import Lease
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks, update_by_id
+from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks
 from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
 
 _COPIED_COLUMNS = (
+    "spec_hash",
     "result",
     "valid",
     "best_rms",
@@ -26,13 +27,6 @@ _COPIED_COLUMNS = (
     "signals_start",
     "signals_size",
 )
-
-
-def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
-    """Write the specification hashes, passed by run; `LeaseLost` without the lease."""
-    LeaseQueue(session).lock_job(lease)
-    rows = ({"id": run, "spec_hash": digest} for run, digest in hashes.items())
-    update_by_id(session, Run, rows)
 
 
 def find_computed_runs(

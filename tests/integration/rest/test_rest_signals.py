@@ -16,6 +16,7 @@ from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
 from tests.rest import recording, settings_of, store_csv
+from workers import job_queue
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 SIGMAS = [0.0, 0.1, 0.2]
@@ -39,8 +40,10 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "reuse": False,
             "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
         }
-        _, runs = identified(app.state.parts, body)
-        yield Served(server, app.state.parts, runs, body)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(job_queue, "choose_pack_size", lambda cost, waiting, slots: waiting)
+            _, runs = identified(app.state.parts, body)
+            yield Served(server, app.state.parts, runs, body)
 
 
 def rows(served: Served, runs: list[str]) -> list[Run]:
@@ -48,7 +51,7 @@ def rows(served: Served, runs: list[str]) -> list[Run]:
         return [RunRepository(session).get(run) for run in runs]
 
 
-def test_each_run_has_a_file_of_its_own_in_one_object(served: Served) -> None:
+def test_each_run_has_a_file_of_its_own_in_the_object_of_its_pack(served: Served) -> None:
     found = [served.server.get(f"/v1/runs/{run}/signals.mcap") for run in served.runs]
     assert len({row.signals_sha256 for row in rows(served, served.runs)}) == 1
     assert len({one.headers["etag"] for one in found}) == len(found)
