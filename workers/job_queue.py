@@ -65,8 +65,9 @@ class JobQueue:
     def read_ahead(self, wanted: int, deadline: float) -> bool:
         """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
-        At least one is read.
+        A pack of them is read in any case, because small packs would take even more time.
         """
+        left = choose_pack_size(self._cost, wanted, 1) - len(self._ready)
         while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._entries, None)
             self._has_no_more = queued is None or isinstance(queued, RunNotReady)
@@ -82,7 +83,8 @@ class JobQueue:
                 run = ActiveRun.from_queue(queued)
                 self._active[run.run] = run
                 self._ready.append(run)
-            if time.monotonic() > deadline:
+            left -= 1
+            if left <= 0 and time.monotonic() > deadline:
                 break
         return bool(self._ready)
 

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 from sqlalchemy.orm import Session
 
@@ -32,6 +33,10 @@ RESULTS_SECONDS = 1.0
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 MAX_REASONS = 3
+MAX_ENDED = 1000
+"""Runs that one transaction ends, about. A longer one would hold up the heartbeat of the job."""
+MAX_STARTED = 500
+"""Runs marked as running in one transaction. Of thousands of short runs most end unmarked."""
 
 RunEndNotice = Callable[[str, Mapping[str, float] | None], None]
 """Receives a run that has ended, and its estimates if it succeeded and they were encoded."""
@@ -219,7 +224,7 @@ class RunRecorder:
         With `floors`, the results are already written (`write_results`), because the bounds refer
         to them.
         """
-        self._store_signals()
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(session, with_progress=True, with_checkpoints=False)
             queue = LeaseQueue(session)
@@ -242,7 +247,7 @@ class RunRecorder:
 
     def cancel_job(self) -> None:
         """End the job as cancelled. Earlier results of its runs remain."""
-        self._store_signals()
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(session, with_progress=True, with_checkpoints=True)
             LeaseQueue(session).finish_job(self.lease, JobState.CANCELLED)
@@ -295,8 +300,38 @@ class RunRecorder:
             self._pending.migrants.extend(migrants)
         return live
 
-    def _commit_writes(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
+    def _prepare_writes(self) -> None:
+        """Store signals, and write results beyond those of one transaction in others before it."""
         self._store_signals()
+        self._drop_ended_starts()
+        while surplus := self._take_surplus():
+            try:
+                with self._database.write_session() as session:
+                    self._write_rows(session, with_progress=False, with_checkpoints=False)
+            except BaseException:
+                self._pending.packs += surplus
+                raise
+            signals = self._pending.stored_signals, self._pending.lost_signals
+            self._mark_written(self._stopwatch(), with_progress=False, with_checkpoints=False)
+            self._pending.packs = surplus
+            self._pending.stored_signals, self._pending.lost_signals = signals
+
+    def _take_surplus(self) -> list[PackedResults]:
+        """Take the packs that are too many for one transaction; at least one stays."""
+        counts = accumulate(len(pack.runs) for pack in self._pending.packs)
+        n_kept = max(1, sum(count <= MAX_ENDED for count in counts))
+        surplus = self._pending.packs[n_kept:]
+        del self._pending.packs[n_kept:]
+        return surplus
+
+    def _drop_ended_starts(self) -> None:
+        """Leave out starts of runs that have ended, which their results tell."""
+        ended = set[str]().union(*(pack.runs for pack in self._pending.packs))
+        started = self._pending.started
+        self._pending.started = [run for run in started if run not in ended]
+
+    def _commit_writes(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(
                 session, with_progress=with_progress, with_checkpoints=with_checkpoints
@@ -329,8 +364,7 @@ class RunRecorder:
     def _write_rows(self, session: Session, *, with_progress: bool, with_checkpoints: bool) -> None:
         writer, pending = RunWriter(session, self.lease), self._pending
         self._reused_outcomes = take_over_runs(session, self.lease, pending.reused)
-        ended = set[str]().union(*(pack.runs for pack in pending.packs))
-        writer.start_runs([run for run in pending.started if run not in ended])
+        writer.start_runs(pending.started[:MAX_STARTED])
         writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
         writer.record_results(pending.packs, pending.lost_signals)
         writer.write_kills(pending.kills)
@@ -350,7 +384,8 @@ class RunRecorder:
             )
 
     def _mark_written(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
-        self._pending, self._results_written_at = _PendingWrites(), now
+        started = self._pending.started[MAX_STARTED:]
+        self._pending, self._results_written_at = _PendingWrites(started), now
         self._evaluations += sum(outcome.evaluations for outcome in self._reused_outcomes)
         self._generation = max(
             [self._generation, *(outcome.generations for outcome in self._reused_outcomes)]

@@ -228,8 +228,9 @@ class RunWriter:
         driver: Any = self._session.connection().connection.driver_connection
         n_ended = 0
         with driver.cursor() as cursor:
-            # The blocks are short and the tables are long, whatever the planner expects.
-            cursor.execute("SET LOCAL enable_hashjoin = off; SET LOCAL enable_mergejoin = off")
+            # Each row is looked up by its key, whatever the planner knows of these tables.
+            for method in ("hashjoin", "mergejoin", "seqscan"):
+                cursor.execute(f"SET LOCAL enable_{method} = off")
             for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
                 cursor.execute(_build_temporary_table(layout))
                 with cursor.copy(f"COPY packed_{layout.table} FROM STDIN (FORMAT BINARY)") as copy:
@@ -327,8 +328,10 @@ _UPDATE_IN_POSTGRES = (
     f"UPDATE runs SET state = {JobState.SUCCEEDED.value!r}, attempt = %s, finished_at = %s, "
     "started_at = coalesce(started_at, %s), "
     + ", ".join(f"{name} = packed.{name}" for name in _RESULT_NAMES)
-    + " FROM packed_runs AS packed WHERE runs.id = packed.id AND runs.job_id = %s "
-    f"AND runs.state IN ({_OPEN_LIST})"
+    # The subquery is not merged into the join: it finds each row by its key.
+    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id FROM runs AS own "
+    "WHERE own.id = packed.id AND own.job_id = %s "
+    f"AND own.state IN ({_OPEN_LIST}) OFFSET 0) AS open WHERE runs.id = open.id"
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.core.states import JobState
-from service.dispatch import fitted_signals
+from service.dispatch import fitted_signals, recorder
 from service.dispatch.checkpoints import unpack_state
 from service.dispatch.encoding import ResultEncoder
 from service.dispatch.recorder import (
@@ -438,6 +438,49 @@ def test_a_run_that_has_ended_already_keeps_its_result_and_counts_once(desk: Des
     with desk.place.database.read_session() as session:
         points = [RunRepository(session).read_history(row.id) for row in rows]
     assert [len(one) for one in points] == [1, 1]
+
+
+@pytest.mark.parametrize("is_refused", [False, True])
+def test_many_results_are_written_in_several_transactions_each_once(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, is_refused: bool
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_ENDED", 2)
+    written: list[int] = []
+    record_results = RunWriter.record_results
+
+    def record(writer: RunWriter, packs: list[PackedResults], lost: set[str]) -> None:
+        if is_refused and len(written) == 1 and written[0] >= 0:
+            written[0] = -written[0]
+            raise ConnectionError("as told")
+        record_results(writer, packs, lost)
+        written.append(len(packs))
+
+    monkeypatch.setattr(RunWriter, "record_results", record)
+    for run in desk.runs:
+        desk.tell_result(run, searched(5, 50, 0.5))
+    if is_refused:
+        with pytest.raises(ConnectionError):
+            desk.recorder.finish_job()
+    desk.recorder.finish_job()
+    assert [abs(count) for count in written] == [2, 2]
+    assert desk.states() == [JobState.SUCCEEDED] * 4
+    assert (desk.place.job(desk.job).n_done, desk.place.job(desk.job).evaluations) == (4, 200)
+
+
+def test_of_many_runs_that_begin_the_first_are_marked_and_the_others_later(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_STARTED", 1)
+    _, second, third, _ = desk.runs
+    for run in desk.runs:
+        desk.recorder.record_start(run)
+    desk.tell_result(second, searched(5, 50, 0.5))
+    expected = [JobState.RUNNING, JobState.SUCCEEDED, JobState.QUEUED, JobState.QUEUED]
+    desk.recorder.write_due()
+    assert desk.states() == expected
+    desk.tell_result(third, searched(5, 50, 0.5))
+    desk.write_after(RESULTS_SECONDS + 0.1)
+    assert desk.states()[2:] == [JobState.SUCCEEDED, JobState.RUNNING]
 
 
 def test_results_of_another_jobs_runs_change_nothing(desk: Desk) -> None:
