@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from service.core.documents import to_finite
 from service.core.json_text import write_json
 from service.dispatch.results import to_history_points, to_migrant_points
-from service.formats.mcap import FitRole, FittedOutput, write_fitted_outputs
+from service.formats.mcap import list_fitted_outputs, write_fitted_outputs
 from service.queue.packed_results import (
     HISTORY_ROWS,
     MIGRANT_ROWS,
@@ -25,8 +25,6 @@ from service.queue.packed_results import (
 )
 from service.repositories.history import pack_history, pack_migrants
 from service.runs.result import to_result_document
-from sysid.core.types import FloatArray
-from sysid.data.records import Record
 from workers.protocol import CompleteRun, Records
 from workers.tasks import prepare_run_records
 
@@ -94,22 +92,13 @@ def write_signals(run: CompleteRun, records: Mapping[str, Records]) -> bytes:
     """Write the file of a run's fitted signals: measured and simulated outputs, as MCAP."""
     data = prepare_run_records(run.spec.problem, records)
     identification = run.concluded.identification
-    fits = [*_list_fits("estimation", data.estimation, identification.simulated)]
+    fits = list_fitted_outputs("estimation", data.estimation, identification.simulated)
     if data.validation is not None:
-        fits += _list_fits("validation", data.validation, identification.simulated_validation)
+        validated = identification.simulated_validation
+        fits += list_fitted_outputs("validation", data.validation, validated)
     target = io.BytesIO()
     write_fitted_outputs(run.run, fits, target)
     return target.getvalue()
-
-
-def _list_fits(
-    role: FitRole, records: Sequence[Record], simulated: tuple[tuple[FloatArray, ...], ...]
-) -> Iterator[FittedOutput]:
-    for number, (record, outputs) in enumerate(zip(records, simulated, strict=True), 1):
-        for channel, values in zip(record.outputs, outputs, strict=True):
-            yield FittedOutput(
-                role, number, channel.name, channel.unit, channel.times, channel.values, values
-            )
 
 
 def _locate_files(files: Sequence[bytes]) -> list[_SignalsPlace]:

@@ -29,7 +29,7 @@ from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from service.storage.statements import CHUNK_ROWS
-from service.storage.tables import Dataset
+from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise
@@ -83,13 +83,21 @@ _MAX_SHARED_PARTS = 256
 
 
 class JobRuns:
-    """Runs and records of one claimed job; implements `workers.protocol.JobSource`."""
+    """Runs and records of one claimed job; implements `workers.protocol.JobSource`.
+
+    Parameters
+    ----------
+    keeps_signals : bool
+        Whether sweeps store fitted signals, unless the job says otherwise.
+    """
 
     def __init__(
         self,
         database: Database,
         claim: Claim,
         store: ObjectStore,
+        *,
+        keeps_signals: bool = False,
     ) -> None:
         self._database, self._lease, self._job = database, claim.lease, claim.job
         self._store = store
@@ -100,6 +108,7 @@ class JobRuns:
         self._shared: OrderedDict[str, _SharedParts] = OrderedDict()
         self.encoder = ResultEncoder(
             "sqlite" if database.is_sqlite else "postgresql",
+            keeps_signals=_choose_keeping(claim.job, default=keeps_signals),
             reports_estimates=self._warm.may_wait,
         )
 
@@ -319,6 +328,12 @@ class JobRuns:
         key = repr(data)
         self._data[key] = data
         return key
+
+
+def _choose_keeping(job: Job, *, default: bool) -> bool:
+    """Choose whether signals are stored: as the job says, else those of a single run."""
+    wanted = job.spec.get("keep_signals")  # older jobs do not have it
+    return job.n_runs == 1 or default if wanted is None else bool(wanted)
 
 
 def _unpack_states(

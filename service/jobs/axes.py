@@ -10,7 +10,7 @@ from service.jobs.schemas import JobIn, SweepAxisIn
 from sysid.core.errors import split_pointer, suggest_name
 
 # Fields of the job as a whole. A cell cannot change them.
-UNSWEPT_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
+UNSWEPT_FIELDS = ("name", "priority", "reuse", "keep_signals", "sweep", "trend")
 
 MAX_LABEL_CHARACTERS = 64
 """Longest name of a label in characters."""

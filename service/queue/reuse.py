@@ -44,9 +44,6 @@ def find_computed_runs(
             Run.project_id == project_id,
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
-            Run.signals_sha256.is_not(
-                None
-            ),  # a run whose signals could not be stored is incomplete
         )
         runs.update(
             {str(digest): run for digest, run in session.execute(query.group_by(Run.spec_hash))}
