@@ -319,7 +319,12 @@ class JobRuns:
             if isinstance(entry, QueuedRun) and (key := entry.spec.reuse_key) is not None
         }
         with self._database.read_session() as session:
-            sources = find_computed_runs(session, set(hashes.values()), self._job.project_id)
+            sources = find_computed_runs(
+                session,
+                set(hashes.values()),
+                self._job.project_id,
+                with_signals=self.encoder.keeps_signals,
+            )
         return {run: sources[key] for run, key in hashes.items() if key in sources}
 
     def _register_data(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select, true, update
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
@@ -30,11 +30,20 @@ _COPIED_COLUMNS = (
 
 
 def find_computed_runs(
-    session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
+    session: Session,
+    hashes: Collection[str],
+    project_id: str = DEFAULT_PROJECT,
+    *,
+    with_signals: bool = False,
 ) -> dict[str, str]:
     """Return the first successful run of the project for each hash that has one.
 
     Runs of deleted jobs are excluded: their signals are garbage and may be missing.
+
+    Parameters
+    ----------
+    with_signals : bool
+        Whether only runs count whose signals are stored.
     """
     runs: dict[str, str] = {}
     for chunk in split_chunks(hashes):
@@ -44,6 +53,7 @@ def find_computed_runs(
             Run.project_id == project_id,
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
+            Run.signals_sha256.is_not(None) if with_signals else true(),
         )
         runs.update(
             {str(digest): run for digest, run in session.execute(query.group_by(Run.spec_hash))}

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
@@ -53,6 +54,9 @@ def resimulate_run(
         if substeps != problem.model.solver.substeps:
             problem = problem.rebuild(model=replace_substeps(problem.untied_model, substeps))
         values = {estimate.name: estimate.value for estimate in estimates}
+        missing = [name for name in problem.free_names if name not in values]
+        if missing:
+            raise InvalidSettings("/parameters", f"there is no estimate of {', '.join(missing)}")
         theta = np.array([values[name] for name in problem.free_names])
         simulated = split_outputs(problem, problem.predict(theta[None])[0])
         if validation is None:

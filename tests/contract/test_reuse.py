@@ -88,12 +88,20 @@ def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
     assert computed == []
 
 
+def test_a_job_that_keeps_signals_takes_over_no_run_without_them(place):
+    carried_out(place, **sweep(2))
+    _, runs, computed = carried_out(place, **sweep(2, keep_signals=True))
+    assert computed == [run.id for run in runs]
+    assert carried_out(place, **sweep(2, keep_signals=True))[2] == []
+
+
 def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(place):
-    first, before, _ = carried_out(place, **sweep(2))
+    kept = {"keep_signals": True}
+    first, before, _ = carried_out(place, **sweep(2, **kept))
     with place.database.write_session() as session:
         JobRepository(session).delete(first)
     delete_orphans(place.database, place.store, older_than=timedelta(0))
-    _, after, computed = carried_out(place, **sweep(2))
+    _, after, computed = carried_out(place, **sweep(2, **kept))
     assert computed == [run.id for run in after]
     assert [run.best_rms for run in after] == [run.best_rms for run in before]
     assert all(place.store.exists(run.signals_sha256) for run in after)

@@ -38,6 +38,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "datasets": [store_csv(server, recording())],
             "algorithm": SMALL,
             "reuse": False,
+            "keep_signals": True,
             "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
         }
         with pytest.MonkeyPatch.context() as patched:
@@ -105,7 +106,14 @@ def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(
         job, runs = identified(served.parts, served.body)
     found = rows(served, runs)
     assert [(row.state.value, row.signals_sha256) for row in found] == [("succeeded", None)] * 3
-    assert served.server.get(f"/v1/runs/{runs[0]}/signals.mcap").status_code == 404
+    again = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap")
+    assert (again.status_code, again.headers["etag"][0]) == (200, '"')
+    stored = served.server.get(f"/v1/runs/{served.runs[0]}/signals.mcap")
+    assert [fit.simulated.tobytes() for fit in read_fitted_outputs(again.content)] == [
+        fit.simulated.tobytes() for fit in read_fitted_outputs(stored.content)
+    ]
+    part = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap", headers={"Range": "bytes=5-20"})
+    assert (part.status_code, part.content) == (206, again.content[5:21])
     events = served.server.get(f"/v1/jobs/{job}/events").text
     assert events.count("are not stored") == 1
     assert f"{runs[0]} and 2 others" in events
