@@ -118,8 +118,6 @@ class SimulatedCluster:
 
     def __init__(self, slots: int, recording: RecordedRuns, seconds: float) -> None:
         self.slots = slots
-        self.answered: list[tuple[float, int]] = []
-        """Time of each answer, and the runs in it."""
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._player = context.Process(
@@ -161,7 +159,6 @@ class SimulatedCluster:
     def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a pack, unpickled as by Ray."""
         pack: PackResult = pickle.loads(memoryview(self._answers.pop(handle))[8:])
-        self.answered.append((time.perf_counter(), len(pack.results)))
         return pack
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
@@ -305,9 +302,9 @@ class Played:
     Attributes
     ----------
     rate : float
-        Runs a second in the middle of the sweep.
+        Runs a second, from the first look at the queue to the end of the job.
     busy : float
-        Workers that had a run to compute then, on average.
+        Workers that had a run to compute, on average.
     cpu, transactions, server : float
         In ms a run: CPU time of the dispatcher, time in its transactions, CPU time of PostgreSQL.
     """
@@ -353,12 +350,13 @@ class Stage:
         try:
             job = self._submit(n_runs)
             self._database.seconds = 0.0
-            server, cpu = self._measure_server(), time.process_time()
+            server, cpu, wall = self._measure_server(), time.process_time(), time.perf_counter()
             self._dispatch(job, cluster)
+            wall = time.perf_counter() - wall
             cpu, server = time.process_time() - cpu, self._measure_server() - server
         finally:
             cluster.close()
-        rate = _compute_rate(cluster.answered, n_runs)
+        rate = n_runs / wall
         each = 1e3 / n_runs
         return Played(
             rate,
@@ -400,18 +398,6 @@ class Stage:
     def _read_state(self, job: str) -> JobState:
         with self._database.read_session() as session:
             return JobRepository(session).get(job).state
-
-
-def _compute_rate(answered: Sequence[tuple[float, int]], n_runs: int) -> float:
-    """Compute runs a second between a quarter and nine tenths of the sweep."""
-    marks: list[tuple[float, int]] = []
-    total = 0
-    for moment, count in answered:
-        total += count
-        if 0.25 * n_runs <= total <= 0.9 * n_runs:
-            marks.append((moment, total))
-    (begun, before), (ended, after) = marks[0], marks[-1]
-    return (after - before) / (ended - begun)
 
 
 @contextmanager
