@@ -258,6 +258,20 @@ def test_history_is_whole_whatever_was_written_before_the_end(desk: Desk) -> Non
             assert [(one.number, one.epoch) for one in log] == [(0, 0), (1, 1), (2, 2)]
 
 
+def test_points_that_were_told_but_not_written_before_the_end_are_not_lost(desk: Desk) -> None:
+    run = desk.runs[0]
+    migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(2))
+    desk.recorder.write_all()
+    desk.tell_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+    desk.tell_result(run, searched(30, 300, 0.9, 0.8, 0.7, migrants=migrants))
+    desk.recorder.write_all()
+    with desk.place.database.read_session() as session:
+        history = RunRepository(session).read_history(run)
+        log = RunRepository(session).read_migrations(run)
+    assert [point.rms for point in history] == [0.9, 0.8, 0.7]
+    assert [one.epoch for one in log] == [0, 1]
+
+
 def end_all(desk: Desk, n_failed: int) -> None:
     for number, run in enumerate(desk.runs):
         if number < n_failed:

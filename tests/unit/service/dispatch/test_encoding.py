@@ -21,7 +21,7 @@ from workers.tasks import process_pack
 
 @pytest.fixture(scope="module")
 def complete() -> list[CompleteRun]:
-    items = [AdvanceRun(f"run_{seed}", spec(seed, generations=5), None, 60.0) for seed in (1, 2)]
+    items = [AdvanceRun(f"run_{seed}", spec(seed, generations=5), None, 60.0) for seed in (1, 2, 3)]
     runs = []
     for item, result in zip(items, process_pack(items, ["short"], RECORDS["short"]), strict=True):
         assert isinstance(result.outcome, RunConclusion)
@@ -56,7 +56,7 @@ def test_a_row_has_the_values_of_its_run(complete: list[CompleteRun]) -> None:
         assert (cells["best_rms"], cells["evaluations"]) == (one.rms, one.evaluations)
         assert (cells["generations"], cells["seconds"]) == (one.generations, 0.25)
         assert cells["fit_estimation"] == one.fit_percent
-    assert packed.runs == ("run_1", "run_2")
+    assert packed.runs == ("run_1", "run_2", "run_3")
     assert packed.evaluations == sum(one.evaluations for one in found)
     assert packed.best_rms == min(one.rms for one in found)
     assert packed.estimates == {}
