@@ -64,9 +64,11 @@ class Dispatcher:
         leases: HeldLeases,
         *,
         project_cores: int | None = None,
+        keeps_signals: bool = False,
     ) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._executor = database, store, executor
+        self._keeps_signals = keeps_signals
         self._woken = threading.Event()
         self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
@@ -159,10 +161,12 @@ class Dispatcher:
         self._woken.set()
 
     def _take_job(self, claim: Claim) -> None:
-        source = JobRuns(self._database, claim, self._store)
-        last_steps = build_end_maker(self._database, claim, source)
+        source = JobRuns(self._database, claim, self._store, keeps_signals=self._keeps_signals)
+        last_steps = retry_transient(partial(build_end_maker, self._database, claim, source))
         recorder = retry_transient(
-            partial(RunRecorder, self._database, claim, source.save_signals, source.note_failure)
+            partial(
+                RunRecorder, self._database, claim, self._store, source.encoder, source.note_end
+            )
         )
         if last_steps is not None:
             self._last_steps[claim.lease] = last_steps
@@ -270,7 +274,12 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
         executor.warm_up_workers()
         leases = HeldLeases(database, settings.lease_seconds)
         dispatcher = Dispatcher(
-            database, store, executor, leases, project_cores=settings.project_cores
+            database,
+            store,
+            executor,
+            leases,
+            project_cores=settings.project_cores,
+            keeps_signals=settings.keep_signals,
         )
         _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()
