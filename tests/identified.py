@@ -30,7 +30,7 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
     floors = build_bounds_maker(parts.database, claim, source)
-    recorder = RunRecorder(parts.database, claim, source.save_signals, source.note_failure)
+    recorder = RunRecorder(parts.database, claim, parts.store, source.encoder, source.note_end)
     feeder: Scheduler[str] = Scheduler(InlineExecutor())
     feeder.add_job(job, source, recorder)
     for _ in range(steps):

@@ -1,13 +1,16 @@
 """Results of runs that no search has found: for tests of what becomes of results."""
 
-from service.dispatch.results import to_run_outcome
+from service.dispatch.encoding import ResultEncoder
 from service.queue.leases import Lease, LeaseQueue
+from service.queue.packed_results import PackedResults
+from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
 from sysid.identification.result import Identification, SearchEvidence
+from sysid.islands.state import RunState
 from sysid.search.state import Improvement, Migrant
 from sysid.uncertainty.estimates import Criteria, Estimate
-from tests.stored import record_outcomes
-from workers.protocol import RunConclusion
+from tests.runs import spec
+from workers.protocol import CompleteRun, RunConclusion
 
 
 def conclude(
@@ -65,8 +68,26 @@ def _build_estimate(name: str, value: float, stderr: float | None) -> Estimate:
 
 def write_results(database: Database, lease: Lease, results: dict[str, RunConclusion]) -> None:
     """End runs of a leased job with these results."""
-    outcomes = [to_run_outcome(run, concluded, 1.0) for run, concluded in results.items()]
-    record_outcomes(database, lease, *outcomes)
+    with database.write_session() as session:
+        packed = encode_results(results, database)
+        RunWriter(session, lease).record_results([packed])
+
+
+def encode_results(
+    results: dict[str, RunConclusion],
+    database: Database,
+    reported: dict[str, RunState] | None = None,
+) -> PackedResults:
+    """Encode results as a worker does, without signals."""
+    encoder = ResultEncoder("sqlite" if database.is_sqlite else "postgresql", keeps_signals=False)
+    told, one = reported or {}, spec()
+    return encoder(
+        [
+            CompleteRun(run, one, concluded, 1.0, told.get(run))
+            for run, concluded in results.items()
+        ],
+        {},
+    )
 
 
 def claim_job(database: Database, job: str) -> Lease:

@@ -1,7 +1,8 @@
 """Small identifications for tests of workers and dispatcher."""
 
+import pickle
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,12 +13,12 @@ from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
 from workers.protocol import (
+    CompleteRun,
     Executor,
     InvalidRun,
     ProblemSpec,
     QueuedRun,
     Records,
-    RunConclusion,
     RunFailure,
     RunSpec,
 )
@@ -74,10 +75,16 @@ class ListedRuns:
         return RECORDS[key]
 
 
+def encode_runs(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> bytes:
+    """Encode runs whole, so that a test can look at them."""
+    return pickle.dumps([(run.run, run.concluded.identification) for run in complete])
+
+
 class Notebook:
     """Keeps what it is told; implements `workers.protocol.RunObserver`."""
 
     def __init__(self) -> None:
+        self.encoder = encode_runs
         self.begun: list[str] = []
         self.states: dict[str, list[RunState]] = {}
         self.results: dict[str, list[Identification]] = {}
@@ -94,8 +101,9 @@ class Notebook:
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         self.states.setdefault(run, []).append(state)
 
-    def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
-        self.results.setdefault(run, []).append(concluded.identification)
+    def record_results(self, encoded: bytes) -> None:
+        for run, identification in pickle.loads(encoded):
+            self.results.setdefault(run, []).append(identification)
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
         self.failures.setdefault(run, []).append(failure)

@@ -11,7 +11,9 @@ from sysid.islands.state import RunState
 from tests.runs import RECORDS, ListedRuns, Notebook, spec
 from workers.protocol import (
     AdvanceRun,
+    Encoder,
     ItemResult,
+    PackResult,
     QueuedRun,
     Records,
     RunFailure,
@@ -41,7 +43,7 @@ class SimulatedExecutor:
         return records
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any], encoder: Encoder
     ) -> int:
         self._next += 1
         self._packs[self._next] = tuple(pack)
@@ -58,8 +60,8 @@ class SimulatedExecutor:
         self._begin()
         return (handle,)
 
-    def fetch_results(self, handle: int) -> tuple[ItemResult, ...]:
-        return tuple(self._done(item) for item in self._packs.pop(handle))
+    def fetch_results(self, handle: int) -> PackResult:
+        return PackResult(tuple(self._done(item) for item in self._packs.pop(handle)))
 
     def cancel_pack(self, handle: int, *, force: bool) -> None:
         raise AssertionError("no job is cancelled here")

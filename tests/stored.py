@@ -27,7 +27,7 @@ class Clock:
 
 def submit(database: Database, name: str = "tube", **values) -> str:
     with database.write_session() as session:
-        new = NewJob(name=name, spec={"model": "tube"}, **values)
+        new = NewJob(name=name, **{"spec": {"model": "tube"}, **values})
         return JobRepository(session).submit(new).job.id
 
 

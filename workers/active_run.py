@@ -33,6 +33,8 @@ class ActiveRun:
     ----------
     has_begun : bool
         Whether this driver sent it to a worker.
+    is_reported : bool
+        Whether the observer was told its state. A checkpoint from the queue is not told.
     slices : int
         Time slices done; 0 before the first.
     kills : int
@@ -56,6 +58,7 @@ class ActiveRun:
     spec: RunSpec
     state: RunState | None
     has_begun: bool = False
+    is_reported: bool = False
     slices: int = 0
     kills: int = 0
     is_suspect: bool = False
@@ -85,7 +88,14 @@ class ActiveRun:
 
     def make_slice(self, cost: MeanCost | None = None) -> WorkItem:
         """Make the next time slice of the whole run; `cost` is that of a run of its job."""
-        return AdvanceRun(self.run, self.spec, self.state, choose_slice_seconds(self.slices, cost))
+        return AdvanceRun(
+            self.run,
+            self.spec,
+            self.state,
+            choose_slice_seconds(self.slices, cost),
+            self.seconds,
+            self.is_reported,
+        )
 
     def split_islands(self) -> list[EvolveIsland]:
         """Make one item for each island that is not at the next border; at least one."""

@@ -2,11 +2,18 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from workers.errors import PackCancelled
-from workers.protocol import ItemResult, PackHandle, Records, WorkItem
-from workers.tasks import process_pack
+from workers.protocol import Encoder, PackHandle, PackResult, Records, WorkItem
+from workers.tasks import run_pack
+
+
+class _Pack(NamedTuple):
+    encoder: Encoder
+    items: tuple[WorkItem, ...]
+    keys: tuple[str, ...]
+    shared: tuple[Records, ...]
 
 
 class InlineExecutor:
@@ -15,10 +22,8 @@ class InlineExecutor:
     def __init__(self, slots: int = 1) -> None:
         self.slots = slots
         self._waiting: deque[int] = deque()
-        self._packs: dict[
-            int, tuple[tuple[WorkItem, ...], tuple[str, ...], tuple[Records, ...]]
-        ] = {}
-        self._results: dict[int, tuple[ItemResult, ...]] = {}
+        self._packs: dict[int, _Pack | None] = {}
+        self._results: dict[int, PackResult] = {}
         self._next = 0
 
     def share_records(self, records: Records) -> Records:
@@ -26,11 +31,15 @@ class InlineExecutor:
         return records
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self,
+        pack: Sequence[WorkItem],
+        keys: Sequence[str],
+        shared: Sequence[Any],
+        encoder: Encoder,
     ) -> PackHandle:
         """Put a pack at the end of the queue."""
         self._next += 1
-        self._packs[self._next] = (tuple(pack), tuple(keys), tuple(shared))
+        self._packs[self._next] = _Pack(encoder, tuple(pack), tuple(keys), tuple(shared))
         self._waiting.append(self._next)
         return self._next
 
@@ -39,12 +48,12 @@ class InlineExecutor:
         if not self._waiting:
             return ()
         handle = self._waiting.popleft()
-        pack, keys, shared = self._packs[handle]
-        if pack:
-            self._results[handle] = process_pack(pack, keys, *shared)
+        pack = self._packs[handle]
+        if pack is not None:
+            self._results[handle] = run_pack(pack.encoder, pack.items, pack.keys, *pack.shared)
         return (handle,)
 
-    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a pack.
 
         Raises
@@ -59,7 +68,7 @@ class InlineExecutor:
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Drop the items of a pack."""
-        self._packs[handle] = ((), (), ())
+        self._packs[handle] = None
 
     def check_cluster_alive(self) -> None:
         """Nothing to do: this process lives."""

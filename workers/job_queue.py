@@ -17,8 +17,9 @@ from workers.protocol import (
     JobEntry,
     JobSource,
     PackHandle,
+    PackResult,
     ReusedRun,
-    RunConclusion,
+    RunEnd,
     RunFailure,
     RunNotReady,
     RunObserver,
@@ -47,25 +48,14 @@ class JobQueue:
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
         self._shared: dict[str, Any] = {}
-        self._unreported: deque[tuple[str, RunConclusion, float]] = deque()
         self._cost = MeanCost()
         self._exhausted = False
         self._has_no_more = False  # at present: the next run waits for unfinished ones
 
     @property
     def is_done(self) -> bool:
-        """Whether all runs were read and reported; none waits or is with the workers."""
-        return self._exhausted and not (self.in_flight or self._ready or self._unreported)
-
-    @property
-    def has_unreported(self) -> bool:
-        """Whether there are results that were not reported to the observer."""
-        return bool(self._unreported)
-
-    @property
-    def unreported_seconds(self) -> float:
-        """Compute time of the results that were not reported to the observer."""
-        return sum(seconds for _, _, seconds in self._unreported)
+        """Whether all runs were read; none waits or is with the workers."""
+        return self._exhausted and not (self.in_flight or self._ready)
 
     @property
     def has_waiting_runs(self) -> bool:
@@ -75,8 +65,9 @@ class JobQueue:
     def read_ahead(self, wanted: int, deadline: float) -> bool:
         """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
-        At least one is read.
+        A pack of them is read in any case, because small packs would take even more time.
         """
+        left = choose_pack_size(self._cost, wanted, 1) - len(self._ready)
         while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._entries, None)
             self._has_no_more = queued is None or isinstance(queued, RunNotReady)
@@ -92,7 +83,8 @@ class JobQueue:
                 run = ActiveRun.from_queue(queued)
                 self._active[run.run] = run
                 self._ready.append(run)
-            if time.monotonic() > deadline:
+            left -= 1
+            if left <= 0 and time.monotonic() > deadline:
                 break
         return bool(self._ready)
 
@@ -109,12 +101,12 @@ class JobQueue:
             size = choose_pack_size(self._cost, len(self._ready), shared_by)
             self._submit_items([run.make_slice(self._cost) for run in self._take_unstarted(size)])
 
-    def absorb_pack(self, handle: PackHandle, results: tuple[ItemResult, ...]) -> None:
+    def absorb_pack(self, handle: PackHandle, pack: PackResult) -> None:
         """Record the results of a pack; islands that were not processed are sent again."""
         items = self.in_flight.pop(handle)
         waiting = self._release_runs(handle, items)
         again: list[WorkItem] = []
-        for item, result in zip(items, results, strict=True):
+        for item, result in zip(items, pack.results, strict=True):
             run = self._active.get(result.run)
             if run is None:
                 continue  # it failed while another of its islands was in flight
@@ -127,16 +119,11 @@ class JobQueue:
                 again.append(item)
             else:
                 self._ready.appendleft(run)
+        if pack.encoded is not None:
+            self.observer.record_results(pack.encoded)
         again = [item for item in again if item.run in self._active]
         if again:
             self._submit_items(again)
-
-    def report_next(self) -> bool:
-        """Report the next result to the observer (slow); return whether there was one."""
-        if self._unreported:
-            self.observer.record_result(*self._unreported.popleft())
-            return True
-        return False
 
     def requeue_lost_pack(self, handle: PackHandle, reason: str) -> None:
         """Queue the runs of a dead worker again from their last state, each alone.
@@ -191,7 +178,7 @@ class JobQueue:
             return
         for name in dict.fromkeys(item.run for item in items):
             self._report_start(self._active[name])
-        handle = self._executor.submit_pack(items, keys, shared)
+        handle = self._executor.submit_pack(items, keys, shared, self.observer.encoder)
         self.in_flight[handle] = tuple(items)
         for item in items:
             self._active[item.run].pack_handles.add(handle)
@@ -222,10 +209,9 @@ class JobQueue:
             case RunFailure() as failure:
                 self._cost = self._cost.add_measurement(result.seconds)
                 self._fail_run(run.run, failure)
-            case RunConclusion() as concluded:
+            case RunEnd():
                 self._cost = self._cost.add_measurement(run.seconds)
                 del self._active[run.run]
-                self._unreported.append((run.run, concluded, run.seconds))
             case RunProgress(state):
                 run.absorb_slice(state, result.seconds)
                 self._continue_run(run)
@@ -248,6 +234,7 @@ class JobQueue:
             run.kills = 0
             self.observer.record_worker_death(run.run, 0)
         self.observer.record_progress(run.run, run.state, run.seconds)
+        run.is_reported = True
         self._ready.appendleft(run)  # finish started runs first, so that few are in progress
 
     def _fail_run(self, name: str, failure: RunFailure) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from workers.protocol import ItemResult, Records, WorkItem
-from workers.tasks import process_pack
+from workers.protocol import Encoder, PackResult, Records, WorkItem
+from workers.tasks import run_pack
 
 MEMORY_SHARE = 0.8
 """Share of the machine's memory for all workers together."""
@@ -27,12 +27,16 @@ def compute_worker_memory(workers: int) -> int:
 
 
 def process_pack_within(
-    limit: int | None, pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
-) -> tuple[ItemResult, ...]:
+    limit: int | None,
+    encoder: Encoder,
+    pack: Sequence[WorkItem],
+    keys: Sequence[str],
+    *shared: Records,
+) -> PackResult:
     """Process a pack in a process that may use `limit` bytes in addition to its program."""
     if limit is not None:
         _limit_memory(limit)
-    return process_pack(pack, keys, *shared)
+    return run_pack(encoder, pack, keys, *shared)
 
 
 @cache

@@ -1,12 +1,12 @@
 """Messages to and from the workers, and the protocols of executor, observer and source."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
@@ -15,7 +15,6 @@ from sysid.identification.fingerprint import compute_fingerprint
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.search.island import Island
-from sysid.search.state import Improvement, Migrant
 
 Records: TypeAlias = tuple[Record, ...]
 WarmStartValues: TypeAlias = tuple[Mapping[str, float], ...]
@@ -66,6 +65,12 @@ class ProblemSpec:
         text = json.dumps(parts, default=_to_json_value)
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
+    def replace_noise(self, noise: Noise) -> "ProblemSpec":
+        """Return the same fit with other noise; the key of all else is not computed again."""
+        other = replace(self, noise=noise)
+        other.__dict__["noise_free_key"] = self.noise_free_key
+        return other
+
     @property
     def record_keys(self) -> tuple[str, ...]:
         """Keys of the shared records."""
@@ -88,6 +93,16 @@ class RunSpec:
     posterior: bool = False
     """Whether the posterior is sampled."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the fields as they are: a dataclass would look them up by name, run by run."""
+        return RunSpec, (
+            self.problem,
+            self.algorithm,
+            self.seed,
+            self.warm_starts,
+            self.posterior,
+        )
+
     @property
     def reuse_key(self) -> str | None:
         """Key that is equal for runs of equal results; None if the result depends on the clock."""
@@ -95,7 +110,7 @@ class RunSpec:
             return None
         parts = (
             self.problem.cache_key,
-            repr(self.algorithm),
+            _describe_algorithm(self.algorithm),
             self.seed,
             [*map(dict, self.warm_starts)],
             self.posterior,
@@ -106,14 +121,34 @@ class RunSpec:
         return blake2b(f"{parts}{fingerprint}".encode(), digest_size=16).hexdigest()
 
 
+@lru_cache(maxsize=256)
+def _describe_algorithm(algorithm: GeneticAlgorithm) -> str:
+    return repr(algorithm)
+
+
 @dataclass(frozen=True, slots=True)
 class AdvanceRun:
-    """Work on a whole run for about `seconds`; from the start if `state` is None."""
+    """Work on a whole run for about `seconds`; from the start if `state` is None.
+
+    Attributes
+    ----------
+    spent : float
+        Compute time so far, in s.
+    is_reported : bool
+        Whether the observer has been told `state`.
+    """
 
     run: str
     spec: RunSpec
     state: RunState | None
     seconds: float
+    spent: float = 0.0
+    is_reported: bool = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the fields as they are, as `RunSpec` does."""
+        fields = (self.run, self.spec, self.state, self.seconds, self.spent, self.is_reported)
+        return AdvanceRun, fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,24 +186,10 @@ class RunConclusion:
     identification: Identification
     rms_noise_free: float | None = None
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle improvements and migrants as plain tuples: named ones cost several times more."""
-        identification = self.identification
-        histories = [[tuple(item) for item in island] for island in identification.history]
-        migrants = [tuple(item) for item in identification.migrations]
-        rest = replace(identification, history=(), migrations=())
-        return _rebuild_conclusion, (rest, histories, migrants, self.rms_noise_free)
 
-
-def _rebuild_conclusion(
-    rest: Identification,
-    histories: list[list[Any]],
-    migrants: list[Any],
-    rms_noise_free: float | None,
-) -> RunConclusion:
-    history = tuple(tuple(map(Improvement._make, island)) for island in histories)
-    identification = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
-    return RunConclusion(identification, rms_noise_free)
+@dataclass(frozen=True, slots=True)
+class RunEnd:
+    """The run is complete; its result is encoded with those of its pack."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,16 +204,52 @@ class RunFailure:
     evaluations: int = 0
 
 
-Outcome: TypeAlias = RunProgress | IslandProgress | RunConclusion | RunFailure
+Outcome: TypeAlias = RunProgress | IslandProgress | RunConclusion | RunEnd | RunFailure
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ItemResult:
-    """Outcome of one item and its compute time in s; None: it was not processed."""
+EncodedRuns: TypeAlias = Any
+"""Complete runs of a pack as they are stored; only the observer looks into it."""
+
+
+class ItemResult(NamedTuple):
+    """Outcome of one item and its compute time in s; None: it was not processed.
+
+    A worker computes a `RunConclusion`. The driver gets a `RunEnd` in its place.
+    """
 
     run: str
     outcome: Outcome | None
     seconds: float
+
+
+class PackResult(NamedTuple):
+    """What a worker returns of a pack: a result for each item, and its complete runs encoded."""
+
+    results: tuple[ItemResult, ...]
+    encoded: EncodedRuns | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompleteRun:
+    """A complete run as its encoder gets it.
+
+    Attributes
+    ----------
+    seconds : float
+        Compute time over all workers.
+    reported : RunState or None
+        The last state that the observer was told: its history need not be encoded again.
+    """
+
+    run: str
+    spec: RunSpec
+    concluded: RunConclusion
+    seconds: float
+    reported: RunState | None = None
+
+
+Encoder: TypeAlias = Callable[[Sequence[CompleteRun], Mapping[str, Records]], EncodedRuns]
+"""Encodes the complete runs of a pack, in the worker."""
 
 
 class Executor(Protocol):
@@ -204,14 +261,18 @@ class Executor(Protocol):
         """Share records once; afterwards only the reference is sent."""
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self,
+        pack: Sequence[WorkItem],
+        keys: Sequence[str],
+        shared: Sequence[Any],
+        encoder: Encoder,
     ) -> PackHandle:
         """Send a pack; `keys` name the shared records in order."""
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
         """Return handles of packs that ended; wait at most `timeout` seconds for the first."""
 
-    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a finished pack, or raise `PackLost`."""
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
@@ -225,7 +286,15 @@ class Executor(Protocol):
 
 
 class RunObserver(Protocol):
-    """Receives the events of the runs of one job."""
+    """Receives the events of the runs of one job.
+
+    Attributes
+    ----------
+    encoder : Encoder
+        Encodes complete runs for `record_results`.
+    """
+
+    encoder: Encoder
 
     def record_start(self, run: str) -> None:
         """The run was sent to a worker for the first time, from its checkpoint or the start."""
@@ -236,8 +305,8 @@ class RunObserver(Protocol):
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can continue from `state` after `seconds` of compute time."""
 
-    def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
-        """The run is complete."""
+    def record_results(self, encoded: EncodedRuns) -> None:
+        """Runs of a pack are complete."""
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """The run failed."""

@@ -28,7 +28,7 @@ from workers.local_ray import (
     LocalRay,
 )
 from workers.memory_limit import compute_worker_memory, process_pack_within
-from workers.protocol import ItemResult, PackHandle, Records, WorkItem
+from workers.protocol import Encoder, PackHandle, PackResult, Records, WorkItem
 from workers.ray_folders import find_folder_processes, kill_processes
 from workers.warmup import warm_up_worker
 
@@ -140,10 +140,14 @@ class RayExecutor:
         return self._ray.put(records)
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self,
+        pack: Sequence[WorkItem],
+        keys: Sequence[str],
+        shared: Sequence[Any],
+        encoder: Encoder,
     ) -> PackHandle:
         """Send a pack; `keys` name the shared records in order."""
-        handle = self._advance.remote(self._memory, tuple(pack), tuple(keys), *shared)
+        handle = self._advance.remote(self._memory, encoder, tuple(pack), tuple(keys), *shared)
         self._in_flight.add(handle)
         return handle
 
@@ -161,7 +165,7 @@ class RayExecutor:
             self._last_answer = time.monotonic()
         return tuple(ready)
 
-    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
+    def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a finished pack.
 
         Raises
@@ -175,7 +179,7 @@ class RayExecutor:
         self._in_flight.discard(handle)
         self._check_processes_alive()
         try:
-            done: tuple[ItemResult, ...] = self._ray.get(handle, timeout=FETCH_SECONDS)
+            done: PackResult = self._ray.get(handle, timeout=FETCH_SECONDS)
         except errors.TaskCancelledError as error:
             raise PackCancelled("cancelled") from error
         except errors.GetTimeoutError as error:

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 from workers.errors import PackFailed, PackLost
 from workers.fair_share import FairShare
 from workers.job_queue import JobQueue
-from workers.packing import PACK_SECONDS, PACKS_PER_CPU
+from workers.packing import PACKS_PER_CPU
 from workers.protocol import Executor, JobSource, PackHandle, RunObserver
 
 _log = logging.getLogger(__name__)
@@ -24,14 +24,6 @@ MIN_PREFETCH_RUNS = 128
 
 READ_SECONDS = 0.05
 """Time that a step spends on reading runs: reused ones need no worker, and may be many."""
-
-MIN_REPORT_SECONDS = 0.02
-MAX_REPORT_SECONDS = 0.25
-"""Limits of the time that a step spends on reporting results, in which signals are stored. Within
-them it equals the time since the last report, so a busy driver spends half of its time on it."""
-
-MAX_UNREPORTED_SECONDS = PACK_SECONDS
-"""Compute time of unreported results, for each core, above which a job gets no further pack."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -53,7 +45,6 @@ class Scheduler(Generic[Key]):
         self._executor = executor
         self._grace, self._project_cores = grace_seconds, project_cores
         self._shares: FairShare[Key] = FairShare()
-        self._reported_at = time.monotonic()
         self._jobs: dict[Key, JobQueue] = {}
         self._stopped: dict[Key, float] = {}  # time of the stop request; inf once forced
 
@@ -86,13 +77,9 @@ class Scheduler(Generic[Key]):
         """
         self._stop_cancelled_jobs()
         self._send_packs()
-        has_news = any(work.has_unreported for work in self._jobs.values())
-        for handle in self._executor.wait_for_packs(0.0 if has_news else timeout):
+        for handle in self._executor.wait_for_packs(timeout):
             self._collect_pack(handle)
         self._send_packs()
-        now = time.monotonic()
-        since = now - self._reported_at
-        self._report_results(now + min(MAX_REPORT_SECONDS, max(MIN_REPORT_SECONDS, since)))
         self._executor.check_cluster_alive()
         ended = tuple(job for job, work in self._jobs.items() if work.is_done)
         for job in ended:
@@ -108,8 +95,6 @@ class Scheduler(Generic[Key]):
                 self._stopped[job] = time.monotonic()
                 self._jobs[job].stop_sending()
                 self._cancel_packs(job, force=False)
-        if jobs is None:
-            self._report_results(float("inf"))
 
     @property
     def _n_in_flight(self) -> int:
@@ -137,24 +122,13 @@ class Scheduler(Generic[Key]):
         for job in self._shares.order_jobs(
             {job: len(work.in_flight) for job, work in active.items()}
         ):
-            if not self._has_project_core(job) or self._has_report_backlog(active[job]):
+            if not self._has_project_core(job):
                 continue
             if active[job].read_ahead(wanted, deadline):
                 return job
             if active[job].in_flight and self.is_saturated:
                 return None
         return None
-
-    def _report_results(self, deadline: float) -> None:
-        """Report results, one of each job in turn, until the time is up.
-
-        Then the workers are served before further results are reported. So a slice of a single run
-        does not wait until all results of a sweep's pack are stored.
-        """
-        while sum(work.report_next() for work in self._jobs.values()):
-            if time.monotonic() > deadline:
-                break
-        self._reported_at = time.monotonic()
 
     def _has_project_core(self, job: Key) -> bool:
         if self._project_cores is None:
@@ -166,9 +140,6 @@ class Scheduler(Generic[Key]):
             if self._shares.get_project(other) == project
         )
         return sum(in_flight) < self._project_cores
-
-    def _has_report_backlog(self, work: JobQueue) -> bool:
-        return work.unreported_seconds > MAX_UNREPORTED_SECONDS * self._executor.slots
 
     def _count_idle_cores(self, chosen: Key) -> int:
         """Count cores that one run of this job may take in addition, without delaying others."""
@@ -184,7 +155,7 @@ class Scheduler(Generic[Key]):
     def _collect_pack(self, handle: PackHandle) -> None:
         owner = next((j for j, work in self._jobs.items() if handle in work.in_flight), None)
         try:
-            results = self._executor.fetch_results(handle)
+            pack = self._executor.fetch_results(handle)
         except PackLost as error:
             if owner is not None:
                 self._record_lost_task(owner, self._jobs[owner], handle, error)
@@ -192,11 +163,11 @@ class Scheduler(Generic[Key]):
         if owner is None:  # its job has ended
             _log.warning("a pack of no job came back")
             return
-        self._shares.charge_seconds(owner, sum(result.seconds for result in results))
+        self._shares.charge_seconds(owner, sum(result.seconds for result in pack.results))
         if owner in self._stopped:
             del self._jobs[owner].in_flight[handle]
         else:
-            self._jobs[owner].absorb_pack(handle, results)
+            self._jobs[owner].absorb_pack(handle, pack)
 
     def _record_lost_task(
         self, job: Key, work: JobQueue, handle: PackHandle, error: PackLost

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,13 +27,17 @@ from sysid.simulation.problem import Problem, compute_reference_rms
 from workers.errors import InvalidCheckpoint
 from workers.protocol import (
     AdvanceRun,
+    CompleteRun,
+    Encoder,
     EvolveIsland,
     IslandProgress,
     ItemResult,
     Outcome,
+    PackResult,
     ProblemSpec,
     Records,
     RunConclusion,
+    RunEnd,
     RunFailure,
     RunProgress,
     WorkItem,
@@ -46,6 +51,73 @@ PACK_LIMIT_SECONDS = 1.0
 MAX_CACHED_PROBLEMS, MAX_CACHED_MODELS = 8, 32
 
 _problem_cache: OrderedDict[str, tuple[str, ProblemPair]] = OrderedDict()
+
+
+def run_pack(
+    encoder: Encoder, pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
+) -> PackResult:
+    """Process the pack, and encode its complete runs."""
+    results = process_pack(pack, keys, *shared)
+    return encode_pack(encoder, pack, results, dict(zip(keys, shared, strict=True)))
+
+
+def encode_pack(
+    encoder: Encoder,
+    pack: Sequence[WorkItem],
+    results: Sequence[ItemResult],
+    records: Mapping[str, Records],
+) -> PackResult:
+    """Encode the complete runs of a pack. One that cannot be encoded fails, and no other."""
+    begun = time.perf_counter()
+    complete = {
+        item.run: CompleteRun(
+            item.run,
+            item.spec,
+            result.outcome,
+            item.spent + result.seconds,
+            item.state if item.is_reported else None,
+        )
+        for item, result in zip(pack, results, strict=True)
+        if isinstance(result.outcome, RunConclusion) and isinstance(item, AdvanceRun)
+    }
+    if not complete:
+        return PackResult(tuple(results))
+    failures: dict[str, RunFailure] = {}
+    try:
+        encoded = encoder([*complete.values()], records)
+    except Exception:  # noqa: BLE001 - the process border: which run it is, is found below
+        failures = _find_unencodable(encoder, complete, records)
+        left = [run for name, run in complete.items() if name not in failures]
+        encoded = encoder(left, records) if left else None
+    each = (time.perf_counter() - begun) / len(complete)
+    ended = {name: failures.get(name, _END) for name in complete}
+    return PackResult(
+        tuple(
+            result
+            if result.run not in ended
+            else ItemResult(result.run, ended[result.run], result.seconds + each)
+            for result in results
+        ),
+        encoded,
+    )
+
+
+_END = RunEnd()
+
+
+def _find_unencodable(
+    encoder: Encoder, complete: Mapping[str, CompleteRun], records: Mapping[str, Records]
+) -> dict[str, RunFailure]:
+    failures: dict[str, RunFailure] = {}
+    for name, run in complete.items():
+        try:
+            encoder([run], records)
+        except Exception as error:  # noqa: BLE001 - the process border: its pack-mates go on
+            _log.exception("the result of run %s cannot be encoded", name)
+            reason = f"internal error: its result cannot be stored: {type(error).__name__}: {error}"
+            evaluations = run.concluded.identification.evaluations
+            failures[name] = RunFailure(reason, "InternalError", evaluations)
+    return failures
 
 
 def process_pack(

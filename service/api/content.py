@@ -7,12 +7,12 @@ body goes to a temporary file; its bytes are hashed and counted as they arrive.
 import asyncio
 import hashlib
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Protocol
 
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
@@ -34,7 +34,6 @@ from service.core.errors import (
 from service.core.settings import Settings
 from service.core.text_checks import parse_digits
 from service.datasets.datasets import check_upload_size
-from service.storage.objects import ObjectStore
 
 MCAP_TYPE = "application/x-mcap"
 # Foxglove and others read from a page of another origin; an id cannot be guessed.
@@ -71,9 +70,37 @@ class ByteRange:
     stop: int
 
 
+class ContentSource(Protocol):
+    """What files are read from: an object store, or memory."""
+
+    def get_size(self, sha256: str) -> int:
+        """Return the size of an object in bytes."""
+        ...
+
+    def get_stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+        """Read an object, or a part of it."""
+        ...
+
+
+class MemoryContent:
+    """One object in memory; a `ContentSource`."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.sha256 = hashlib.sha256(data).hexdigest()
+
+    def get_size(self, sha256: str) -> int:
+        """Return the size in bytes."""
+        return len(self._data)
+
+    def get_stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+        """Read the object, or a part of it."""
+        yield self._data[start : len(self._data) if length is None else start + length]
+
+
 def content_response(
     request: Request,
-    store: ObjectStore,
+    store: ContentSource,
     sha256: str,
     file_name: str,
     part_of: ByteRange | None = None,

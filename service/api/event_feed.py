@@ -2,13 +2,14 @@
 
 A stream that asks the database by itself costs a thread and a connection, several times a second.
 Here one query asks for the news of all jobs that have a stream. Streams of one job that stand at
-the same event share what is read.
+the same event share what is read. Many streams are woken in turns, so that other requests are
+answered between them.
 """
 
 import asyncio
 import json
-from collections import Counter
-from collections.abc import AsyncIterator
+from collections import Counter, defaultdict
+from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from threading import Event as Flag
@@ -23,6 +24,11 @@ from service.storage.sessions import Database
 from service.storage.tables import Event
 
 MAX_BATCH_EVENTS = 500
+SHARE_SECONDS = 1.0
+"""How long events that were read are there for other streams at the same event."""
+WOKEN_STREAMS = 5
+"""Streams that are woken at once: about a millisecond of work."""
+PAUSE_SECONDS = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +63,7 @@ class EventFeed:
         self._heads: dict[str, JobHead] = {}
         self._reads: dict[tuple[str, int], asyncio.Task[EventBatch]] = {}
         self._poller: asyncio.Task[None] | None = None
-        self._changed = asyncio.Event()
+        self._waiting: defaultdict[str, set[asyncio.Future[None]]] = defaultdict(set)
 
     @asynccontextmanager
     async def watch_job(self, job_id: str) -> AsyncIterator[None]:
@@ -94,8 +100,15 @@ class EventFeed:
         if key not in self._reads:
             reading = run_in_threadpool(self._read_batch, job_id, last)
             self._reads[key] = task = asyncio.ensure_future(reading)
-            task.add_done_callback(lambda _: self._reads.pop(key))
+            task.add_done_callback(lambda _: self._share_for_a_while(key, task))
         return await asyncio.shield(self._reads[key])  # a client that leaves does not stop it
+
+    def _share_for_a_while(self, key: tuple[str, int], task: asyncio.Task[EventBatch]) -> None:
+        """Keep events that were read; what had none may be read again at once."""
+        if task.cancelled() or task.exception() is not None or not task.result().text:
+            del self._reads[key]
+        else:
+            asyncio.get_running_loop().call_later(SHARE_SECONDS, self._reads.pop, key)
 
     async def wait_for_news(self, job_id: str, last: int, seconds: float) -> bool:
         """Wait until a job has events after a number, or has ended; False if nothing came."""
@@ -104,10 +117,20 @@ class EventFeed:
         try:
             async with asyncio.timeout(seconds):
                 while not self._has_news(job_id, last, before):
-                    await self._changed.wait()
+                    await self._wait_for_turn(job_id)
         except TimeoutError:
             return False
         return True
+
+    async def _wait_for_turn(self, job_id: str) -> None:
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[job_id].add(turn)
+        try:
+            await turn
+        finally:
+            self._waiting[job_id].discard(turn)
+            if not self._waiting[job_id]:
+                del self._waiting[job_id]
 
     def _has_news(self, job_id: str, last: int, before: JobHead | None) -> bool:
         if self._stopping.is_set() or self._poller is None or self._poller.done():
@@ -119,7 +142,7 @@ class EventFeed:
     def _start_poller(self) -> None:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
-            self._poller.add_done_callback(lambda _: self._wake_streams())
+            self._poller.add_done_callback(lambda _: self._wake_all())
 
     async def _poll(self) -> None:
         """Look for news until there is no stream. If this fails, streams read by themselves."""
@@ -131,13 +154,21 @@ class EventFeed:
                 if not is_transient(error):
                     raise
                 continue  # the database may come back; the streams wait for it
-            has_changed, self._heads = heads != self._heads, heads
-            if has_changed:
-                self._wake_streams()
+            before, self._heads = self._heads, heads
+            await self._wake_streams(job for job in heads if heads[job] != before.get(job))
 
-    def _wake_streams(self) -> None:
-        self._changed.set()
-        self._changed = asyncio.Event()
+    async def _wake_streams(self, jobs: Iterable[str]) -> None:
+        turns = [turn for job in list(jobs) for turn in self._waiting.get(job, ())]
+        for start in range(0, len(turns), WOKEN_STREAMS):
+            for turn in turns[start : start + WOKEN_STREAMS]:
+                _end_turn(turn)
+            if start + WOKEN_STREAMS < len(turns):
+                await asyncio.sleep(PAUSE_SECONDS)
+
+    def _wake_all(self) -> None:
+        for turns in self._waiting.values():
+            for turn in turns:
+                _end_turn(turn)
 
     def _read_heads(self, job_ids: list[str]) -> dict[str, JobHead]:
         with self._database.read_session() as session:
@@ -154,6 +185,11 @@ class EventFeed:
             len(events) == MAX_BATCH_EVENTS,
             state.is_terminal,
         )
+
+
+def _end_turn(turn: asyncio.Future[None]) -> None:
+    if not turn.done():
+        turn.set_result(None)
 
 
 def _format_event(event: Event) -> str:

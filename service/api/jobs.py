@@ -14,9 +14,9 @@ from service.jobs import submit
 from service.jobs.schemas import JobIn, JobOut
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunOrder
-from service.runs import runs, table
+from service.runs import runs
 from service.runs.schemas import RunOut
-from service.sweeps import summary
+from service.sweeps import summary, table
 from service.sweeps.schemas import SummaryOut
 from service.trends import trend
 from service.trends.schemas import TrendOut

@@ -5,13 +5,19 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from service.api.bodies import JsonRoute
-from service.api.content import FILE_ANSWERS, ByteRange, McapResponse, content_response
+from service.api.content import (
+    FILE_ANSWERS,
+    ByteRange,
+    McapResponse,
+    MemoryContent,
+    content_response,
+)
 from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
 from service.core.errors import NotFound
 from service.figures.profiles import plot_profiles as profile_figure
-from service.repositories.runs import RunRepository
+from service.jobs.stored_run import load_run
 from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
 from service.runs.schemas import (
     CompareIn,
@@ -110,10 +116,14 @@ def read_run_signals(
     run_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
     """Download measured and simulated outputs and residuals as MCAP; ranges and ETags work."""
-    run = RunRepository(session).get(run_id)
+    stored = load_run(session, run_id)
+    run, part = stored.run, None
     if run.signals_sha256 is None:
-        raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
-    part = None
+        fits = fitted.load_fitted_signals(session, parts.store, stored)
+        if fits is None:
+            raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
+        content = MemoryContent(fitted.write_signals_file(run_id, fits))
+        return content_response(request, content, content.sha256, f"{run_id}.mcap")
     if run.signals_start is not None and run.signals_size is not None:
         part = ByteRange(run.signals_start, run.signals_start + run.signals_size)
     return content_response(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)

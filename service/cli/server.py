@@ -284,17 +284,17 @@ def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson =
         migrate.check_revision(database)
         store = open_store(settings.resolved_store_url)
         with database.read_session() as session:
-            lost = garbage.find_lost_hashes(session, store)
-            orphans = list(garbage.find_orphans(session, store))
+            lost = sorted(garbage.find_lost_hashes(session, store))
+            n_orphans = sum(1 for _ in garbage.find_orphans(session, store))
         n_deleted, freed = garbage.delete_orphans(database, store) if fix else (0, 0)
     if as_json:
-        found = {"lost": sorted(lost), "without_row": len(orphans)}
+        found = {"lost": lost, "without_row": n_orphans}
         print_json({**found, "deleted": n_deleted, "freed_bytes": freed})
     else:
         if fix:
             out.print(f"deleted {n_deleted} objects, {freed} bytes")
-        out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
-        for sha256 in sorted(lost):
+        out.print(f"tables at head; {len(lost)} objects lost; {n_orphans} objects without a row")
+        for sha256 in lost:
             err.print(f"lost: {sha256}", markup=False)
     if lost:
         raise typer.Exit(1)

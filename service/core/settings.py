@@ -59,6 +59,9 @@ class Settings(BaseSettings):
         Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
     project_cores : int or None
         Cores of each dispatcher that the runs of one project may use; None: all.
+    keep_signals : bool
+        Whether sweeps store the fitted signals of their runs, unless a job says otherwise. Else
+        they are computed again when they are asked for.
     lease_seconds : float
         How long a job stays with a dispatcher that sends no heartbeat.
     data : Path or None
@@ -86,6 +89,7 @@ class Settings(BaseSettings):
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)
     project_cores: int | None = Field(default=None, ge=1)
+    keep_signals: bool = False
     lease_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)
     poll_seconds: float = Field(default=0.3, gt=0)

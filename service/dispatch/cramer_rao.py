@@ -25,12 +25,13 @@ from service.dispatch.background import DocumentMaker
 from service.dispatch.job_runs import JobRuns
 from service.queue.leases import Claim
 from service.repositories.datasets import DatasetRepository
-from service.repositories.summaries import GroupKey, RunGroup, find_quietest_run, read_groups
+from service.repositories.summaries import find_quietest_run
 from service.storage.columns import Document
 from service.storage.errors import StorageError
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run
+from service.sweeps.groups import GroupKey, SweepGroups
 from service.sweeps.true_parameters import find_true_parameters
 from sysid.core.errors import SysidError
 from sysid.core.threads import use_one_thread
@@ -99,19 +100,15 @@ class _BoundsMaker:
             for axis in self._job.spec["sweep"]["axes"]
             if not axis["path"].startswith(IRRELEVANT_FIELDS)
         ]
-        groups = retry_transient(partial(self._group_runs, axes))
-        cells = [dict(zip(axes, group.key, strict=True)) for group in groups[:MAX_PROBLEMS]]
+        keys = [GroupKey("axis", path) for path in axes]
+        groups = SweepGroups(self._job.spec, keys, MAX_PROBLEMS)
+        cells = [dict(zip(axes, key, strict=True)) for key in groups.keys]
         problems = []
         for cell in cells:
             problems.append(self._describe_problem(cell))
             yield None
-        left_out = len(groups) > MAX_PROBLEMS
-        yield {"axes": axes, "problems": problems, "note": LEFT_OUT_NOTE if left_out else ""}
-
-    def _group_runs(self, axes: list[str]) -> list[RunGroup]:
-        keys = [GroupKey("axis", path) for path in axes]
-        with self._database.read_session() as session:
-            return read_groups(session, self._job.id, keys, [], MAX_PROBLEMS, self._job.project_id)
+        note = LEFT_OUT_NOTE if groups.is_cut else ""
+        yield {"axes": axes, "problems": problems, "note": note}
 
     def _describe_problem(self, cell: Mapping[str, Any]) -> Document:
         entry: Document = {

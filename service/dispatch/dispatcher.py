@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.errors import Misconfigured
 from service.core.settings import LOG_FORMAT, Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
-from service.dispatch.cramer_rao import build_bounds_maker
+from service.dispatch.job_end import build_end_maker
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.leases import HeldLeases
 from service.dispatch.recorder import RunRecorder
@@ -64,9 +64,11 @@ class Dispatcher:
         leases: HeldLeases,
         *,
         project_cores: int | None = None,
+        keeps_signals: bool = False,
     ) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._executor = database, store, executor
+        self._keeps_signals = keeps_signals
         self._woken = threading.Event()
         self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
@@ -75,9 +77,7 @@ class Dispatcher:
         self._recorders: dict[Lease, RunRecorder] = {}
         self._priorities: dict[Lease, int] = {}
         self._is_filling = False
-        self._floors: dict[
-            Lease, DocumentMaker
-        ] = {}  # for jobs with noise, built when their runs end
+        self._last_steps: dict[Lease, DocumentMaker] = {}  # taken when the runs of a job end
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._checked_at = 0.0
@@ -161,13 +161,15 @@ class Dispatcher:
         self._woken.set()
 
     def _take_job(self, claim: Claim) -> None:
-        source = JobRuns(self._database, claim, self._store)
-        floors = retry_transient(partial(build_bounds_maker, self._database, claim, source))
+        source = JobRuns(self._database, claim, self._store, keeps_signals=self._keeps_signals)
+        last_steps = retry_transient(partial(build_end_maker, self._database, claim, source))
         recorder = retry_transient(
-            partial(RunRecorder, self._database, claim, source.save_signals, source.note_failure)
+            partial(
+                RunRecorder, self._database, claim, self._store, source.encoder, source.note_end
+            )
         )
-        if floors is not None:
-            self._floors[claim.lease] = floors
+        if last_steps is not None:
+            self._last_steps[claim.lease] = last_steps
         self._recorders[claim.lease] = recorder
         job = claim.job
         self._priorities[claim.lease] = job.priority
@@ -183,9 +185,9 @@ class Dispatcher:
         recorder.is_stopped = True
 
     def _end_runs(self, lease: Lease) -> None:
-        """Handle a job whose runs have ended. Its bounds, if any, are computed before it ends."""
-        recorder, floors = self._recorders[lease], self._floors.pop(lease, None)
-        if floors is None or recorder.is_stopped:
+        """Handle a job whose runs have ended. Its last steps, if any, are taken before it ends."""
+        recorder, last_steps = self._recorders[lease], self._last_steps.pop(lease, None)
+        if last_steps is None or recorder.is_stopped:
             self._conclude_job(lease)
             return
         try:
@@ -194,10 +196,10 @@ class Dispatcher:
             self._drop_lost_job(recorder, error)
             self._conclude_job(lease)
         else:
-            self._side_jobs.start_job(lease, floors)
+            self._side_jobs.start_job(lease, last_steps)
 
     def _list_ready_to_conclude(self) -> list[Lease]:
-        """List jobs whose bounds are ready, or are no longer wanted."""
+        """List jobs whose last steps are done, or are no longer wanted."""
         stopped = [key for key in self._side_jobs.pending_keys if self._recorders[key].is_stopped]
         for lease in stopped:
             self._side_jobs.cancel_job(lease)
@@ -272,7 +274,12 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
         executor.warm_up_workers()
         leases = HeldLeases(database, settings.lease_seconds)
         dispatcher = Dispatcher(
-            database, store, executor, leases, project_cores=settings.project_cores
+            database,
+            store,
+            executor,
+            leases,
+            project_cores=settings.project_cores,
+            keeps_signals=settings.keep_signals,
         )
         _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()

@@ -12,12 +12,7 @@ from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.dispatch.checkpoints import UnreadableCheckpoint, unpack_state
-from service.dispatch.fitted_signals import (
-    FittedPart,
-    SignalsBatch,
-    StoredSignals,
-    add_fitted_signals,
-)
+from service.dispatch.encoding import ResultEncoder
 from service.dispatch.warm_starts import OpenChains, WarmStarts
 from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import build_stored_cells, read_axis_groups
@@ -25,8 +20,8 @@ from service.jobs.to_core import fit_settings_of, to_algorithm
 from service.models.models import load_stored_model
 from service.queue.leases import Claim, LeaseQueue
 from service.queue.previous_attempts import delete_progress
-from service.queue.reuse import find_computed_runs, write_hashes
-from service.queue.run_writes import RunWriter
+from service.queue.reuse import find_computed_runs
+from service.queue.run_writes import RunWriter, WaitingRun
 from service.repositories.datasets import DatasetRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import LeaseLost, StorageError
@@ -34,10 +29,10 @@ from service.storage.objects import ObjectStore
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from service.storage.statements import CHUNK_ROWS
-from service.storage.tables import Dataset, Run
+from service.storage.tables import Dataset, Job
 from sysid.core.errors import SysidError
+from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.model import Model
 from workers.errors import RecordsUnavailable
@@ -53,11 +48,11 @@ from workers.protocol import (
     RunSpec,
     WarmStartValues,
 )
-from workers.tasks import prepare_run_records
 
 _log = logging.getLogger(__name__)
 
-READ_AHEAD = 200
+READ_AHEAD = 500
+"""Runs read in one transaction."""
 MAX_READY_RUNS = 64
 """Runs of different chains read at a time."""
 CACHED_SAMPLES = 1_000_000
@@ -71,23 +66,51 @@ class DataKey(NamedTuple):
     channels: SignalChannels
 
 
+class _SharedParts(NamedTuple):
+    """What is equal in the runs of a sweep that differ only in `_OWN_PATHS`.
+
+    `problem` has no noise. `body` is the body of any of these runs.
+    """
+
+    body: Mapping[str, Any]
+    problem: ProblemSpec
+    algorithm: GeneticAlgorithm
+
+
+_OWN_PATHS = ("/seed", "/noise/seed", "/noise/sigma")
+"""Fields that nearly every run has for itself. All else is built once for many runs."""
+_MAX_SHARED_PARTS = 256
+
+
 class JobRuns:
-    """Runs and records of one claimed job; implements `workers.protocol.JobSource`."""
+    """Runs and records of one claimed job; implements `workers.protocol.JobSource`.
+
+    Parameters
+    ----------
+    keeps_signals : bool
+        Whether sweeps store fitted signals, unless the job says otherwise.
+    """
 
     def __init__(
         self,
         database: Database,
         claim: Claim,
         store: ObjectStore,
+        *,
+        keeps_signals: bool = False,
     ) -> None:
         self._database, self._lease, self._job = database, claim.lease, claim.job
         self._store = store
-        self._signals = SignalsBatch(store)
-        self._problems: dict[str, ProblemSpec] = {}
         self._data: dict[str, DataKey] = {}
         self._cached_records: OrderedDict[str, Records] = OrderedDict()
         self._warm = WarmStarts(database, claim.job)
         self._groups: list[AxisGroup] | None = None
+        self._shared: OrderedDict[str, _SharedParts] = OrderedDict()
+        self.encoder = ResultEncoder(
+            "sqlite" if database.is_sqlite else "postgresql",
+            keeps_signals=_choose_keeping(claim.job, default=keeps_signals),
+            reports_estimates=self._warm.may_wait,
+        )
 
     def iterate_runs(self) -> Iterator[JobEntry]:
         """Iterate over the unfinished runs, each from its checkpoint if it has one.
@@ -110,13 +133,13 @@ class JobRuns:
         except LeaseLost as error:  # the recorder meets it too, and stops the job
             _log.warning("no more runs are read: %s", error)
 
-    def _iterate_in_order(self) -> Iterator[list[Run]]:
+    def _iterate_in_order(self) -> Iterator[list[WaitingRun]]:
         rows = self._read_next_rows(-1)
         while rows:
             yield rows
             rows = self._read_next_rows(rows[-1].number)
 
-    def _iterate_chains(self, chains: OpenChains) -> Iterator[list[Run]]:
+    def _iterate_chains(self, chains: OpenChains) -> Iterator[list[WaitingRun]]:
         """Iterate over ready runs of many chains. Yields no rows while all remaining runs wait."""
         n_created = retry_transient(self._count_made_runs)
         while not chains.is_exhausted:
@@ -130,7 +153,7 @@ class JobRuns:
                 chains.end_run(number)
             yield rows
 
-    def _to_coming_runs(self, rows: list[tuple[Run, RunState | None]]) -> Iterator[JobEntry]:
+    def _to_coming_runs(self, rows: list[tuple[WaitingRun, RunState | None]]) -> Iterator[JobEntry]:
         """Convert rows to runs, or to earlier runs with the same specification."""
         queued = [
             retry_transient(partial(self._build_queued_run, row, state)) for row, state in rows
@@ -140,8 +163,6 @@ class JobRuns:
             source = sources.get(run.run)
             if source is not None:
                 retry_transient(partial(self._warm.record_reuse, run.run, source))
-            elif isinstance(run, QueuedRun):
-                self._problems[run.run] = run.spec.problem
             yield run if source is None else ReusedRun(run.run, source)
 
     def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
@@ -152,7 +173,32 @@ class JobRuns:
         SysidError, ServiceError, StorageError
             If its settings are invalid, or its model is missing.
         """
-        body = build_run_body(self._job.spec, cell)
+        return self._specify_run(cell, self._share_parts(cell), warm)
+
+    def _specify_run(
+        self, cell: Mapping[str, Any], shared: _SharedParts, warm: WarmStartValues
+    ) -> RunSpec:
+        body = shared.body
+        sigma = cell.get("/noise/sigma", body["noise"]["sigma"])
+        noise = Noise(float(sigma), int(cell.get("/noise/seed", body["noise"]["seed"])))
+        return RunSpec(
+            shared.problem.replace_noise(noise),
+            shared.algorithm,
+            int(cell.get("/seed", body["seed"])),
+            warm,
+            posterior=body.get("posterior", False),  # older jobs do not have it
+        )
+
+    def _share_parts(self, cell: Mapping[str, Any]) -> _SharedParts:
+        """Return the parts of a cell's run that it shares with others, built at the first one."""
+        key = repr([(path, value) for path, value in cell.items() if path not in _OWN_PATHS])
+        if key not in self._shared:
+            self._shared[key] = self._build_shared_parts(build_run_body(self._job.spec, cell))
+            if len(self._shared) > _MAX_SHARED_PARTS:
+                self._shared.popitem(last=False)
+        return self._shared[key]
+
+    def _build_shared_parts(self, body: Mapping[str, Any]) -> _SharedParts:
         model = load_stored_model(body["model"])
         validation = body["validation"] or {}
         validation_datasets = validation.get("datasets")
@@ -164,15 +210,8 @@ class JobRuns:
             else self._register_data(validation_datasets, body, model),
             validation_fraction=validation.get("fraction"),
             settings=fit_settings_of(body),
-            noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
         )
-        return RunSpec(
-            problem,
-            to_algorithm(body["algorithm"]),
-            int(body["seed"]),
-            warm,
-            posterior=body.get("posterior", False),  # older jobs do not have it
-        )
+        return _SharedParts(body, problem, to_algorithm(body["algorithm"]))
 
     def load_records(self, key: str) -> Records:
         """Load the records of that key from the object store, or from the cache.
@@ -182,7 +221,7 @@ class JobRuns:
         RecordsUnavailable
             If a dataset or a channel is missing or invalid.
         """
-        if key not in self._cached_records:  # needed by every run of a sweep to store its signals
+        if key not in self._cached_records:
             self._cached_records[key] = self._read_records(key)
             while len(self._cached_records) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
                 self._cached_records.popitem(last=False)
@@ -210,35 +249,15 @@ class JobRuns:
         with self._database.read_session() as session:
             return DatasetRepository(session, self._job.project_id).get_all(datasets)
 
-    def save_signals(self, run: str, identification: Identification) -> StoredSignals | None:
-        """Write the file of a run's fitted signals, to be stored with those of other runs.
-
-        Raises
-        ------
-        ObjectStoreFailed
-            If it cannot be written.
-        """
-        self._warm.record_success(run, identification)
-        problem = self._problems.pop(run)
-        records = {key: self.load_records(key) for key in problem.record_keys}
-        fit_records = prepare_run_records(problem, records)
-        parts: list[FittedPart] = [("estimation", fit_records.estimation, identification.simulated)]
-        if fit_records.validation is not None:
-            parts.append(
-                ("validation", fit_records.validation, identification.simulated_validation)
-            )
-        return add_fitted_signals(self._signals, run, parts)
-
-    def note_failure(self, run: str) -> None:
-        """Record the failure of a run, so that later runs of its chain stop waiting."""
-        self._problems.pop(run, None)
-        self._warm.record_failure(run)
+    def note_end(self, run: str, estimates: Mapping[str, float] | None) -> None:
+        """Record that a run has ended, so that later runs of its chain stop waiting."""
+        self._warm.record_end(run, estimates)
 
     def _read_checkpoints(self) -> dict[str, bytes]:
         with self._database.write_session() as session:
             return RunWriter(session, self._lease).read_checkpoints()
 
-    def _read_next_rows(self, after: int) -> list[Run]:
+    def _read_next_rows(self, after: int) -> list[WaitingRun]:
         """Read unfinished runs after that number. If none is left, the next ones are created."""
         while not (rows := retry_transient(partial(self._read_pending, after))):
             if not retry_transient(self._make_runs):
@@ -266,11 +285,11 @@ class JobRuns:
         with self._database.read_session() as session:
             return RunRepository(session, self._job.project_id).count_created(self._job.id)
 
-    def _read_unfinished(self, numbers: list[int]) -> list[Run]:
+    def _read_unfinished(self, numbers: list[int]) -> list[WaitingRun]:
         with self._database.write_session() as session:
             return RunWriter(session, self._lease).list_unfinished(numbers)
 
-    def _read_pending(self, after: int) -> list[Run]:
+    def _read_pending(self, after: int) -> list[WaitingRun]:
         with self._database.write_session() as session:
             return RunWriter(session, self._lease).list_pending(READ_AHEAD, after)
 
@@ -281,26 +300,31 @@ class JobRuns:
                 for message in messages:
                     LeaseQueue(session).append_event(self._lease, "log", {"message": message})
 
-    def _build_queued_run(self, row: Run, state: RunState | None) -> QueuedRun | InvalidRun:
+    def _build_queued_run(self, row: WaitingRun, state: RunState | None) -> QueuedRun | InvalidRun:
         try:
-            warm = self._warm.find_values(row, build_run_body(self._job.spec, row.cell))
-            spec = self.build_specification(row.cell, warm)
+            shared = self._share_parts(row.cell)
+            warm = self._warm.find_values(row, shared.body["warm_start"])
+            spec = self._specify_run(row.cell, shared, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return InvalidRun(row.id, RunFailure(str(error), type(error).__name__))
         return QueuedRun(row.id, spec, state, row.kills)
 
     def _find_computed_runs(self, queued: list[QueuedRun | InvalidRun]) -> dict[str, str]:
-        """Find earlier runs with the same specification, and write all hashes."""
+        """Find earlier runs with the same specification."""
+        if not self._job.spec["reuse"]:
+            return {}
         hashes = {
             entry.run: key
             for entry in queued
             if isinstance(entry, QueuedRun) and (key := entry.spec.reuse_key) is not None
         }
-        with self._database.write_session() as session:
-            write_hashes(session, self._lease, hashes)
-            if not self._job.spec["reuse"]:
-                return {}
-            sources = find_computed_runs(session, set(hashes.values()), self._job.project_id)
+        with self._database.read_session() as session:
+            sources = find_computed_runs(
+                session,
+                set(hashes.values()),
+                self._job.project_id,
+                with_signals=self.encoder.keeps_signals,
+            )
         return {run: sources[key] for run, key in hashes.items() if key in sources}
 
     def _register_data(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:
@@ -311,8 +335,14 @@ class JobRuns:
         return key
 
 
+def _choose_keeping(job: Job, *, default: bool) -> bool:
+    """Choose whether signals are stored: as the job says, else those of a single run."""
+    wanted = job.spec.get("keep_signals")  # older jobs do not have it
+    return job.n_runs == 1 or default if wanted is None else bool(wanted)
+
+
 def _unpack_states(
-    rows: Sequence[Run], checkpoints: dict[str, bytes]
+    rows: Sequence[WaitingRun], checkpoints: dict[str, bytes]
 ) -> tuple[dict[str, RunState | None], list[str]]:
     """Take the checkpoints of these runs; return their states, and what cannot be read."""
     states: dict[str, RunState | None] = {row.id: None for row in rows}

@@ -3,28 +3,28 @@
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import accumulate
 
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
-from service.dispatch.fitted_signals import SignalsLocation, StoredSignals
-from service.dispatch.results import to_history_points, to_migrant_points, to_run_outcome
+from service.dispatch.fitted_signals import store_signals
+from service.dispatch.results import to_history_points, to_migrant_points
 from service.queue.leases import Claim, JobProgress, LeaseQueue
+from service.queue.packed_results import PackedResults
 from service.queue.previous_attempts import summarize_attempts
 from service.queue.reuse import take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
+from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
-from sysid.search.state import Improvement, Migrant
-from workers.errors import RecordsUnavailable
-from workers.protocol import RunConclusion, RunFailure
+from workers.protocol import Encoder, RunFailure
 
 _log = logging.getLogger(__name__)
 
@@ -33,9 +33,13 @@ RESULTS_SECONDS = 1.0
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 MAX_REASONS = 3
+MAX_ENDED = 1000
+"""Runs that one transaction ends, about. A longer one would hold up the heartbeat of the job."""
+MAX_STARTED = 500
+"""Runs marked as running in one transaction. Of thousands of short runs most end unmarked."""
 
-SaveSignals = Callable[[str, Identification], StoredSignals | None]
-"""Writes the file of a run's fitted signals, ready to be stored."""
+RunEndNotice = Callable[[str, Mapping[str, float] | None], None]
+"""Receives a run that has ended, and its estimates if it succeeded and they were encoded."""
 
 
 @dataclass(slots=True)
@@ -57,16 +61,18 @@ class _PendingWrites:
     started: list[str] = field(default_factory=list)
     reused: dict[str, str] = field(default_factory=dict)
     outcomes: list[RunOutcome] = field(default_factory=list)
+    packs: list[PackedResults] = field(default_factory=list)
     history: list[HistoryPoint] = field(default_factory=list)
     migrants: list[MigrantPoint] = field(default_factory=list)
-    signals: dict[str, StoredSignals] = field(default_factory=dict)
+    stored_signals: set[str] = field(default_factory=set)
+    lost_signals: set[str] = field(default_factory=set)
     messages: list[str] = field(default_factory=list)
     kills: dict[str, int] = field(default_factory=dict)
 
     @property
     def has_runs(self) -> bool:
         """Whether a run has begun, ended or lost its worker."""
-        return bool(self.outcomes or self.started or self.reused or self.kills)
+        return bool(self.outcomes or self.packs or self.started or self.reused or self.kills)
 
 
 class RunRecorder:
@@ -77,6 +83,12 @@ class RunRecorder:
 
     Parameters
     ----------
+    store : ObjectStore
+        Where fitted signals go.
+    encoder : Encoder
+        Encodes complete runs as `PackedResults` in the worker.
+    report_end : callable
+        Receives each run that ended, and its estimates if it succeeded and they are encoded.
     stopwatch : callable
         Elapsed seconds of this process.
     """
@@ -85,20 +97,22 @@ class RunRecorder:
         self,
         database: Database,
         claim: Claim,
-        save_signals: SaveSignals,
-        report_failure: Callable[[str], None],
+        store: ObjectStore,
+        encoder: Encoder,
+        report_end: RunEndNotice,
         *,
         stopwatch: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lease = claim.lease
-        self._report_failure, self._stopwatch = report_failure, stopwatch
+        self.encoder = encoder
+        self._report_end, self._stopwatch = report_end, stopwatch
         self.is_stopped = False
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MAX_REASONS)
         self._reasons = list(before.failure_reasons)
         # Evaluations of runs that have not continued yet.
         self._checkpoint_evaluations = before.checkpoint_evaluations
-        self._database, self._save_signals = database, save_signals
+        self._database, self._store = database, store
         self._live: dict[str, _LiveRun] = {}
         self._pending = _PendingWrites()
         self._n_runs, self._n_done = claim.job.n_runs, claim.job.n_done
@@ -132,31 +146,28 @@ class RunRecorder:
         live.state, live.seconds, live.changed = state, seconds, True
         self._has_new_progress = True
 
-    def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
-        """Record the result of a complete run."""
-        self._checkpoint_evaluations.pop(run, None)
-        identification, live = concluded.identification, self._live.pop(run, None)
-        self._collect_history(run, identification.history, identification.migrations, live)
-        try:
-            signals = self._save_signals(run, identification)
-        except (ObjectStoreFailed, RecordsUnavailable) as error:
-            self._report_unstored_signals([run], error)
-            signals = None
-        if signals is not None:
-            self._pending.signals[run] = signals
-        self._pending.outcomes.append(to_run_outcome(run, concluded, seconds))
-        self._evaluations += identification.evaluations
-        self._generation = max(self._generation, identification.generations)
-        self._best = min(self._best, identification.rms)
-        self._n_done += 1
+    def record_results(self, packed: PackedResults) -> None:
+        """Record the complete runs of a pack."""
+        self._pending.packs.append(packed)
+        if self._live or self._checkpoint_evaluations:
+            for run in packed.runs:
+                self._checkpoint_evaluations.pop(run, None)
+                self._end_live_run(run)
+        for run, estimates in packed.estimates.items():
+            self._report_end(run, estimates)
+        self._evaluations += packed.evaluations
+        self._generation = max(self._generation, packed.generations)
+        if packed.best_rms is not None:
+            self._best = min(self._best, packed.best_rms)
+        self._n_done += len(packed.runs)
         self._has_new_progress = True
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """Record that the run failed."""
-        self._report_failure(run)
-        live, evaluations = self._live.pop(run, None), self._checkpoint_evaluations.pop(run, 0)
+        self._report_end(run, None)
+        evaluations = self._checkpoint_evaluations.pop(run, 0)
+        live = self._end_live_run(run)
         if live is not None:
-            self._collect_history(run, live.state.history, live.state.migrations, live)
             evaluations = live.state.evaluations
         evaluations = failure.evaluations or evaluations
         self._evaluations += evaluations
@@ -213,7 +224,7 @@ class RunRecorder:
         With `floors`, the results are already written (`write_results`), because the bounds refer
         to them.
         """
-        self._store_signals()
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(session, with_progress=True, with_checkpoints=False)
             queue = LeaseQueue(session)
@@ -236,7 +247,7 @@ class RunRecorder:
 
     def cancel_job(self) -> None:
         """End the job as cancelled. Earlier results of its runs remain."""
-        self._store_signals()
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(session, with_progress=True, with_checkpoints=True)
             LeaseQueue(session).finish_job(self.lease, JobState.CANCELLED)
@@ -279,56 +290,83 @@ class RunRecorder:
         reasons = "; ".join(self._reasons)
         return reasons if n_runs == 1 else f"{n_failed} of {n_runs} runs failed: {reasons}"
 
-    def _collect_history(
-        self,
-        run: str,
-        history: tuple[tuple[Improvement, ...], ...],
-        migrants: tuple[Migrant, ...],
-        live: _LiveRun | None,
-    ) -> None:
-        written, logged = ({}, 0) if live is None else (live.written, live.migrants)
-        self._pending.history.extend(to_history_points(run, history, written))
-        self._pending.migrants.extend(to_migrant_points(run, migrants, logged))
+    def _end_live_run(self, run: str) -> _LiveRun | None:
+        """End a run in progress: the history up to its last state is written with its end."""
+        live = self._live.pop(run, None)
+        if live is not None:
+            points = to_history_points(run, live.state.history, live.written)
+            self._pending.history.extend(points)
+            migrants = to_migrant_points(run, live.state.migrations, live.migrants)
+            self._pending.migrants.extend(migrants)
+        return live
+
+    def _prepare_writes(self) -> None:
+        """Store signals, and write results beyond those of one transaction in others before it."""
+        self._store_signals()
+        self._drop_ended_starts()
+        while surplus := self._take_surplus():
+            try:
+                with self._database.write_session() as session:
+                    self._write_rows(session, with_progress=False, with_checkpoints=False)
+            except BaseException:
+                self._pending.packs += surplus
+                raise
+            signals = self._pending.stored_signals, self._pending.lost_signals
+            self._mark_written(self._stopwatch(), with_progress=False, with_checkpoints=False)
+            self._pending.packs = surplus
+            self._pending.stored_signals, self._pending.lost_signals = signals
+
+    def _take_surplus(self) -> list[PackedResults]:
+        """Take the packs that are too many for one transaction; at least one stays."""
+        counts = accumulate(len(pack.runs) for pack in self._pending.packs)
+        n_kept = max(1, sum(count <= MAX_ENDED for count in counts))
+        surplus = self._pending.packs[n_kept:]
+        del self._pending.packs[n_kept:]
+        return surplus
+
+    def _drop_ended_starts(self) -> None:
+        """Leave out starts of runs that have ended, which their results tell."""
+        ended = set[str]().union(*(pack.runs for pack in self._pending.packs))
+        started = self._pending.started
+        self._pending.started = [run for run in started if run not in ended]
 
     def _commit_writes(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
-        self._store_signals()
+        self._prepare_writes()
         with self._database.write_session() as session:
             self._write_rows(
                 session, with_progress=with_progress, with_checkpoints=with_checkpoints
             )
         self._mark_written(now, with_progress=with_progress, with_checkpoints=with_checkpoints)
 
-    def _report_unstored_signals(self, runs: Sequence[str], error: Exception) -> None:
-        """Report unstored signals. The results are written without them."""
-        others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
-        text = f"the signals of {runs[0]}{others} are not stored: {error}"
-        _log.error(text)
-        self._pending.messages.append(text)
-
     def _store_signals(self) -> None:
-        """Store the files of ended runs, before the rows that refer to them."""
-        locations: dict[str, SignalsLocation] = {}
-        failed: dict[int, tuple[Exception, list[str]]] = {}
-        for run, signals in self._pending.signals.items():
+        """Store the signals of ended runs, before the rows that refer to them.
+
+        Without its signals a result is written all the same.
+        """
+        pending, runs, reason = self._pending, list[str](), ""
+        for pack in pending.packs:
+            name = pack.signals_sha256
+            if name is None or name in pending.stored_signals or name in pending.lost_signals:
+                continue
             try:
-                locations[run] = signals.store_file()
+                store_signals(self._store, pack.signals)
+                pending.stored_signals.add(name)
             except ObjectStoreFailed as error:
-                failed.setdefault(id(error), (error, []))[1].append(run)
-        for reason, runs in failed.values():
-            self._report_unstored_signals(runs, reason)
-        self._pending.signals = {}
-        self._pending.outcomes = [
-            outcome
-            if outcome.run_id not in locations
-            else _add_signals_location(outcome, locations[outcome.run_id])
-            for outcome in self._pending.outcomes
-        ]
+                pending.lost_signals.add(name)
+                runs += pack.runs
+                reason = str(error)
+        if runs:
+            others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
+            text = f"the signals of {runs[0]}{others} are not stored: {reason}"
+            _log.error(text)
+            pending.messages.append(text)
 
     def _write_rows(self, session: Session, *, with_progress: bool, with_checkpoints: bool) -> None:
         writer, pending = RunWriter(session, self.lease), self._pending
         self._reused_outcomes = take_over_runs(session, self.lease, pending.reused)
-        writer.start_runs(pending.started)
+        writer.start_runs(pending.started[:MAX_STARTED])
         writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
+        writer.record_results(pending.packs, pending.lost_signals)
         writer.write_kills(pending.kills)
         for text in pending.messages:
             LeaseQueue(session).append_event(self.lease, "log", {"message": text})
@@ -346,7 +384,8 @@ class RunRecorder:
             )
 
     def _mark_written(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
-        self._pending, self._results_written_at = _PendingWrites(), now
+        started = self._pending.started[MAX_STARTED:]
+        self._pending, self._results_written_at = _PendingWrites(started), now
         self._evaluations += sum(outcome.evaluations for outcome in self._reused_outcomes)
         self._generation = max(
             [self._generation, *(outcome.generations for outcome in self._reused_outcomes)]
@@ -361,15 +400,6 @@ class RunRecorder:
             self._checkpoints_written_at = now
             for live in self._live.values():
                 live.changed = False
-
-
-def _add_signals_location(outcome: RunOutcome, location: SignalsLocation) -> RunOutcome:
-    return replace(
-        outcome,
-        signals_sha256=location.sha256,
-        signals_start=location.start,
-        signals_size=location.size,
-    )
 
 
 def _list_rms(outcomes: list[RunOutcome]) -> list[float]:

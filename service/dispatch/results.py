@@ -1,33 +1,10 @@
-"""Conversion of an identification to the rows to store: pure functions."""
+"""Conversion of the history of a run to the points to store: pure functions."""
 
 import math
 from collections.abc import Iterator, Mapping
 
-from service.core.documents import to_finite
-from service.core.states import JobState
-from service.queue.run_writes import RunOutcome
 from service.repositories.history import HistoryPoint, MigrantPoint
-from service.runs.result import to_result_document
 from sysid.search.state import Improvement, Migrant
-from workers.protocol import RunConclusion
-
-
-def to_run_outcome(run: str, concluded: RunConclusion, seconds: float) -> RunOutcome:
-    """Build the row of a run that succeeded, without its signals."""
-    identification, rms_noise_free = concluded.identification, to_finite(concluded.rms_noise_free)
-    return RunOutcome(
-        run_id=run,
-        state=JobState.SUCCEEDED,
-        result={**to_result_document(identification, seconds), "rms_noise_free": rms_noise_free},
-        valid=identification.valid,
-        best_rms=to_finite(identification.rms),
-        rms_noise_free=rms_noise_free,
-        fit_estimation=to_finite(identification.fit_percent),
-        fit_validation=to_finite(identification.fit_percent_validation),
-        evaluations=identification.evaluations,
-        generations=identification.generations,
-        seconds=seconds,
-    )
 
 
 def to_history_points(

@@ -19,10 +19,10 @@ from service.jobs.axes import locate_cell
 from service.jobs.schemas import PREVIOUS, SweepIn
 from service.jobs.stored_cells import read_axis_groups
 from service.jobs.warm_start_order import ChainLayout
+from service.queue.run_writes import WaitingRun
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run
-from sysid.identification.result import Identification
 from workers.protocol import WarmStartValues
 
 MAX_OPEN_CHAINS = 1_000
@@ -183,11 +183,11 @@ class WarmStarts:
         self._chains = OpenChains(chain, self._job.n_runs, wait_rule, ended)
         return self._chains
 
-    def register_run(self, row: Run) -> None:
+    def register_run(self, row: WaitingRun) -> None:
         """Register a run that is sent to the workers. Later runs of its chain wait for it."""
         self._numbers[row.id] = row.number
 
-    def find_values(self, row: Run, body: Mapping[str, Any]) -> WarmStartValues:
+    def find_values(self, row: WaitingRun, reference: str | None) -> WarmStartValues:
         """Find the values that a run begins with. Earlier runs of its chain have ended.
 
         Raises
@@ -195,7 +195,6 @@ class WarmStarts:
         StorageError
             If the run that it names is missing.
         """
-        reference = body["warm_start"]
         if reference is None:
             return ()
         if reference != PREVIOUS:
@@ -204,25 +203,23 @@ class WarmStarts:
         values = self._chains.find_previous_values(row.number, self._read_last_success)
         return () if values is None else (values,)
 
-    def record_success(self, run: str, identification: Identification) -> None:
-        """Record that a run of the job has succeeded."""
-        self._end_run(
-            run, {estimate.name: float(estimate.value) for estimate in identification.estimates}
-        )
+    @property
+    def may_wait(self) -> bool:
+        """Whether runs of the job may start from runs before them."""
+        axes = self._job.spec["sweep"]["axes"]
+        swept = any(axis["path"] == WARM_START_PATH for axis in axes)
+        return swept or self._job.spec["warm_start"] == PREVIOUS
+
+    def record_end(self, run: str, values: Mapping[str, float] | None) -> None:
+        """Record that a run of the job has ended; `values` are its estimates if it succeeded."""
+        number = self._numbers.pop(run, None)
+        if number is not None and self._chains is not None:
+            self._chains.end_run(number, values)
 
     def record_reuse(self, run: str, source: str) -> None:
         """Record that a run takes over the result of `source`."""
         if run in self._numbers:
-            self._end_run(run, self._read_estimates(source))
-
-    def record_failure(self, run: str) -> None:
-        """Record that a run of the job has failed."""
-        self._end_run(run, None)
-
-    def _end_run(self, run: str, values: Mapping[str, float] | None) -> None:
-        number = self._numbers.pop(run, None)
-        if number is not None and self._chains is not None:
-            self._chains.end_run(number, values)
+            self.record_end(run, self._read_estimates(source))
 
     def _read_last_success(self, before: range) -> tuple[int, Mapping[str, float]] | None:
         """Read number and estimates of the last successful run among these."""

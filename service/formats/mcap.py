@@ -39,7 +39,7 @@ from service.formats.topics import (
 )
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
-from sysid.data.records import Channel, History, Recording
+from sysid.data.records import Channel, History, Record, Recording
 
 
 class ByteSink(Protocol):
@@ -75,6 +75,19 @@ class FittedOutput:
     def experiment(self) -> str:
         """Name of the experiment, such as ``estimation 2``."""
         return f"{self.role} {self.number}"
+
+
+def list_fitted_outputs(
+    role: FitRole, records: Sequence[Record], simulated: Sequence[Sequence[FloatArray]]
+) -> list[FittedOutput]:
+    """List the outputs of records with their simulated values."""
+    return [
+        FittedOutput(
+            role, number, channel.name, channel.unit, channel.times, channel.values, values
+        )
+        for number, (record, outputs) in enumerate(zip(records, simulated, strict=True), 1)
+        for channel, values in zip(record.outputs, outputs, strict=True)
+    ]
 
 
 def write_recording(

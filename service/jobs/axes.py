@@ -10,7 +10,7 @@ from service.jobs.schemas import JobIn, SweepAxisIn
 from sysid.core.errors import split_pointer, suggest_name
 
 # Fields of the job as a whole. A cell cannot change them.
-UNSWEPT_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
+UNSWEPT_FIELDS = ("name", "priority", "reuse", "keep_signals", "sweep", "trend")
 
 MAX_LABEL_CHARACTERS = 64
 """Longest name of a label in characters."""
@@ -55,11 +55,15 @@ class AxisGroup(Sequence[AxisPosition]):
     def __getitem__(self, position: Any) -> Any:
         if not -len(self) <= position < len(self):
             raise IndexError(position)
+        pointer = _build_pointer(self.columns[0][0], self.columns[0][1], position)
+        return AxisPosition(pointer, self.build_cell(position))
+
+    def build_cell(self, position: int) -> SweepCell:
+        """Build the values and labels of one position."""
         labels: dict[str, float | str] = {}
         for _, axis, _ in self.columns:
             labels.update(axis.labels[position] if axis.labels else {})
-        cell = SweepCell({axis.path: values[position] for _, axis, values in self.columns}, labels)
-        return AxisPosition(_build_pointer(self.columns[0][0], self.columns[0][1], position), cell)
+        return SweepCell({axis.path: values[position] for _, axis, values in self.columns}, labels)
 
 
 def group_axes(axes: Sequence[SweepAxisIn]) -> list[list[int]]:
@@ -80,16 +84,19 @@ def build_axis_groups(axes: Sequence[SweepAxisIn], groups: list[list[int]]) -> l
     return [AxisGroup.from_axes(axes, numbers) for numbers in groups]
 
 
-def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> Iterator[SweepCell]:
+def iterate_cells(groups: Sequence[AxisGroup], start: int = 0) -> Iterator[SweepCell]:
     """Iterate over the crossed groups' cells from number `start`; without axes one empty cell."""
     lengths = [len(steps) for steps in groups]
+    positions = [-1] * len(groups)
+    cells = [SweepCell()] * len(groups)
     for number in range(start, prod(lengths)):
         values: dict[str, Any] = {}
         labels: dict[str, float | str] = {}
-        for steps, position in zip(groups, locate_cell(number, lengths), strict=True):
-            cell = steps[position].cell
-            values.update(cell.values)
-            labels.update(cell.labels)
+        for group, position in enumerate(locate_cell(number, lengths)):
+            if positions[group] != position:  # mostly of the last group only
+                positions[group], cells[group] = position, groups[group].build_cell(position)
+            values.update(cells[group].values)
+            labels.update(cells[group].labels)
         yield SweepCell(values, labels)
 
 

@@ -253,6 +253,12 @@ class IdentificationIn(Body):
         default=True, description="take over results of earlier runs with the same specification"
     )
 
+    keep_signals: bool | None = Field(
+        default=None,
+        description="store the fitted signals of every run. By default a sweep computes them again "
+        "when they are asked for",
+    )
+
     def dump_set_fields(self, *also: str) -> dict[str, Any]:
         """Dump these fields and those in `also`, if they were set."""
         names = {*IdentificationIn.model_fields, *also}

@@ -18,6 +18,8 @@ from service.storage.columns import Document
 CELLS_AT_SUBMISSION = 2_000
 """Cells created at submission. Most jobs have no more."""
 
+_NO_LABELS: Document = {}
+
 REFERENCE_FIELDS = ("/model", "/datasets", "/validation", "/warm_start")
 """Fields that name stored objects or contain such names."""
 
@@ -36,7 +38,7 @@ def build_stored_cells(
         yield StoredCell(
             number=number,
             cell=dict(cell.values),
-            labels=dict(cell.labels),
+            labels=dict(cell.labels) if cell.labels else _NO_LABELS,
             method=_find_field_value(spec, cell, "algorithm", "method"),
             seed=_find_field_value(spec, cell, "seed"),
             sigma=_find_field_value(spec, cell, "noise", "sigma"),

@@ -28,8 +28,11 @@ from sysid.data.records import Record
 from sysid.data.splitting import split_record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
+from sysid.uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
+    from sysid.identification.fit_problems import FitRecords
+    from sysid.identification.resimulate import FittedSignals
     from sysid.simulation.problem import Problem
 
 
@@ -120,10 +123,49 @@ class StoredRun:
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
         return Problem.from_settings(self.model, records, fit_settings_of(body))
 
+    def resimulate(
+        self, session: Session, store: ObjectStore
+    ) -> "tuple[FitRecords, FittedSignals]":
+        """Compute the fitted signals of a successful run again, bit for bit.
+
+        Returns the records of the fit too.
+
+        Raises
+        ------
+        SysidError, StorageError, ServiceError
+            If a dataset is not there any more, or has no such channel.
+        """
+        # This imports the compiler.
+        from sysid.identification.fit_problems import prepare_records
+        from sysid.identification.resimulate import resimulate_run
+
+        validation = self.body["validation"] or {}
+        model, others = self.requested_model, validation.get("datasets")
+        channels = map_channels(model, self.body["channels"], self.body["hold"])
+        datasets = DatasetRepository(session, self.job.project_id)
+        noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
+        records = prepare_records(
+            read_records(store, datasets.get_all(self.body["datasets"]), channels),
+            None if others is None else read_records(store, datasets.get_all(others), channels),
+            validation.get("fraction"),
+            noise,
+        )
+        substeps = self.result.get("substeps", model.solver.substeps)
+        estimates = [_to_estimate(document) for document in self.estimates]
+        settings = fit_settings_of(self.body)
+        return records, resimulate_run(model, records, settings, estimates, substeps)
+
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""
         names = {parameter.name for parameter in parameters}
         return {name: change for name, change in self.body["parameters"].items() if name in names}
+
+
+def _to_estimate(document: Mapping[str, Any]) -> Estimate:
+    value, lower, upper = (float(document[name]) for name in ("value", "lower", "upper"))
+    return Estimate(
+        document["name"], document["unit"], value, lower, upper, None, None, document["status"]
+    )
 
 
 def load_run(session: Session, run_id: str) -> StoredRun:

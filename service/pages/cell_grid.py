@@ -11,17 +11,17 @@ from sqlalchemy.orm import Session
 from service.core.job_fields import SIGMA_PATH
 from service.core.states import JobState
 from service.core.text import format_count, format_value
-from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity
+from service.repositories.summaries import SummaryQuantity
 from service.storage.columns import to_json
 from service.storage.tables import Job
-from service.sweeps.groups import get_groups
+from service.sweeps.groups import QUANTILES_PER_MILLE, RunGroup
+from service.sweeps.job_summary import list_default_keys, load_summary
 from sysid.core.text import format_number
 
 MAX_LISTED_RUNS = 50
 """Most runs that a page lists; for more it shows the grid."""
-MAX_CELLS = 2_000
 MAX_COLUMNS = 12
-MEDIAN_INDEX = 2  # index of the median among the quantiles
+MEDIAN_INDEX = QUANTILES_PER_MILLE.index(500)
 
 CellKey = tuple[Any, ...]
 
@@ -52,14 +52,12 @@ class GridView:
 
 def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
     """Build the grid of a job; None if it has few runs, or they differ only in seeds."""
-    paths = [axis["path"] for axis in job.spec["sweep"]["axes"]]
-    keys = [path for path in paths if not path.endswith("/seed")]
+    keys = [key.name for key in list_default_keys(job.spec)]
     if job.n_runs <= MAX_LISTED_RUNS or not keys:
         return None
     error = SummaryQuantity("rms_noise_free" if SIGMA_PATH in keys else "rms")
-    named = [GroupKey("axis", path) for path in keys]
-    groups = get_groups(session, job, named, [error], MAX_CELLS)
-    is_cut, groups = len(groups) > MAX_CELLS, groups[:MAX_CELLS]
+    summary = load_summary(session, job)
+    groups = summary.groups
     split = len(keys) - 1 if _fits_as_columns([group.key[-1] for group in groups]) else len(keys)
     columns = _distinct_keys([group.key[split:] for group in groups])
     shares = _rank_medians(groups, error)
@@ -80,7 +78,7 @@ def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> Gr
         column_name=_axis_label(keys[-1]) if split < len(keys) else "",
         columns=[format_value(column[0]) if column else "all" for column in columns],
         rows=rows,
-        is_cut=is_cut,
+        is_cut=summary.is_cut,
     )
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
+from service.core.errors import Conflict
 from service.datasets.recordings import load_recording
 from service.formats.mcap import FitRole, FittedOutput
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
-from service.runs.fitted import read_fitted_signals
+from service.runs.fitted import load_fitted_signals
+from service.runs.residuals import ResidualAnalysis, analyse_residuals
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
@@ -184,13 +186,27 @@ def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrac
     return [to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
 
 
+def read_residual_analysis(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> ResidualAnalysis | None:
+    """Analyse a run's residuals; None until it has signals, or without data."""
+    try:
+        return analyse_residuals(session, store, stored)
+    except Conflict:
+        return None
+
+
 def read_run_experiments(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[ExperimentTraces]:
-    """Read the records that a run was fitted to; empty until the run stores its signals."""
-    if stored.run.signals_sha256 is None:
+    """Read the records that a run was fitted to; empty until it has signals, or without data."""
+    try:
+        fits = load_fitted_signals(session, store, stored)
+    except Conflict:  # a dataset was deleted: the other figures are shown
         return []
-    fitted = _by_experiment(read_fitted_signals(store, stored.run))
+    if fits is None:
+        return []
+    fitted = _by_experiment(fits)
     estimation, validation = fitted["estimation"], fitted["validation"]
     validation_settings = stored.body["validation"] or {}
     inputs = list(_read_inputs(session, store, stored, stored.body["datasets"]))

@@ -14,13 +14,13 @@ from service.pages.diagnostics import plot_residual_tests
 from service.pages.figure_data import (
     read_corner_parameters,
     read_dataset_traces,
+    read_residual_analysis,
     read_run_experiments,
     read_run_figure_data,
 )
 from service.pages.trend import load_trend
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.sweeps.summary import summarise_job
 from sysid.figures import plotly, signals
@@ -66,7 +66,7 @@ def load_run_figure(
         figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
         return figure
     if name == "residuals":
-        tested = analyse_residuals(session, store, stored)
+        tested = read_residual_analysis(session, store, stored)
         if tested is None:
             return plotly.empty_figure()
         _check_experiment(choice.experiment, len(tested.experiments))
@@ -87,7 +87,7 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
         return plotly.empty_figure()
-    summary = summarise_job(session, job.id, keys, errors_only=True)
+    summary = summarise_job(session, job.id, keys)
     return plot_noise_sweep(summary, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
 

@@ -219,14 +219,15 @@ def load_run_row(session: Session, stored: StoredRun) -> RunView:
 def load_full_run(session: Session, stored: StoredRun) -> RunView:
     """Load a run with the heights of its plots, so that the page reserves their room."""
     run, result, model = stored.run, stored.result, stored.model
+    has_signals = run.state is JobState.SUCCEEDED
     names = list_free_parameters(session, stored)
     counts = len(model.outputs), len(model.inputs)
     # Plots that appear when the run ends lie below the live plots; they get their room then.
     heights = {
-        "response": signals.response_height(*counts) if run.signals_sha256 else 0,
+        "response": signals.response_height(*counts) if has_signals else 0,
         "convergence": convergence_height(len(names), columns=3),
         "correlation": correlation_height(len(names)) if result.get("correlation") else 0,
-        "residuals": _residuals_height(result) if run.signals_sha256 else 0,
+        "residuals": _residuals_height(result) if has_signals else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
         "posterior": posterior_height(len((result.get("posterior") or {}).get("parameters", ()))),
     }
@@ -271,7 +272,7 @@ def _find_best_run(runs: RunRepository, job: Job) -> Run | None:
 
 def _latest_events(session: Session, job: Job) -> list[Any]:
     # The page shows progress already, so the list has only state changes and log lines.
-    return EventRepository(session).list_latest(job.id, EVENTS_SHOWN, kinds=("state", "log", "end"))
+    return EventRepository(session).list_latest(job.id, EVENTS_SHOWN)
 
 
 def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]:

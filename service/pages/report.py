@@ -23,6 +23,7 @@ from service.pages.dataset_links import count_unlisted_datasets, dataset_links
 from service.pages.diagnostics import plot_residual_tests
 from service.pages.figure_data import (
     read_corner_parameters,
+    read_residual_analysis,
     read_run_experiments,
     read_run_figure_data,
 )
@@ -39,7 +40,6 @@ from service.pages.trend import load_trend, to_trend_view
 from service.pages.views import RunView, to_job_view
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunOrder, RunRepository
-from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
@@ -238,7 +238,7 @@ def _run_figures(
     for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
         title = f"Measured against identified: {experiment.name}"
         titled.append((title, signals.plot_response(experiment)))
-    tested = analyse_residuals(session, store, stored)
+    tested = read_residual_analysis(session, store, stored)
     if tested is not None:
         titled += [
             (f"Correlation of the residuals: {name}", plot_residual_tests(tested, number))

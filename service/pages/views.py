@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Any
 
 from service.core.job_fields import DATASETS_PATH
-from service.core.states import OPEN_STATES, StateName
+from service.core.states import OPEN_STATES, JobState, StateName
 from service.core.text import format_count, format_value
 from service.core.wire import Answer
 from service.jobs.schemas import JobOut
@@ -145,7 +145,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         unit=unit,
         estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
         warnings=result.get("warnings", ()),
-        has_signals=run.signals_sha256 is not None,
+        has_signals=run.state is JobState.SUCCEEDED,
         heights=heights,
         diagnostics=to_diagnostics(result),
         posterior=to_posterior_views(result),

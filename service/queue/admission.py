@@ -1,8 +1,9 @@
 """Admission of jobs: those that a dispatcher claims, and those that a project may submit."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import ColumnElement, Subquery, func, or_, select
+from sqlalchemy import BindParameter, ColumnElement, Subquery, bindparam, func, or_, select
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
@@ -29,6 +30,21 @@ class Admission:
         return or_(job.n_runs <= self.max_runs, job.priority > self.above_priority)
 
 
+def is_open(job: type[Job] = Job) -> ColumnElement[bool]:
+    """Return the condition that a row of `jobs` is queued or running.
+
+    Its values are written out: SQLite then sees that the index of open jobs has all such rows.
+    """
+    states: BindParameter[Any] = bindparam(None, OPEN_STATES, expanding=True, literal_execute=True)
+    condition: ColumnElement[bool] = job.state.in_(states)
+    return condition
+
+
+def is_in_state(state: JobState, job: type[Job] = Job) -> ColumnElement[bool]:
+    """Return the condition that a row of `jobs` is in this open state, found by the same index."""
+    return is_open(job) & (job.state == state)
+
+
 @dataclass(frozen=True, slots=True)
 class UnfinishedWork:
     """Queued and running jobs of a project, and their unfinished runs."""
@@ -39,11 +55,13 @@ class UnfinishedWork:
 
 def count_unfinished(session: Session, project_id: str) -> UnfinishedWork:
     """Count the unfinished jobs and runs of a project."""
-    query = select(func.count(), func.coalesce(func.sum(Job.n_runs - Job.n_done), 0)).where(
-        Job.state.in_(OPEN_STATES), Job.project_id == project_id
-    )
-    jobs, runs = session.execute(query).one()
-    return UnfinishedWork(int(jobs), int(runs))
+    counts = func.count(), func.sum(Job.n_runs - Job.n_done)
+    # Of all projects: with a condition on one, SQLite may search all jobs that it ever had.
+    query = select(Job.project_id, *counts).where(is_open()).group_by(Job.project_id)
+    for project, jobs, runs in session.execute(query):
+        if project == project_id:
+            return UnfinishedWork(int(jobs), int(runs))
+    return UnfinishedWork(0, 0)
 
 
 def count_running_jobs() -> Subquery:
@@ -52,5 +70,5 @@ def count_running_jobs() -> Subquery:
     Columns ``project_id`` and ``n``. A project without running jobs is not among them.
     """
     count = func.count().label("n")
-    running = select(Job.project_id, count).where(Job.state == JobState.RUNNING)
+    running = select(Job.project_id, count).where(is_in_state(JobState.RUNNING))
     return running.group_by(Job.project_id).subquery("in_hand")

@@ -30,7 +30,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Session, aliased, defer
 
 from service.core.states import OPEN_STATES, JobState
-from service.queue.admission import Admission, count_running_jobs
+from service.queue.admission import Admission, count_running_jobs, is_in_state
 from service.queue.clocks import Clock, choose_database_clock
 from service.repositories.events import EventKind, EventRepository
 from service.repositories.jobs import end_open_runs, notify_queue
@@ -141,7 +141,7 @@ class LeaseQueue:
         first = (
             select(waiting.id)
             .outerjoin(running_jobs, running_jobs.c.project_id == waiting.project_id)
-            .where(waiting.state == JobState.QUEUED)
+            .where(is_in_state(JobState.QUEUED, waiting))
             .where(true() if admission is None else admission.admits(waiting))
             .order_by(waiting.priority.desc(), func.coalesce(running_jobs.c.n, 0), waiting.id)
             .limit(1)
@@ -155,6 +155,7 @@ class LeaseQueue:
             .values(
                 state=JobState.RUNNING,
                 attempt=Job.attempt + 1,
+                n_done_at_claim=Job.n_done,
                 lease_owner=owner,
                 lease_until=now + lease,
                 started_at=func.coalesce(Job.started_at, now),
@@ -294,7 +295,7 @@ class LeaseQueue:
         """Return whether a lease is to be reaped, or ends later than any valid lease."""
         now = self._read_clock()
         is_wrong = or_(_is_expired(now, owners), _ends_too_late(now, owners))
-        query = select(exists().where(Job.state == JobState.RUNNING, is_wrong))
+        query = select(exists().where(is_in_state(JobState.RUNNING), is_wrong))
         return bool(self._session.scalar(query))
 
     def reap_expired(self, owners: LeaseOwners | None = None) -> ReapResult:
@@ -310,7 +311,7 @@ class LeaseQueue:
         """
         now, current_owners = self._read_clock(), owners or LeaseOwners()
         ahead = update(Job).where(
-            Job.state == JobState.RUNNING, _ends_too_late(now, current_owners)
+            is_in_state(JobState.RUNNING), _ends_too_late(now, current_owners)
         )
         ends = _choose_by_owner(
             {owner: now + length for owner, length in current_owners.lease_lengths.items()}, now
@@ -318,7 +319,7 @@ class LeaseQueue:
         self._session.execute(ahead.values(lease_until=ends), execution_options=RETURNING_OPTIONS)
         expired = (
             select(Job)
-            .where(Job.state == JobState.RUNNING, _is_expired(now, current_owners))
+            .where(is_in_state(JobState.RUNNING), _is_expired(now, current_owners))
             .with_for_update(skip_locked=True, key_share=True)
             .options(_DEFER_SPEC)
         )
@@ -348,14 +349,17 @@ class LeaseQueue:
 
     def _correct_best_rms(self, job: Job) -> None:
         """Take the best RMS from the results; a running run reports its fitness only."""
-        best = self._session.scalar(select(func.min(Run.best_rms)).where(Run.job_id == job.id))
+        of_job = Run.job_id == job.id, Run.best_rms.is_not(None)  # as in its index
+        best = self._session.scalar(select(func.min(Run.best_rms)).where(*of_job))
         if best is not None:
             job.best_rms = best
 
     def _check_runs_finished(self, job: Job) -> None:
         """Check that all runs have finished, including those that are not created yet."""
-        ended = select(func.count()).where(Run.job_id == job.id, Run.state.not_in(OPEN_STATES))
-        n_left = job.n_runs - (self._session.scalar(ended) or 0)
+        unfinished = select(func.count()).where(Run.job_id == job.id, Run.state.in_(OPEN_STATES))
+        last = self._session.scalar(select(func.max(Run.number)).where(Run.job_id == job.id))
+        n_created = 0 if last is None else last + 1
+        n_left = job.n_runs - n_created + (self._session.scalar(unfinished) or 0)
         if n_left:
             raise RowConflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
@@ -396,11 +400,8 @@ class LeaseQueue:
 
 def _has_progressed() -> ColumnElement[bool]:
     """Return the condition that a run of a job ended or was checkpointed in this attempt."""
-    ended = exists().where(
-        Run.job_id == Job.id, Run.attempt == Job.attempt, Run.state.not_in(OPEN_STATES)
-    )
     checkpointed = exists().where(Checkpoint.job_id == Job.id, Checkpoint.attempt == Job.attempt)
-    return or_(ended, checkpointed)
+    return or_(Job.n_done > Job.n_done_at_claim, checkpointed)
 
 
 def _is_expired(now: datetime, owners: LeaseOwners) -> ColumnElement[bool]:

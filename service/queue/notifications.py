@@ -13,7 +13,7 @@ from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.queue.admission import Admission
+from service.queue.admission import Admission, is_in_state
 from service.repositories.jobs import QUEUE_CHANNEL
 from service.storage.sessions import Database
 from service.storage.tables import Job
@@ -130,7 +130,7 @@ class _PostgresqlNotifier(Notifier):
 
 # Built once: building a statement costs more than executing it.
 # Only the key, so that the indexes alone can answer.
-_QUEUED_JOBS = select(Job.id).where(Job.state == JobState.QUEUED)
+_QUEUED_JOBS = select(Job.id).where(is_in_state(JobState.QUEUED))
 _CANCELLED_JOBS = select(Job.id).where(
     Job.lease_owner == bindparam("owner"), Job.state == JobState.RUNNING, Job.cancel_requested
 )

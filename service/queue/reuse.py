@@ -3,16 +3,17 @@
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select, true, update
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.queue.leases import Lease, LeaseQueue
+from service.queue.leases import Lease
 from service.queue.run_writes import RunOutcome, RunWriter
-from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks, update_by_id
+from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks
 from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
 
 _COPIED_COLUMNS = (
+    "spec_hash",
     "result",
     "valid",
     "best_rms",
@@ -28,19 +29,21 @@ _COPIED_COLUMNS = (
 )
 
 
-def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
-    """Write the specification hashes, passed by run; `LeaseLost` without the lease."""
-    LeaseQueue(session).lock_job(lease)
-    rows = ({"id": run, "spec_hash": digest} for run, digest in hashes.items())
-    update_by_id(session, Run, rows)
-
-
 def find_computed_runs(
-    session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
+    session: Session,
+    hashes: Collection[str],
+    project_id: str = DEFAULT_PROJECT,
+    *,
+    with_signals: bool = False,
 ) -> dict[str, str]:
     """Return the first successful run of the project for each hash that has one.
 
     Runs of deleted jobs are excluded: their signals are garbage and may be missing.
+
+    Parameters
+    ----------
+    with_signals : bool
+        Whether only runs count whose signals are stored.
     """
     runs: dict[str, str] = {}
     for chunk in split_chunks(hashes):
@@ -50,9 +53,7 @@ def find_computed_runs(
             Run.project_id == project_id,
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
-            Run.signals_sha256.is_not(
-                None
-            ),  # a run whose signals could not be stored is incomplete
+            Run.signals_sha256.is_not(None) if with_signals else true(),
         )
         runs.update(
             {str(digest): run for digest, run in session.execute(query.group_by(Run.spec_hash))}

@@ -2,16 +2,25 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import chain
+from typing import Any, NamedTuple
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import Select, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
 from service.queue.clocks import Clock
 from service.queue.leases import FinalState, Lease, LeaseQueue, choose_smaller_rms
+from service.queue.packed_results import (
+    COPY_END,
+    COPY_HEAD,
+    LAYOUTS,
+    RESULT_ROWS,
+    PackedResults,
+    RowLayout,
+)
 from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
-from service.storage.columns import Document, utc_now
+from service.storage.columns import Document, UtcDateTime, utc_now
 from service.storage.statements import (
     CHUNK_ROWS,
     RETURNING_OPTIONS,
@@ -46,6 +55,15 @@ class NewRun:
     sigma: float | None = None
 
 
+class WaitingRun(NamedTuple):
+    """An unfinished run: what is needed to compute it."""
+
+    id: str
+    number: int
+    cell: Document
+    kills: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutcome:
     """Outcome of a run. `result` is the document of the run result; None if the run failed."""
@@ -53,6 +71,7 @@ class RunOutcome:
     run_id: str
     state: FinalState
     error: str | None = None
+    spec_hash: str | None = None
     result: Document | None = None
     valid: bool | None = None
     best_rms: float | None = None
@@ -83,22 +102,25 @@ class RunWriter:
         """Create the runs of the job; existing runs stay, so a second call is harmless."""
         insert_runs(self._session, self._lock_job(), cells)
 
-    def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[Run]:
+    def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[WaitingRun]:
         """List unfinished runs with a `number` above `after`, in order."""
         self._lock_job()
-        pending = select(Run).where(
-            Run.job_id == self._lease.job_id, Run.state.in_(OPEN_STATES), Run.number > after
-        )
-        return list(self._session.scalars(pending.order_by(Run.number).limit(limit)))
+        pending = self._select_open().where(Run.number > after)
+        rows = self._session.execute(pending.order_by(Run.number).limit(limit))
+        return list(map(WaitingRun._make, rows))
 
-    def list_unfinished(self, numbers: Sequence[int]) -> list[Run]:
+    def list_unfinished(self, numbers: Sequence[int]) -> list[WaitingRun]:
         """List the unfinished runs of these numbers, in their order."""
         self._lock_job()
-        runs: list[Run] = []
+        runs: list[WaitingRun] = []
         for chunk in split_chunks(numbers):
-            of_job = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
-            runs += self._session.scalars(select(Run).where(of_job, Run.state.in_(OPEN_STATES)))
+            rows = self._session.execute(self._select_open().where(Run.number.in_(chunk)))
+            runs += map(WaitingRun._make, rows)
         return sorted(runs, key=lambda run: run.number)
+
+    def _select_open(self) -> Select[str, int, Document, int]:
+        columns = select(Run.id, Run.number, Run.cell, Run.kills)
+        return columns.where(Run.job_id == self._lease.job_id, Run.state.in_(OPEN_STATES))
 
     def start_runs(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
@@ -148,6 +170,78 @@ class RunWriter:
         for chunk in split_chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
         return tuple(outcome.run_id for outcome in fresh)
+
+    def record_results(
+        self, packs: Sequence[PackedResults], lost_signals: Collection[str] = ()
+    ) -> None:
+        """End the successful runs of packs, as `record_outcomes` does, in bulk.
+
+        Parameters
+        ----------
+        lost_signals : collection of str
+            Objects that could not be stored. Their runs have no signals.
+        """
+        self._lock_job()
+        if not packs:
+            return
+        if self._session.get_bind().dialect.name == "sqlite":
+            n_ended = self._record_in_sqlite(packs)
+        else:
+            n_ended = self._record_in_postgres(packs)
+        if lost_signals:
+            signals = {"signals_sha256": None, "signals_start": None, "signals_size": None}
+            lost = (Run.job_id == self._lease.job_id) & Run.signals_sha256.in_(lost_signals)
+            self._session.execute(
+                update(Run).where(lost).values(signals), execution_options=RETURNING_OPTIONS
+            )
+        rms = [pack.best_rms for pack in packs if pack.best_rms is not None]
+        self._add_to_counts(n_ended, 0, min(rms, default=None))
+        is_open = Run.state.in_(OPEN_STATES)
+        ended = select(Run.id).where(Run.id == Checkpoint.run_id, ~is_open)
+        self._session.execute(
+            delete(Checkpoint).where(Checkpoint.job_id == self._lease.job_id, ended.exists()),
+            execution_options={"synchronize_session": False},
+        )
+
+    def _record_in_sqlite(self, packs: Sequence[PackedResults]) -> int:
+        """Hand the rows to SQLite, and return how many runs were open."""
+        self._session.flush()
+        connection = self._session.connection()
+        moment = UtcDateTime().bind_processor(connection.dialect)
+        assert moment is not None
+        constants = (self._lease.job_id, self._lease.attempt, moment(self._clock()))
+        cursor: Any = connection.connection.cursor()
+        n_ended = 0
+        for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
+            rows = chain.from_iterable(blocks)
+            if layout is RESULT_ROWS:
+                cursor.executemany(_UPDATE_IN_SQLITE, map(constants.__add__, rows))
+                n_ended = max(cursor.rowcount, 0)
+            else:
+                cursor.executemany(_build_sqlite_insert(layout), rows)
+        cursor.close()
+        return n_ended
+
+    def _record_in_postgres(self, packs: Sequence[PackedResults]) -> int:
+        """Copy the rows into temporary tables, and from there to their places."""
+        self._session.flush()
+        driver: Any = self._session.connection().connection.driver_connection
+        n_ended = 0
+        with driver.cursor() as cursor:
+            # Each row is looked up by its key, whatever the planner knows of these tables.
+            for method in ("hashjoin", "mergejoin", "seqscan"):
+                cursor.execute(f"SET LOCAL enable_{method} = off")
+            for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
+                cursor.execute(_build_temporary_table(layout))
+                with cursor.copy(f"COPY packed_{layout.table} FROM STDIN (FORMAT BINARY)") as copy:
+                    copy.write(b"".join((COPY_HEAD, *blocks, COPY_END)))
+                if layout is RESULT_ROWS:
+                    constants = (self._lease.attempt, *2 * (self._clock(),), self._lease.job_id)
+                    cursor.execute(_UPDATE_IN_POSTGRES, constants)
+                    n_ended = cursor.rowcount
+                else:
+                    cursor.execute(_build_postgres_insert(layout))
+        return n_ended
 
     def append_history(
         self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint] = ()
@@ -207,15 +301,60 @@ class RunWriter:
         insert_missing(self._session, MigrationLog, pack_migrants(migrants))
 
     def _update_counts(self, ended: Sequence[RunOutcome]) -> None:
-        values: dict[str, Any] = {
-            "n_done": Job.n_done + len(ended),
-            "n_failed": Job.n_failed + sum(outcome.state is JobState.FAILED for outcome in ended),
-        }
+        n_failed = sum(outcome.state is JobState.FAILED for outcome in ended)
         rms = [outcome.best_rms for outcome in ended if outcome.best_rms is not None]
-        if rms:
-            values["best_rms"] = choose_smaller_rms(min(rms))
+        self._add_to_counts(len(ended), n_failed, min(rms, default=None))
+
+    def _add_to_counts(self, n_ended: int, n_failed: int, best_rms: float | None) -> None:
+        values: dict[str, Any] = {
+            "n_done": Job.n_done + n_ended,
+            "n_failed": Job.n_failed + n_failed,
+        }
+        if best_rms is not None:
+            values["best_rms"] = choose_smaller_rms(best_rms)
         changed = update(Job).where(*self._lease.fence()).values(values)
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
+
+
+_OPEN_LIST = ", ".join(repr(state.value) for state in OPEN_STATES)
+_RESULT_NAMES = [name for name in RESULT_ROWS.columns if name != "id"]
+_UPDATE_IN_SQLITE = (
+    f"UPDATE runs SET state = {JobState.SUCCEEDED.value!r}, attempt = ?2, finished_at = ?3, "
+    "started_at = coalesce(started_at, ?3), "
+    + ", ".join(f"{name} = ?{number}" for number, name in enumerate(_RESULT_NAMES, 5))
+    + f" WHERE id = ?4 AND job_id = ?1 AND state IN ({_OPEN_LIST})"
+)
+_UPDATE_IN_POSTGRES = (
+    f"UPDATE runs SET state = {JobState.SUCCEEDED.value!r}, attempt = %s, finished_at = %s, "
+    "started_at = coalesce(started_at, %s), "
+    + ", ".join(f"{name} = packed.{name}" for name in _RESULT_NAMES)
+    # The subquery is not merged into the join: it finds each row by its key.
+    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id FROM runs AS own "
+    "WHERE own.id = packed.id AND own.job_id = %s "
+    f"AND own.state IN ({_OPEN_LIST}) OFFSET 0) AS open WHERE runs.id = open.id"
+)
+
+
+def _build_sqlite_insert(layout: RowLayout) -> str:
+    marks = ", ".join("?" * len(layout.columns))
+    names = ", ".join(layout.columns)
+    return f"INSERT INTO {layout.table} ({names}) VALUES ({marks}) ON CONFLICT DO NOTHING"
+
+
+def _build_postgres_insert(layout: RowLayout) -> str:
+    names = ", ".join(layout.columns)
+    return (
+        f"INSERT INTO {layout.table} ({names}) SELECT {names} FROM packed_{layout.table} "
+        "ON CONFLICT DO NOTHING"
+    )
+
+
+def _build_temporary_table(layout: RowLayout) -> str:
+    columns = ", ".join(f"{name} {kind}" for name, kind in layout.columns.items())
+    return (
+        f"CREATE TEMPORARY TABLE IF NOT EXISTS packed_{layout.table} ({columns}) "
+        "ON COMMIT DELETE ROWS"
+    )
 
 
 def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:

@@ -1,15 +1,15 @@
 """The events of jobs in order: the source of the event stream."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-from sqlalchemy import func, select
+from sqlalchemy import func, select, text
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES
 from service.storage.columns import Document
-from service.storage.tables import Event, Job
+from service.storage.tables import TOLD_CONDITION, Event, Job
 
 EventKind = Literal["state", "progress", "log", "end"]
 
@@ -61,11 +61,7 @@ class EventRepository:
         rows = self._session.execute(select(Job.id, Job.state, last).where(Job.id.in_(job_ids)))
         return {job_id: JobHead(number or 0, state.is_terminal) for job_id, state, number in rows}
 
-    def list_latest(
-        self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()
-    ) -> list[Event]:
-        """List the last events of a job of some kinds (by default of all), oldest first."""
-        query = select(Event).where(Event.job_id == job_id).order_by(Event.id.desc()).limit(limit)
-        if kinds:
-            query = query.where(Event.kind.in_(kinds))
-        return list(self._session.scalars(query))[::-1]
+    def list_latest(self, job_id: str, limit: int = 100) -> list[Event]:
+        """List the last events of a job that are no progress, oldest first."""
+        told = select(Event).where(Event.job_id == job_id, text(TOLD_CONDITION))
+        return list(self._session.scalars(told.order_by(Event.id.desc()).limit(limit)))[::-1]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select, text, update
+from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -13,7 +13,7 @@ from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
 from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
-from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run
+from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -105,9 +105,16 @@ class JobRepository:
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
-        if states:
-            query = query.where(Job.state.in_(states))
-        rows = self._session.scalars(query).all()
+        rows: Sequence[Job]
+        if states:  # each by itself, so that an index has them in order
+            found = [
+                job
+                for state in set(states)
+                for job in self._session.scalars(query.where(Job.state == state))
+            ]
+            rows = sorted(found, key=lambda job: job.id, reverse=True)[: limit + 1]
+        else:
+            rows = self._session.scalars(query).all()
         return make_page(rows, limit, (job.id for job in rows))
 
     def count_states(self) -> dict[JobState, int]:
@@ -149,20 +156,17 @@ class JobRepository:
             raise RowConflict(
                 f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
             )
-        unsuccessful = update(Run).where(Run.job_id == job_id, Run.state != JobState.SUCCEEDED)
+        others = [state for state in JobState if state is not JobState.SUCCEEDED]
+        unsuccessful = update(Run).where(Run.job_id == job_id, Run.state.in_(others))
         self._session.execute(
             unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
         )
         job.state, job.cancel_requested = JobState.QUEUED, False
         job.error = job.finished_at = None
+        job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
-        job.n_done = (
-            self._session.scalar(
-                select(func.count()).where(Run.job_id == job_id, Run.state == JobState.SUCCEEDED)
-            )
-            or 0
-        )
+        self._session.execute(delete(StoredSummary).where(StoredSummary.job_id == job_id))
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job

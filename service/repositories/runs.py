@@ -1,11 +1,12 @@
-"""Runs as users see them: read, list, count, and the columns of summaries."""
+"""Runs as users see them: read, list, count."""
 
 import json
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 from sqlalchemy import (
     ColumnElement,
+    ScalarSelect,
     Select,
     cast,
     exists,
@@ -13,7 +14,6 @@ from sqlalchemy import (
     literal,
     or_,
     select,
-    true,
     type_coerce,
 )
 from sqlalchemy.dialects.postgresql import JSONB
@@ -25,7 +25,7 @@ from service.repositories.history import HistoryPoint, MigrantPoint, unpack_hist
 from service.storage.columns import Document, to_json
 from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.statements import RowPage, make_page
-from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory
+from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
 
 RunOrder = Literal[
     "number", "best_rms", "fit_estimation", "fit_validation", "sigma", "seconds", "evaluations"
@@ -39,27 +39,6 @@ _ORDER_COLUMNS: dict[RunOrder, InstrumentedAttribute[Any]] = {
     "seconds": Run.seconds,
     "evaluations": Run.evaluations,
 }
-
-
-class RunRow(NamedTuple):
-    """The columns of a run for summaries and plots; `estimates` as in the table."""
-
-    id: str
-    number: int
-    cell: Document
-    labels: Document
-    state: JobState
-    valid: bool | None
-    best_rms: float | None
-    fit_estimation: float | None
-    fit_validation: float | None
-    sigma: float | None
-    method: str | None
-    seed: int | None
-    evaluations: int
-    generations: int
-    seconds: float | None
-    estimates: Document | None
 
 
 class RunRepository:
@@ -92,15 +71,22 @@ class RunRepository:
         `cell` selects the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``. The
         pages do not shift while runs finish, unless their values in the column change.
         """
-        query = select(Run).where(*self._filter_job(job_id)).limit(limit + 1)
+        conditions = [*self._filter_job(job_id)]
         if states:
-            query = query.where(Run.state.in_(states))
+            conditions.append(Run.state.in_(states))
         for column, entries in ((Run.cell, cell), (Run.labels, labels)):
             for key, value in (entries or {}).items():
-                query = query.where(entry_equals(self._session, column, key, value))
-        rows = self._session.scalars(
-            _apply_order(query, _ORDER_COLUMNS[order], descending, cursor)
-        ).all()
+                conditions.append(entry_equals(self._session, column, key, value))
+        chosen: list[str] = []  # only identifiers are sorted: a row has kilobytes
+        for part in _split_by_order(_ORDER_COLUMNS[order], descending, cursor):
+            left = limit + 1 - len(chosen)
+            if left:
+                query = part.where(*conditions).limit(left)
+                chosen += self._session.scalars(query)
+        by_id = {
+            run.id: run for run in self._session.scalars(select(Run).where(Run.id.in_(chosen)))
+        }
+        rows = [by_id[run_id] for run_id in chosen]
         cursors = (json.dumps([getattr(run, order), run.number]) for run in rows)
         return make_page(rows, limit, cursors)
 
@@ -115,28 +101,6 @@ class RunRepository:
         counts = dict(self._session.execute(query).all())
         return {state: counts.get(state, 0) for state in JobState}
 
-    def read_table(self, job_id: str) -> list[RunRow]:
-        """Read the summary columns of all runs of a job, in the order of the sweep."""
-        columns = [getattr(Run, name) for name in RunRow._fields]
-        query = select(*columns).where(*self._filter_job(job_id)).order_by(Run.number)
-        return [RunRow(*row) for row in self._session.execute(query)]
-
-    def list_parameters(self, job_id: str) -> list[tuple[str, str]]:
-        """List names and units of all parameters in the results of a job, the earliest first."""
-        if self._session.get_bind().dialect.name == "postgresql":
-            elements = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
-            each, entry = elements.render_derived(), func.jsonb_extract_path_text
-            name, unit = (entry(each.c.value, key) for key in ("name", "unit"))
-        else:
-            each = func.json_each(Run.result, "$.parameters").table_valued("value")
-            name, unit = (func.json_extract(each.c.value, f"$.{key}") for key in ("name", "unit"))
-        query_columns = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
-        query = query_columns.where(*self._filter_job(job_id), Run.result.is_not(None)).group_by(
-            name, unit
-        )
-        rows = sorted(self._session.execute(query), key=lambda row: row[2])
-        return [(row[0], row[1]) for row in rows]
-
     def read_history(self, run_id: str) -> list[HistoryPoint]:
         """Read the improved champions of a run by island, in their order."""
         parts = select(RunHistory.points, RunHistory.n_parameters).where(
@@ -150,7 +114,16 @@ class RunRepository:
         return unpack_migrants(run_id, self._session.scalars(parts))
 
     def _filter_job(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
-        return Run.job_id == job_id, Run.project_id == self._project_id
+        return (Run.job_id == select_job_id(job_id, self._project_id),)
+
+
+def select_job_id(job_id: str, project_id: str) -> ScalarSelect[str]:
+    """Return the identifier of a job as a subquery, NULL in another project.
+
+    The runs of a job need no condition on the project then. With one, SQLite may search all runs
+    of the project.
+    """
+    return select(Job.id).where(Job.id == job_id, Job.project_id == project_id).scalar_subquery()
 
 
 def entry_equals(
@@ -185,27 +158,30 @@ def _sqlite_entry_equals(
     )
 
 
-def _apply_order(
-    query: Select[Run],
-    column: InstrumentedAttribute[Any],
-    descending: bool,
-    cursor: str | None,
-) -> Select[Run]:
-    by = column.desc() if descending else column.asc()
-    if column is Run.number:  # never NULL and unique: a plain order can use its index
-        query = query.order_by(by)
-    else:
-        query = query.order_by(column.is_(None), by, Run.number)
-    if cursor is None:
-        return query
-    value, number = _parse_cursor(cursor)
-    if value is None:
-        return query.where(column.is_(None), Run.number > number)
-    beyond = column < value if descending else column > value
+def _split_by_order(
+    column: InstrumentedAttribute[Any], descending: bool, cursor: str | None
+) -> Iterator[Select[str]]:
+    """Yield the queries of the runs after the cursor: those with a value, then the others.
+
+    Each one by itself has the order of an index, if there is one of the column.
+    """
+    value, number = (None, -1) if cursor is None else _parse_cursor(cursor)
+    query, by = select(Run.id), column.desc() if descending else column.asc()
     if column is Run.number:
-        return query.where(beyond)
-    tied = (column == value) & (Run.number > number)
-    return query.where(or_(beyond, tied, column.is_(None)))
+        if value is not None:
+            query = query.where(column < value if descending else column > value)
+        yield query.order_by(by)
+        return
+    if cursor is None:
+        yield query.where(column.is_not(None)).order_by(by, Run.number)
+    elif value is not None:
+        beyond, near = (
+            (column < value, column <= value) if descending else (column > value, column >= value)
+        )
+        after = query.where(column.is_not(None), near, or_(beyond, Run.number > number))
+        yield after.order_by(by, Run.number)
+        number = -1
+    yield query.where(column.is_(None), Run.number > number).order_by(Run.number)
 
 
 def _parse_cursor(cursor: str) -> tuple[float | None, int]:

@@ -1,42 +1,114 @@
-"""Use case of a run's response: measured and simulated outputs, from the stored signals."""
+"""Use case of a run's response: measured and simulated outputs, stored or computed again."""
 
+import io
+from collections import OrderedDict
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import groupby
+from threading import Lock
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import NotFound
+from service.core.concurrency import simulation_limit
+from service.core.errors import Conflict, NotFound, ServiceError
+from service.core.states import JobState
 from service.datasets.datasets import to_series
-from service.formats.mcap import FittedOutput, read_fitted_outputs
-from service.repositories.runs import RunRepository
+from service.formats.mcap import (
+    FittedOutput,
+    list_fitted_outputs,
+    read_fitted_outputs,
+    write_fitted_outputs,
+)
+from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ExperimentOut, ResponseOut
+from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
-from service.storage.tables import Run
+from sysid.core.errors import SysidError
 from sysid.data.records import Channel
 
-# Objects never change, so their contents can be cached. A zoom reads the same object repeatedly.
 _CACHE_SIZE = 4
+"""Runs whose signals stay in memory: a zoom reads the same ones repeatedly."""
 
 
-def read_fitted_signals(store: ObjectStore, run: Run) -> tuple[FittedOutput, ...]:
-    """Read the measured and simulated outputs of a run that has signals.
+def load_fitted_signals(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> tuple[FittedOutput, ...] | None:
+    """Load the measured and simulated outputs of a run; None if it has not succeeded.
+
+    Signals that were not stored are computed again.
 
     Raises
     ------
     ObjectMissing, ObjectStoreFailed
         If the object is not there, or cannot be read.
+    Conflict
+        If they are not stored and cannot be computed again.
     """
-    assert run.signals_sha256 is not None
-    return _read_object(store, run.signals_sha256, run.signals_start, run.signals_size)
+    run = stored.run
+    if run.signals_sha256 is not None:
+        return _read_object(store, run.signals_sha256, run.signals_start, run.signals_size)
+    if run.state is not JobState.SUCCEEDED:
+        return None
+    return _computed_signals.get(run.id) or _computed_signals.put(
+        run.id, _compute_signals(session, store, stored)
+    )
+
+
+def write_signals_file(run: str, fits: Sequence[FittedOutput]) -> bytes:
+    """Write the signals of a run as the file that a worker would have stored."""
+    target = io.BytesIO()
+    write_fitted_outputs(run, fits, target)
+    return target.getvalue()
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _read_object(
     store: ObjectStore, sha256: str, start: int | None, size: int | None
 ) -> tuple[FittedOutput, ...]:
+    """Read the signals of an object, which never changes."""
     if start is None or size is None:
         return read_fitted_outputs(store.get_bytes(sha256))
     return read_fitted_outputs(store.get_range(sha256, start, size))
+
+
+@simulation_limit.acquire()
+def _compute_signals(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> tuple[FittedOutput, ...]:
+    try:
+        records, signals = stored.resimulate(session, store)
+    except (SysidError, ServiceError, StorageError) as error:
+        raise Conflict(
+            f"the signals of run {stored.run.id} are not stored, and cannot be computed again: "
+            f"{error}"
+        ) from error
+    fits = list_fitted_outputs("estimation", records.estimation, signals.simulated)
+    if records.validation is not None:
+        validated = signals.simulated_validation
+        fits += list_fitted_outputs("validation", records.validation, validated)
+    return tuple(fits)
+
+
+class _ComputedSignals:
+    """Signals of the latest runs, which never change."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._fits: OrderedDict[str, tuple[FittedOutput, ...]] = OrderedDict()
+
+    def get(self, run: str) -> tuple[FittedOutput, ...] | None:
+        with self._lock:
+            return self._fits.get(run)
+
+    def put(self, run: str, fits: tuple[FittedOutput, ...]) -> tuple[FittedOutput, ...]:
+        with self._lock:
+            self._fits[run] = fits
+            while len(self._fits) > _CACHE_SIZE:
+                self._fits.popitem(last=False)
+        return fits
+
+
+_computed_signals = _ComputedSignals()
 
 
 def build_response(
@@ -49,15 +121,15 @@ def build_response(
     NotFound
         If the run has no signals: it has not succeeded, or not yet.
     """
-    run = RunRepository(session).get(run_id)
-    if run.signals_sha256 is None:
-        raise NotFound("response of run", run_id, f"; the run is {run.state.value}")
-    fits = read_fitted_signals(store, run)
+    stored = load_run(session, run_id)
+    fits = load_fitted_signals(session, store, stored)
+    if fits is None:
+        raise NotFound("response of run", run_id, f"; the run is {stored.run.state.value}")
     experiments = [
         _to_experiment_out(name, list(outputs), max_points)
         for name, outputs in groupby(fits, key=lambda fit: fit.experiment)
     ]
-    return ResponseOut(id=run.id, experiments=experiments)
+    return ResponseOut(id=run_id, experiments=experiments)
 
 
 def _to_experiment_out(name: str, outputs: list[FittedOutput], max_points: int) -> ExperimentOut:

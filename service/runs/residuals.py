@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from service.core.errors import NotFound, ServiceError
 from service.formats.mcap import FittedOutput
 from service.jobs.stored_run import StoredRun, load_run
-from service.runs.fitted import read_fitted_signals
+from service.runs.fitted import load_fitted_signals
 from service.runs.result import to_test_document
 from service.runs.schemas import CorrelationOut, ResidualsOut
 from service.storage.errors import StorageError
@@ -75,9 +75,9 @@ def analyse_residuals(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> ResidualAnalysis | None:
     """Analyse residuals as `get_residuals` does, but return values; None without signals."""
-    if stored.run.signals_sha256 is None:
+    fits = load_fitted_signals(session, store, stored)
+    if fits is None:
         return None
-    fits = read_fitted_signals(store, stored.run)
     validation = [fit for fit in fits if fit.role == "validation"]
     inputs, missing = _read_inputs(session, store, stored, bool(validation))
     counts = {} if validation else _count_past_coefficients(session, stored)

@@ -94,7 +94,7 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
             "created_at": run.created_at,
             "started_at": run.started_at,
             "finished_at": run.finished_at,
-            "has_signals": run.signals_sha256 is not None,
+            "has_signals": run.state is JobState.SUCCEEDED,
         }
     )
 

@@ -1,6 +1,5 @@
 """Column types that behave the same on SQLite and on PostgreSQL."""
 
-import json
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, TypeAlias
@@ -8,7 +7,8 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
-from service.core.text_checks import find_json_fault, find_text_fault
+from service.core.json_text import write_json
+from service.core.text_checks import find_text_fault
 from service.storage.errors import UnstorableValue
 
 Document: TypeAlias = dict[str, Any]
@@ -18,8 +18,6 @@ DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "p
 """JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
 OrderedJsonType = JSON(none_as_null=True)
 """JSON with its order of keys: JSONB sorts them, but a search draws parameters in that order."""
-
-_ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
 
 LargeInteger = BigInteger().with_variant(Integer(), "sqlite")
 """64 bits on both: SQLite calls that INTEGER, and numbers rows with this type only."""
@@ -72,13 +70,9 @@ class TextT(TypeDecorator[str]):
 def to_json(value: object) -> str:
     """Return the JSON text of a document; refuse what PostgreSQL would refuse or alter."""
     try:
-        text = _ENCODER.encode(value)
+        return write_json(value)
     except ValueError as error:
-        raise UnstorableValue(f"a document contains NaN or an infinite number: {error}") from error
-    fault = find_json_fault(text)
-    if fault is not None:
-        raise UnstorableValue(fault)
-    return text
+        raise UnstorableValue(str(error)) from error
 
 
 def make_state_type(states: type[StrEnum]) -> Enum:

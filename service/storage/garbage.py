@@ -1,46 +1,53 @@
-"""Objects that no row refers to, and rows whose object is missing: ``lagid db check``."""
+"""Objects that no row refers to, and rows whose object is missing: ``lagid db check``.
 
-from collections.abc import Iterator
+Store and tables are compared in parts, so that memory does not grow with the number of objects.
+"""
+
+from collections.abc import Collection, Iterator
 from datetime import timedelta
+from itertools import product
 
-from sqlalchemy import select
+from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from service.storage.columns import utc_now
 from service.storage.objects import RENEWAL_AGE, ObjectStore, StoredObject
 from service.storage.sessions import Database
+from service.storage.statements import split_chunks
 from service.storage.tables import Dataset, Job, Run
 
 MINIMUM_AGE = 2 * RENEWAL_AGE
 """An object may be older by this time than the row that will refer to it."""
-
-
-def list_named_hashes(session: Session) -> set[str]:
-    """List the hashes of all objects that undeleted rows refer to."""
-    datasets = select(Dataset.sha256).where(Dataset.deleted_at.is_(None))
-    runs = (
-        select(Run.signals_sha256)
-        .join(Job, Job.id == Run.job_id)
-        .where(Run.signals_sha256.is_not(None), Job.deleted_at.is_(None))
-    )
-    hashes = set(session.scalars(datasets))
-    hashes.update(sha256 for sha256 in session.scalars(runs) if sha256 is not None)
-    return hashes
+PREFIXES = tuple("".join(digits) for digits in product("0123456789abcdef", repeat=2))
+"""First digits of the hashes: the folders of the store."""
 
 
 def find_orphans(
     session: Session, store: ObjectStore, older_than: timedelta = MINIMUM_AGE
 ) -> Iterator[StoredObject]:
     """Yield the objects that no row refers to and that are too old to wait for one."""
-    named, limit = list_named_hashes(session), utc_now() - older_than
-    for item in store.list_objects():
-        if item.sha256 not in named and (item.modified_at is None or item.modified_at < limit):
-            yield item
+    limit = utc_now() - older_than
+    old = (
+        item
+        for item in store.list_objects()
+        if item.modified_at is None or item.modified_at < limit
+    )
+    for items in split_chunks(old):
+        named = _find_named_hashes(session, [item.sha256 for item in items])
+        yield from (item for item in items if item.sha256 not in named)
 
 
-def find_lost_hashes(session: Session, store: ObjectStore) -> set[str]:
-    """Return the hashes that rows refer to, but that the store does not have."""
-    return list_named_hashes(session) - {item.sha256 for item in store.list_objects()}
+def find_lost_hashes(session: Session, store: ObjectStore) -> Iterator[str]:
+    """Yield the hashes that rows refer to, but that the store does not have, in order."""
+    for prefix in PREFIXES:
+        named: set[str | None] = set()
+        for query in _select_hashes():
+            column = query.selected_columns[0]
+            part = query.where(column >= prefix, column < f"{prefix}g").distinct()
+            named.update(session.scalars(part))
+        # Listed after the rows were read: an object is written before its row.
+        named.difference_update(item.sha256 for item in store.list_objects(prefix))
+        yield from sorted(filter(None, named))
 
 
 def delete_orphans(
@@ -52,20 +59,26 @@ def delete_orphans(
     """
     limit, n_deleted, freed = utc_now() - older_than, 0, 0
     with database.read_session() as session:
-        orphans = list(find_orphans(session, store, older_than))
-    for orphan in orphans:
-        with database.read_session() as session:  # a new one sees new rows
-            is_named = _is_named(session, orphan.sha256)
-        if not is_named and store.delete_older(orphan.sha256, limit):
-            n_deleted, freed = n_deleted + 1, freed + orphan.size
+        for orphan in find_orphans(session, store, older_than):
+            with database.read_session() as later:  # a new one sees new rows
+                is_named = bool(_find_named_hashes(later, [orphan.sha256]))
+            if not is_named and store.delete_older(orphan.sha256, limit):
+                n_deleted, freed = n_deleted + 1, freed + orphan.size
     return n_deleted, freed
 
 
-def _is_named(session: Session, sha256: str) -> bool:
-    dataset = select(Dataset.id).where(Dataset.sha256 == sha256, Dataset.deleted_at.is_(None))
-    run = (
-        select(Run.id)
-        .join(Job, Job.id == Run.job_id)
-        .where(Run.signals_sha256 == sha256, Job.deleted_at.is_(None))
-    )
-    return any(session.scalar(query.limit(1)) is not None for query in (dataset, run))
+def _find_named_hashes(session: Session, hashes: Collection[str]) -> set[str]:
+    """Return those of the hashes that undeleted rows refer to."""
+    return {
+        sha256
+        for query in _select_hashes()
+        for sha256 in session.scalars(query.where(query.selected_columns[0].in_(hashes)))
+        if sha256 is not None
+    }
+
+
+def _select_hashes() -> tuple[Select[str], Select[str | None]]:
+    """Select the hashes that undeleted datasets, and runs of undeleted jobs, refer to."""
+    datasets = select(Dataset.sha256).where(Dataset.deleted_at.is_(None))
+    runs = select(Run.signals_sha256).join(Job, Job.id == Run.job_id)
+    return datasets, runs.where(Run.signals_sha256.is_not(None), Job.deleted_at.is_(None))

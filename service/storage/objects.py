@@ -111,10 +111,11 @@ class ObjectStore(ABC):
     def delete_older(self, sha256: str, limit: datetime) -> bool:
         """Delete an object that was last written before `limit`; return whether it was."""
 
-    def list_objects(self) -> Iterator[StoredObject]:
-        """Yield every object, in no particular order."""
+    def list_objects(self, prefix: str = "") -> Iterator[StoredObject]:
+        """Yield every object, or those whose hash begins with two digits; in no certain order."""
+        folder = f"{_ROOT}/{prefix}" if prefix else _ROOT
         with _translate_errors("list the objects"):
-            for chunk in obstore.list(self._backend, prefix=_ROOT):
+            for chunk in obstore.list(self._backend, prefix=folder):
                 for entry in chunk:
                     sha256 = Path(entry["path"]).stem
                     if _HASH.fullmatch(sha256):

@@ -5,10 +5,12 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
@@ -17,8 +19,11 @@ from service.storage.columns import to_json
 
 BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
+ANALYSED_ROWS = 1000
+"""Rows of each index that SQLite's ANALYZE reads."""
 _READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
 _BUSY_OPTION = "lagid_busy_seconds"
+_DATABASE_KEY = "lagid_database"
 
 
 class Database:
@@ -27,13 +32,26 @@ class Database:
     ``with database.write_session() as session`` commits at the end, or rolls back on an error. On
     SQLite a writing session begins with ``BEGIN IMMEDIATE``. So it waits for the lock at its start
     and never meets a deadlock later. A reading session sees one consistent state and cannot write.
+
+    Parameters
+    ----------
+    url : str
+        Address of the database.
+    is_durable : bool
+        Whether a commit survives a power cut. On SQLite, without it, the last commits may be lost:
+        right for a dispatcher, whose work is computed again. On PostgreSQL each commit survives.
+    **options
+        Options of SQLAlchemy's engine.
     """
 
-    def __init__(self, url: str, **options: Any) -> None:
-        self.engine = _create_engine(url, **options)
+    def __init__(self, url: str, *, is_durable: bool = False, **options: Any) -> None:
+        self.engine = _create_engine(url, is_durable=is_durable, **options)
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
-            self.engine.execution_options(**_READ_OPTIONS), expire_on_commit=False, autoflush=False
+            self.engine.execution_options(**_READ_OPTIONS),
+            expire_on_commit=False,
+            autoflush=False,
+            info={_DATABASE_KEY: self},
         )
 
     @property
@@ -70,18 +88,35 @@ class Database:
         """Return an engine whose transactions wait `seconds` for locks of others."""
         return self.engine.execution_options(**{_BUSY_OPTION: seconds})
 
+    def update_statistics(self) -> None:
+        """Count rows for SQLite's planner, by samples of each index; PostgreSQL does it by itself.
+
+        It is done when the database is opened and after many rows were written. If others hold the
+        lock, it is left to the next time.
+        """
+        if self.is_sqlite:
+            with suppress(OperationalError), self.get_waiting_engine(0.1).begin() as connection:
+                connection.exec_driver_sql(f"PRAGMA analysis_limit = {ANALYSED_ROWS}")
+                connection.exec_driver_sql("ANALYZE")
+
     def dispose(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
 
 
-def _create_engine(url: str, **options: Any) -> Engine:
+def find_database(session: Session) -> Database:
+    """Return the database of a reading session, to store what reading it has shown."""
+    database: Database = session.info[_DATABASE_KEY]
+    return database
+
+
+def _create_engine(url: str, *, is_durable: bool, **options: Any) -> Engine:
     address = make_url(url)
     if address.get_backend_name() == "sqlite":
         settings = {"timeout": BUSY_SECONDS, "check_same_thread": False}
         engine = create_engine(address, json_serializer=to_json, connect_args=settings, **options)
         event.listen(engine, "do_connect", _create_private_file)
-        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "connect", partial(_prepare_sqlite, is_durable=is_durable))
         event.listen(engine, "begin", _begin_sqlite)
         return engine
     if address.drivername == "postgresql":
@@ -110,12 +145,15 @@ def _create_private_file(
             os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
 
-def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
+def _prepare_sqlite(
+    connection: DBAPIConnection, _entry: ConnectionPoolEntry, *, is_durable: bool
+) -> None:
     assert isinstance(connection, sqlite3.Connection)
     connection.isolation_level = None  # sqlite3 must not begin transactions by itself
     connection.execute(f"PRAGMA busy_timeout = {int(1000 * BUSY_SECONDS)}")
     _enable_wal(connection)
-    connection.execute("PRAGMA synchronous = NORMAL")
+    # NORMAL syncs the write-ahead log only now and then, FULL at each commit.
+    connection.execute(f"PRAGMA synchronous = {'FULL' if is_durable else 'NORMAL'}")
     connection.execute("PRAGMA foreign_keys = ON")
 
 

@@ -116,7 +116,12 @@ def _execute_bulk(
         kind = columns["id" if name == _ID_PARAMETER else name].type.dialect_impl(dialect)
         convert = kind.bind_processor(dialect)
         column = [row[name] for row in rows]
-        values.append(column if convert is None else [convert(value) for value in column])
+        if convert is None:
+            values.append(column)
+        elif len(set(map(id, column))) == 1:  # one value for all rows
+            values.append([convert(column[0])] * len(column))
+        else:
+            values.append([convert(value) for value in column])
     if compiled.positional:
         order = [names.index(name) for name in compiled.positiontup or ()]
         parameters: Any = list(zip(*(values[i] for i in order), strict=True))
@@ -136,6 +141,9 @@ def _build_insert(session: Session, table: type[Base]) -> "sqlite.Insert | postg
 IdPrefix = Literal["proj", "key", "ds", "mdl", "job", "run"]
 
 _ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
+_PAIRS = [first + second for first in _ALPHABET for second in _ALPHABET]
+_TAIL_BITS = 20
+"""Bits of the last four characters, in which consecutive identifiers differ."""
 _RANDOM_BITS = 80
 _LENGTH = 26
 
@@ -166,7 +174,15 @@ def new_id(prefix: IdPrefix) -> str:
 
 def new_ids(prefix: IdPrefix, n: int) -> list[str]:
     """Make `n` new identifiers, ascending."""
-    return [f"{prefix}_{_encode_base32(number)}" for number in _id_sequence.take_numbers(n)]
+    numbers = _id_sequence.take_numbers(n)
+    heads = {
+        head: f"{prefix}_{_encode_base32(head << _TAIL_BITS)[:-4]}"
+        for head in range(numbers[0] >> _TAIL_BITS, (numbers[-1] >> _TAIL_BITS) + 1)
+    }
+    return [
+        f"{heads[number >> _TAIL_BITS]}{_PAIRS[number >> 10 & 1023]}{_PAIRS[number & 1023]}"
+        for number in numbers
+    ]
 
 
 def _encode_base32(number: int) -> str:

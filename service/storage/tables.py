@@ -20,6 +20,11 @@ from service.storage.columns import (
 
 DEFAULT_PROJECT = "proj_default"
 
+OPEN_CONDITION = "state IN ('queued', 'running')"
+"""Condition of the index of open jobs. SQLite uses the index only for queries with this text."""
+TOLD_CONDITION = "kind <> 'progress'"
+"""Condition of the index of the events that a page lists."""
+
 
 class Base(DeclarativeBase):
     """Base class of the tables."""
@@ -40,6 +45,12 @@ class Base(DeclarativeBase):
         list[Any]: DocumentType,
         JobState: make_state_type(JobState),
     }
+
+
+def _partial_index(name: str, condition: str, *columns: str, unique: bool = False) -> Index:
+    """Declare an index over the rows that meet a condition, on both databases."""
+    where = text(condition)
+    return Index(name, *columns, unique=unique, sqlite_where=where, postgresql_where=where)
 
 
 class Project(Base):
@@ -78,13 +89,12 @@ class Dataset(Base):
     __tablename__ = "datasets"
     __table_args__ = (
         Index("ix_datasets_project_id_id", "project_id", "id"),
-        Index(
+        _partial_index(
             "uq_datasets_project_id_source_key",
+            "deleted_at IS NULL",
             "project_id",
             "source_key",
             unique=True,
-            sqlite_where=text("deleted_at IS NULL"),
-            postgresql_where=text("deleted_at IS NULL"),
         ),
     )
 
@@ -139,16 +149,35 @@ class Job(Base):
     `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers that
     stopped without progress; at `max_attempts` of them the job fails. `evaluations`, `generation`
     and `seconds_left` are the progress over all runs. `best_rms` is the smallest RMS of any run so
-    far. `n_reused` counts the runs taken over from other jobs. `floors` is the document that
+    far. `n_reused` counts the runs taken over from other jobs. `n_done_at_claim` is `n_done` at the
+    last claim, so that progress since then needs no look at the runs. `floors` is the document that
     `service.dispatch.cramer_rao` computes for a job with noise.
     """
 
     __tablename__ = "jobs"
     __table_args__ = (
         Index("ix_jobs_project_id_id", "project_id", "id"),
-        # These two hold all columns that a dispatcher reads to poll and to claim.
-        Index("ix_jobs_queue", "state", "priority", "id", "project_id", "n_runs"),
-        Index("ix_jobs_owned", "lease_owner", "state", "cancel_requested", "id"),
+        _partial_index("ix_jobs_by_state", "deleted_at IS NULL", "project_id", "state", "id"),
+        # These two hold all columns that a dispatcher reads to poll and to claim. Ended jobs are
+        # not among them, so that their number costs nothing.
+        _partial_index(
+            "ix_jobs_open",
+            OPEN_CONDITION,
+            "state",
+            "priority",
+            "id",
+            "project_id",
+            "n_runs",
+            "n_done",
+        ),
+        _partial_index(
+            "ix_jobs_owned",
+            "lease_owner IS NOT NULL",
+            "lease_owner",
+            "state",
+            "cancel_requested",
+            "id",
+        ),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -165,6 +194,7 @@ class Job(Base):
     cancel_requested: Mapped[bool] = mapped_column(default=False)
     n_runs: Mapped[int]
     n_done: Mapped[int] = mapped_column(default=0)
+    n_done_at_claim: Mapped[int] = mapped_column(default=0)
     n_failed: Mapped[int] = mapped_column(default=0)
     n_reused: Mapped[int] = mapped_column(default=0)
     best_rms: Mapped[float | None]
@@ -194,6 +224,9 @@ class Run(Base):
     __table_args__ = (
         UniqueConstraint("job_id", "number"),
         Index("ix_runs_job_id_state_number", "job_id", "state", "number"),
+        _partial_index(
+            "ix_runs_job_id_best_rms", "best_rms IS NOT NULL", "job_id", "best_rms", "number"
+        ),
         Index("ix_runs_project_id_id", "project_id", "id"),
         Index("ix_runs_project_id_spec_hash", "project_id", "spec_hash"),
     )
@@ -228,6 +261,20 @@ class Run(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+
+
+class StoredSummary(Base):
+    """What pages, figures and tables say of an ended job: `service.sweeps.job_summary`.
+
+    It holds for this `attempt` of the job. It is deleted when the job is resumed.
+    """
+
+    __tablename__ = "job_summaries"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    attempt: Mapped[int]
+    document: Mapped[Document] = mapped_column(OrderedJsonType)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
 class RunHistory(Base):
@@ -277,6 +324,8 @@ class Event(Base):
     __tablename__ = "events"
     __table_args__ = (
         Index("ix_events_job_id_id", "job_id", "id"),
+        # A page lists these; a long job has thousands of the others among them.
+        _partial_index("ix_events_told", TOLD_CONDITION, "job_id", "id"),
         {"sqlite_autoincrement": True},  # no number is reused, so no event is missed
     )
 

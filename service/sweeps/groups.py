@@ -1,121 +1,135 @@
-"""Groups of a job's runs, including runs that have not been created yet.
+"""Groups of a job's runs by axes or labels, and their aggregates.
 
-The runs of a job are created in order, so the missing ones are the cells from some number on. The
-lengths of the axes give how many of them belong to a group. Groups of ended jobs are cached.
-Grouping 100,000 runs takes seconds, and a page requests the same groups repeatedly.
+The runs of a job are the cells of its sweep in order. So the axes alone tell the group of each run,
+also of runs that are not created yet, and how many groups there are. No run is read for that.
 """
 
-from collections import OrderedDict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product
-from math import prod
-from threading import Lock
-from typing import Any, NamedTuple
+from math import inf, prod
+from typing import Any, Literal
 
-from sqlalchemy.orm import Session
+import numpy as np
+from numpy.typing import NDArray
 
 from service.core.job_fields import SIGMA_PATH
 from service.core.states import JobState
-from service.jobs.axes import AxisGroup, SweepCell, locate_cell
+from service.jobs.axes import AxisGroup
 from service.jobs.stored_cells import read_axis_groups
-from service.repositories.runs import RunRepository
-from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity, read_groups
-from service.storage.columns import to_json
-from service.storage.tables import Job
+from service.repositories.summaries import RunTable, SummaryQuantity
+
+QUANTILES_PER_MILLE = (50, 250, 500, 750, 950)
+"""Quantiles in thousandths, so that ranks are integers."""
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+_MISSING = object()
 
 
-def group_all_runs(
-    session: Session,
-    job: Job,
-    keys: Sequence[GroupKey],
-    quantities: Sequence[SummaryQuantity],
-    limit: int,
-) -> list[RunGroup]:
-    """Group all runs of a job in the order of the sweep, into at most `limit` + 1 groups.
+@dataclass(frozen=True, slots=True)
+class GroupKey:
+    """Key by which runs are grouped: an axis of the sweep, or a label."""
 
-    A run not yet created counts as queued. In a job that ended without it, it has the job's state.
-    """
-    groups = read_groups(session, job.id, keys, quantities, limit, job.project_id)
-    n_created = RunRepository(session, job.project_id).count_created(job.id)
-    if n_created >= job.n_runs or len(groups) > limit:
-        return groups
-    sweep = _GroupedSweep(job.spec, keys)
-    # Matched by their first runs: a database may round the numbers in a key.
-    by_key = {to_json(sweep.find_key(group.first_number)): group for group in groups}
-    state = job.state if job.state.is_terminal else JobState.QUEUED
-    for part in sweep.iterate_pending(n_created):
-        text = to_json(part.key)
-        if text not in by_key:
-            if len(groups) > limit:
-                break
-            by_key[text] = _build_empty_group(part, keys)
-            groups.append(by_key[text])
-        by_key[text].states[state] += part.size
-    return groups
+    kind: Literal["axis", "label"]
+    name: str
 
 
-class PendingGroup(NamedTuple):
-    """Runs not yet created that share one position in every axis group of the keys."""
+@dataclass(slots=True)
+class RunGroup:
+    """Runs with equal values of the grouping keys; `sigma` is the range of their noise."""
 
     key: tuple[Any, ...]
-    first: int
-    size: int
+    first_number: int
+    states: dict[JobState, int]
+    n_valid: int
+    sigma: tuple[float, float] | None
+    mean_evaluations: float | None
+    mean_seconds: float | None
+    quantiles: dict[SummaryQuantity, tuple[float, ...]] = field(default_factory=dict)
 
 
-class _GroupedSweep:
-    """Crossed axis groups of a job, viewed by the grouping keys of its runs."""
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """An axis group that sets keys: the different entries of its positions, in order.
 
-    def __init__(self, spec: Mapping[str, Any], keys: Sequence[GroupKey]) -> None:
-        self._keys = keys
-        self._groups = read_axis_groups(spec)
-        self._lengths = [len(steps) for steps in self._groups]
+    `entries` has one value for each key, or `_MISSING`. `codes` has the entry of each position, and
+    -1 after the last entry that the limit allows.
+    """
+
+    entries: list[tuple[Any, ...]]
+    firsts: list[int]
+    codes: Ints
+    stride: int
+
+
+class SweepGroups:
+    """Groups of a sweep, in its order; at most `limit` of them.
+
+    Parameters
+    ----------
+    spec : mapping
+        A stored job.
+    keys : sequence of GroupKey
+        What distinguishes the groups. Runs without a label have None.
+
+    Attributes
+    ----------
+    by : tuple of GroupKey
+        The keys.
+    n_runs : int
+        Runs of the whole sweep.
+    keys : list of tuple
+        Values of the keys, by group.
+    first_numbers : list of int
+        Number of the first run, by group.
+    is_cut : bool
+        Whether there are more groups than the limit.
+    """
+
+    def __init__(self, spec: Mapping[str, Any], keys: Sequence[GroupKey], limit: int) -> None:
+        axes = read_axis_groups(spec)
+        lengths = [len(steps) for steps in axes]
+        self.n_runs, self.by = prod(lengths), tuple(keys)
+        self.keys: list[tuple[Any, ...]] = []
+        self.first_numbers: list[int] = []
         self._places = [
-            index
-            for index, steps in enumerate(self._groups)
+            _build_place(steps, keys, prod(lengths[number + 1 :]), limit)
+            for number, steps in enumerate(axes)
             if any(_sets_key(steps, key) for key in keys)
         ]
+        self.is_cut = any(place.codes.min() < 0 for place in self._places)
+        self._groups = np.full(prod(len(place.entries) for place in self._places), -1)
+        known: dict[Hashable, int] = {}
+        for number, entries in enumerate(product(*(place.entries for place in self._places))):
+            key = _merge_entries(entries, len(keys))
+            identity = tuple(map(_identify, key))
+            if identity not in known:
+                if len(known) == limit:
+                    self.is_cut = True
+                    break
+                known[identity] = len(known)
+                self.keys.append(key)
+                self.first_numbers.append(self._find_first_number(number))
+            self._groups[number] = known[identity]
 
-    def find_key(self, number: int) -> tuple[Any, ...]:
-        """Find the key of the group that a run belongs to."""
-        positions = locate_cell(number, self._lengths)
-        return self._build_key([positions[index] for index in self._places])
+    def locate_runs(self, numbers: Ints) -> Ints:
+        """Return the group of each run (N,) by its number; -1 beyond the limit."""
+        combinations, is_beyond = np.zeros_like(numbers), np.zeros(len(numbers), np.bool_)
+        for place in self._places:
+            codes = place.codes[numbers // place.stride % len(place.codes)]
+            is_beyond |= codes < 0
+            combinations = combinations * len(place.entries) + codes
+        located: Ints = np.where(is_beyond, -1, self._groups[np.where(is_beyond, 0, combinations)])
+        return located
 
-    def iterate_pending(self, start: int) -> Iterator[PendingGroup]:
-        """Iterate over the runs from number `start`, group by group in the order of the sweep."""
-        lengths = self._lengths
-        total = prod(lengths)
-        for positions in product(*(range(lengths[index]) for index in self._places)):
-            fixed = dict(zip(self._places, positions, strict=True))
-            size = count_cells_below(total, lengths, fixed) - count_cells_below(
-                start, lengths, fixed
-            )
-            if size:
-                first = sum(
-                    position * prod(lengths[index + 1 :]) for index, position in fixed.items()
-                )
-                yield PendingGroup(self._build_key(positions), first, size)
-
-    def _build_key(self, positions: Sequence[int]) -> tuple[Any, ...]:
-        cells = [
-            self._groups[index][position].cell
-            for index, position in zip(self._places, positions, strict=True)
-        ]
-        return tuple(_get_key_value(cells, key) for key in self._keys)
-
-
-def count_cells_below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
-    """Count the cells before number `end` that have the `fixed` positions, by axis group."""
-    count = 0
-    for index, _ in enumerate(lengths):
-        later = range(index + 1, len(lengths))
-        free = prod(lengths[axis] for axis in later if axis not in fixed)
-        position, end = divmod(end, prod(lengths[axis] for axis in later))
-        required = fixed.get(index)
-        if required is None:
-            count += position * free
-        elif required != position:
-            return count + (free if required < position else 0)
-    return count + end  # without axes there is one cell
+    def _find_first_number(self, combination: int) -> int:
+        number = 0
+        for place in reversed(self._places):
+            combination, entry = divmod(combination, len(place.entries))
+            number += place.firsts[entry] * place.stride
+        return number
 
 
 def _sets_key(steps: AxisGroup, key: GroupKey) -> bool:
@@ -124,73 +138,145 @@ def _sets_key(steps: AxisGroup, key: GroupKey) -> bool:
     return any(key.name in labels for _, axis, _ in steps.columns for labels in axis.labels or [])
 
 
-def _get_key_value(cells: Sequence[SweepCell], key: GroupKey) -> Any:
-    """Return the value as the run's cell has it: of two labels with one name the later counts."""
-    value = None
-    for cell in cells:
-        value = (cell.values if key.kind == "axis" else cell.labels).get(key.name, value)
-    return value
+def _build_place(steps: AxisGroup, keys: Sequence[GroupKey], stride: int, limit: int) -> _Place:
+    columns = [_list_key_values(steps, key) for key in keys]
+    known: dict[Hashable, int] = {}
+    entries, firsts = [], []
+    codes = np.full(len(steps), -1, dtype=np.int64)
+    for position, entry in enumerate(zip(*columns, strict=True)):
+        identity = tuple(map(_identify, entry))
+        if identity not in known:
+            if len(known) == limit:
+                break
+            known[identity] = len(known)
+            entries.append(entry)
+            firsts.append(position)
+        codes[position] = known[identity]
+    return _Place(entries, firsts, codes, stride)
 
 
-def _build_empty_group(part: PendingGroup, keys: Sequence[GroupKey]) -> RunGroup:
-    swept = dict(zip((key.name for key in keys), part.key, strict=True)).get(SIGMA_PATH)
-    sigma = None if swept is None else (float(swept), float(swept))
-    return RunGroup(
-        key=part.key,
-        first_number=part.first,
-        states=dict.fromkeys(JobState, 0),
-        n_valid=0,
-        sigma=sigma,
-        mean_evaluations=None,
-        mean_seconds=None,
-    )
+def _list_key_values(steps: AxisGroup, key: GroupKey) -> Iterable[Any]:
+    """List the values of a key at each position; of two labels with one name the later counts."""
+    values: Sequence[Any] = [_MISSING] * len(steps)
+    for _, axis, column in steps.columns:
+        if key.kind == "axis" and axis.path == key.name:
+            values = column
+        elif key.kind == "label" and axis.labels:
+            pairs = zip(values, axis.labels, strict=True)
+            values = [labels.get(key.name, before) for before, labels in pairs]
+    return values
 
 
-CACHE_SIZE = 32
-MAX_CACHED_GROUPS = 2_000
-"""Larger results are not cached."""
+def _merge_entries(entries: Sequence[tuple[Any, ...]], n_keys: int) -> tuple[Any, ...]:
+    merged: list[Any] = [None] * n_keys
+    for entry in entries:
+        merged = [old if new is _MISSING else new for old, new in zip(merged, entry, strict=True)]
+    return tuple(merged)
 
 
-class _GroupCache:
-    """Cache of the groups requested last."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._groups: OrderedDict[Hashable, list[RunGroup]] = OrderedDict()
-
-    def get(self, key: Hashable) -> list[RunGroup] | None:
-        with self._lock:
-            if key in self._groups:
-                self._groups.move_to_end(key)
-            return self._groups.get(key)
-
-    def put(self, key: Hashable, groups: list[RunGroup]) -> None:
-        with self._lock:
-            self._groups[key] = groups
-            while len(self._groups) > CACHE_SIZE:
-                self._groups.popitem(last=False)
+def _identify(value: Any) -> Hashable:
+    """Return what distinguishes a value: 0 is 0.0, but neither is false."""
+    if value is _MISSING or isinstance(value, str):
+        return (value,)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    return json.dumps(value, sort_keys=True)
 
 
-_cache = _GroupCache()
-
-
-def get_groups(
-    session: Session,
-    job: Job,
-    keys: Sequence[GroupKey],
-    quantities: Sequence[SummaryQuantity],
-    limit: int,
+def aggregate_runs(
+    table: RunTable, groups: SweepGroups, pending: JobState = JobState.QUEUED
 ) -> list[RunGroup]:
-    """Return `service.sweeps.groups.group_all_runs`, cached for jobs that have ended.
+    """Aggregate the runs of each group, in the order of the sweep.
 
-    A resumed job ends at another time, so its groups are computed again.
+    Quantiles are those of successful runs, interpolated linearly between neighbours.
+
+    Parameters
+    ----------
+    pending : JobState
+        State that runs count in that are not created yet.
     """
-    if not job.state.is_terminal:
-        return group_all_runs(session, job, keys, quantities, limit)
-    key = (job.id, job.attempt, job.finished_at, tuple(keys), tuple(quantities), limit)
-    groups = _cache.get(key)
-    if groups is None:
-        groups = group_all_runs(session, job, keys, quantities, limit)
-        if len(groups) <= MAX_CACHED_GROUPS:
-            _cache.put(key, groups)
-    return groups
+    n_groups = len(groups.keys)
+    located = groups.locate_runs(table.numbers)
+    inside = located >= 0
+    succeeded = inside & table.is_in_state(JobState.SUCCEEDED)
+    counts = {
+        state: np.bincount(located[inside & table.is_in_state(state)], minlength=n_groups)
+        for state in JobState
+    }
+    all_runs = groups.locate_runs(np.arange(groups.n_runs))
+    sizes = np.bincount(all_runs[all_runs >= 0], minlength=n_groups)
+    counts[pending] = counts[pending] + sizes - sum(counts.values())
+    valid = np.bincount(located[inside & table.is_valid], minlength=n_groups)
+    evaluations = _compute_means(table.evaluations, located, succeeded, n_groups)
+    seconds = _compute_means(table.seconds, located, succeeded, n_groups)
+    low, high = _find_ranges(table.sigma, located, inside, n_groups)
+    made = [
+        RunGroup(
+            key=key,
+            first_number=groups.first_numbers[group],
+            states={state: int(counts[state][group]) for state in JobState},
+            n_valid=int(valid[group]),
+            sigma=_choose_sigma(low[group], high[group], groups, group),
+            mean_evaluations=_to_optional(evaluations[group]),
+            mean_seconds=_to_optional(seconds[group]),
+        )
+        for group, key in enumerate(groups.keys)
+    ]
+    for quantity, values in table.values.items():
+        used = succeeded & np.isfinite(values)
+        for group, quantiles in _compute_quantiles(values[used], located[used], n_groups):
+            made[group].quantiles[quantity] = quantiles
+    return made
+
+
+def _compute_means(values: Floats, located: Ints, chosen: NDArray[np.bool_], n: int) -> Floats:
+    """Compute the mean of the chosen runs' values in each group (n,); NaN without any."""
+    used = chosen & np.isfinite(values)
+    counts = np.bincount(located[used], minlength=n)
+    sums = np.bincount(located[used], values[used], minlength=n)
+    means: Floats = np.divide(sums, counts, out=np.full(n, np.nan), where=counts > 0)
+    return means
+
+
+def _find_ranges(
+    values: Floats, located: Ints, chosen: NDArray[np.bool_], n: int
+) -> tuple[Floats, Floats]:
+    """Find the least and the largest value of each group (n,)."""
+    used = chosen & np.isfinite(values)
+    low, high = np.full(n, inf), np.full(n, -inf)
+    np.minimum.at(low, located[used], values[used])
+    np.maximum.at(high, located[used], values[used])
+    return low, high
+
+
+def _choose_sigma(
+    low: float, high: float, groups: SweepGroups, group: int
+) -> tuple[float, float] | None:
+    """Return the range of the runs' noise; without runs that of the keys, None if unknown."""
+    if low <= high:
+        return float(low), float(high)
+    named = {key.name: value for key, value in zip(groups.by, groups.keys[group], strict=True)}
+    swept = named.get(SIGMA_PATH)
+    return None if swept is None else (float(swept), float(swept))
+
+
+def _compute_quantiles(
+    values: Floats, located: Ints, n: int
+) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Yield each group that has values, and its quantiles."""
+    counts = np.bincount(located, minlength=n)
+    ranked = values[np.lexsort((values, located))]
+    starts = np.cumsum(counts) - counts
+    for group in np.flatnonzero(counts).tolist():
+        of_group = ranked[starts[group] : starts[group] + counts[group]].tolist()
+        yield group, tuple(_interpolate_quantile(of_group, q) for q in QUANTILES_PER_MILLE)
+
+
+def _interpolate_quantile(ranked: Sequence[float], thousandths: int) -> float:
+    whole, rest = divmod(thousandths * (len(ranked) - 1), 1000)
+    low = ranked[whole]
+    return low if rest == 0 else low + (ranked[whole + 1] - low) * rest / 1000
+
+
+def _to_optional(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -9,21 +9,14 @@ from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
-from service.repositories.summaries import (
-    QUANTILES_PER_MILLE,
-    GroupKey,
-    RunGroup,
-    SummaryQuantity,
-    read_groups,
-)
-from service.storage.tables import Job, Run
+from service.repositories.summaries import SummaryQuantity
+from service.storage.tables import Job
 from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
-from service.sweeps.groups import get_groups
+from service.sweeps.groups import QUANTILES_PER_MILLE, GroupKey, RunGroup, SweepGroups
+from service.sweeps.job_summary import MAX_GROUPS, list_default_keys, load_groups, load_summary
 from service.sweeps.schemas import ErrorReferenceOut, GroupOut, ParameterSummaryOut, SummaryOut
 from sysid.core.errors import suggest_name
 
-MAX_GROUPS = 2_000
 MEDIAN = QUANTILES_PER_MILLE.index(500)
 RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
     SummaryQuantity("rms"),
@@ -39,9 +32,7 @@ BOUND_NOTE = (
 )
 
 
-def summarise_job(
-    session: Session, job_id: str, by: Sequence[str] | None, *, errors_only: bool = False
-) -> SummaryOut:
+def summarise_job(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryOut:
     """Aggregate the runs of a job over the values of some axes or labels.
 
     Parameters
@@ -49,32 +40,29 @@ def summarise_job(
     by : sequence of str, optional
         Paths of axes (``/noise/sigma``) and names of labels (``length_m``). By default every
         axis that is not a seed.
-    errors_only : bool
-        Only the RMS against the records without noise, and the estimates, as figures need them.
 
     Raises
     ------
     InvalidRequest
-        If a key is unknown, or the keys give too many groups.
+        If a key is unknown, or the keys give too many groups. No run is read before.
     """
     job = JobRepository(session).get(job_id)
     keys = _choose_keys(job, by)
-    units = _read_units(session, job)
-    floors = StoredBounds(job.floors)
-    quantities = [RMS_NOISE_FREE, *(SummaryQuantity("estimate", name) for name in units)]
-    if not errors_only:
-        quantities += [RMS, FIT_ESTIMATION, FIT_VALIDATION]
-        quantities += [SummaryQuantity("stderr", name) for name in units]
-    groups = get_groups(session, job, keys, quantities, MAX_GROUPS)
-    if len(groups) > MAX_GROUPS:
+    groups = SweepGroups(job.spec, keys, MAX_GROUPS)
+    if groups.is_cut:
         raise InvalidRequest.from_fault(
             "?by", f"gives more than {MAX_GROUPS} groups. Name fewer axes, for example no seed"
         )
+    parameters = load_summary(session, job).parameters
+    units = {one.name: one.unit for one in parameters if not one.is_fixed}
+    floors = StoredBounds(job.floors)
     return SummaryOut(
         job=job.id,
         by=[key.name for key in keys],
         quantiles=[q / 1000 for q in QUANTILES_PER_MILLE],
-        groups=[_to_group_out(group, keys, units, floors) for group in groups],
+        groups=[
+            _to_group_out(group, keys, units, floors) for group in load_groups(session, job, groups)
+        ],
         runs=job.n_runs,
         reused=job.n_reused,
         rms_unit=find_rms_unit(session, job.spec),
@@ -103,7 +91,7 @@ def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
     paths = [axis["path"] for axis in axes]
     labels = {name for axis in axes for labels in axis["labels"] or [] for name in labels}
     if by is None:
-        return [GroupKey("axis", path) for path in paths if not path.endswith("/seed")]
+        return list_default_keys(job.spec)
     keys = []
     for name in dict.fromkeys(by):
         if name not in paths and name not in labels:
@@ -115,26 +103,6 @@ def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
             )
         keys.append(GroupKey("axis" if name in paths else "label", name))
     return keys
-
-
-def _read_units(session: Session, job: Job) -> dict[str, str]:
-    """Read the estimated parameters with their units from the first runs.
-
-    If an axis changes the model, the first run of each of its values is read, because models may
-    have different parameters.
-    """
-    runs = RunRepository(session)
-    heads: list[Run] = list(runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED]).items)
-    if any(axis["path"] == "/model" for axis in job.spec["sweep"]["axes"]):
-        for group in read_groups(session, job.id, [GroupKey("axis", "/model")], [], MAX_GROUPS):
-            cell = {"/model": group.key[0]}
-            heads += runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED], cell=cell).items
-    return {
-        estimate["name"]: estimate["unit"]
-        for run in heads
-        for estimate in (run.result or {}).get("parameters", [])
-        if estimate["status"] != "fixed"
-    }
 
 
 def _to_group_out(

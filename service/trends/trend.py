@@ -1,9 +1,10 @@
 """Use case of trends: a batch of re-identifications over one label, compared with its reference."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 from sqlalchemy.orm import Session
 
+from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import build_run_body
 from service.jobs.results import read_noise_model
@@ -58,6 +59,24 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
         raise Conflict(
             f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
+    key = job.id, job.attempt, job.finished_at, _find_reference_version(session, job)
+    return _trends.get(key, lambda: _compute(session, job), is_final=job.state.is_terminal)
+
+
+_trends = ComputedValues(8)
+
+
+def _find_reference_version(session: Session, job: Job) -> Hashable:
+    """Return what may change of a job's reference: its names, and the runs of its own job."""
+    run_id = job.spec["trend"].get("reference")
+    if run_id is None:
+        return None
+    of = JobRepository(session).get(RunRepository(session).get(run_id).job_id)
+    names = tuple(list_reference_names(session, run_id))
+    return names, of.attempt, of.n_done, of.n_failed, of.finished_at
+
+
+def _compute(session: Session, job: Job) -> TrendOut:
     request = job.spec["trend"]
     rows_by_label, quantities = _collect_quantities(session, job)
     bodies = {

@@ -5,7 +5,7 @@ in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and exce
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -44,6 +44,10 @@ class Noise:
     kind: NoiseKind = "gaussian"
     terms: int = 12
     mean: float = 0.0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the fields as they are: every run of a noise sweep has its own."""
+        return Noise, (self.sigma, self.seed, self.kind, self.terms, self.mean)
 
     def __post_init__(self) -> None:
         if not 0 <= self.sigma < np.inf:

@@ -1,6 +1,6 @@
 """Validation of estimates on data that were not used for them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -53,6 +53,32 @@ def validate_estimates(
     the estimated one. On other records only the initial state is estimated, on their first part.
     `metrics` are those of the estimation data.
     """
+    fixed_problem, simulated, scored = simulate_validation(validation, estimation, estimates)
+    agreement, spread = compute_metrics(fixed_problem, simulated), fixed_problem.output_scale
+    is_still = spread < _STILL_SHARE * estimation.output_scale and (
+        agreement.fit_percent < 0.0 or spread < _STILL_NOISE * metrics.rms
+    )
+    return Validation(
+        _leave_out_fit(agreement) if is_still else agreement,
+        scored,
+        run_residual_tests(fixed_problem, simulated, "validation", correlation_times),
+        spread,
+        is_still,
+    )
+
+
+class ValidationRun(NamedTuple):
+    """Simulation of validation data: its problem, values (n,), and their scored part by output."""
+
+    problem: Problem
+    simulated: FloatArray
+    scored: tuple[tuple[FloatArray, ...], ...]
+
+
+def simulate_validation(
+    validation: Problem, estimation: Problem, estimates: Sequence[Estimate]
+) -> ValidationRun:
+    """Simulate validation data with all estimates fixed, as `validate_estimates` says."""
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
     shared = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
@@ -65,17 +91,8 @@ def validate_estimates(
     )
     theta = _estimate_starts(fixed_problem) if fixed_problem.free_parameters else np.zeros(0)
     simulated = fixed_problem.predict(theta[None])[0]
-    agreement, spread = compute_metrics(fixed_problem, simulated), fixed_problem.output_scale
-    is_still = spread < _STILL_SHARE * estimation.output_scale and (
-        agreement.fit_percent < 0.0 or spread < _STILL_NOISE * metrics.rms
-    )
-    return Validation(
-        _leave_out_fit(agreement) if is_still else agreement,
-        _select_scored_part(fixed_problem, split_outputs(fixed_problem, simulated)),
-        run_residual_tests(fixed_problem, simulated, "validation", correlation_times),
-        spread,
-        is_still,
-    )
+    scored = _select_scored_part(fixed_problem, split_outputs(fixed_problem, simulated))
+    return ValidationRun(fixed_problem, simulated, scored)
 
 
 def _estimate_starts(problem: Problem) -> FloatArray:

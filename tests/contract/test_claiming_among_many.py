@@ -98,7 +98,7 @@ def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded, admission)
     assert not [plan for plan in plans if whole in plan], plans
     assert not [plan for plan in plans if "CORRELATED" in plan or "SubPlan" in plan], plans
     if crowded.is_sqlite:
-        assert "COVERING INDEX ix_jobs_queue" in plans[0]
+        assert "COVERING INDEX ix_jobs_open" in plans[0]
 
 
 def test_a_look_at_the_queue_scans_no_table(crowded) -> None:

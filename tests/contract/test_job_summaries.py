@@ -1,16 +1,24 @@
 """Summaries of stored results: rates of ended runs, bounds at one σ, nothing out of date."""
 
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from service.core import computed
+from service.core.errors import InvalidRequest
 from service.core.states import JobState
-from service.queue.leases import Lease, LeaseQueue
+from service.dispatch import job_end
+from service.dispatch.job_runs import JobRuns
+from service.queue.leases import Claim, Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
 from service.repositories.jobs import JobRepository
+from service.storage.errors import LeaseLost
+from service.storage.sessions import Database
+from service.storage.tables import StoredSummary
+from service.sweeps import job_summary, summary
 from service.sweeps.schemas import SummaryOut
-from service.sweeps.summary import summarise_job
+from tests.database import record_statements
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
 from tests.stored import record_outcomes
@@ -32,10 +40,24 @@ FLOORS = {
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Iterator[Place]:
-    made = Place(tmp_path / "data")
-    yield made
-    made.database.dispose()
+def place(tmp_path: Path, sqlite_database: Database) -> Place:
+    """For what is computed, whichever database keeps it."""
+    return Place(tmp_path / "data", sqlite_database)
+
+
+@pytest.fixture
+def stored_place(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch) -> Place:
+    """A place where the summaries of all jobs are stored, and none is remembered."""
+    monkeypatch.setattr(job_summary, "STORED_RUNS", 1)
+    monkeypatch.setattr(job_end, "STORED_RUNS", 1)
+    forget(monkeypatch)
+    return Place(tmp_path / "data", database)
+
+
+def forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a new process."""
+    monkeypatch.setattr(job_summary, "_summaries", computed.ComputedValues(8))
+    monkeypatch.setattr(job_summary, "_tables", computed.ComputedValues(2))
 
 
 def swept(place: Place) -> tuple[str, Lease, list[str]]:
@@ -49,7 +71,7 @@ def swept(place: Place) -> tuple[str, Lease, list[str]]:
 
 def summarise(place: Place, job: str, by: list[str] | None = None) -> SummaryOut:
     with place.database.read_session() as session:
-        return summarise_job(session, job, by)
+        return summary.summarise_job(session, job, by)
 
 
 def fail(place: Place, lease: Lease, run: str) -> None:
@@ -98,3 +120,121 @@ def test_a_summary_of_an_ended_job_is_computed_again_after_it_was_resumed(place:
     with place.database.write_session() as session:
         LeaseQueue(session).finish_job(again, JobState.SUCCEEDED)
     assert [group.succeeded for group in summarise(place, job).groups] == [4, 4]
+
+
+def ended(place: Place) -> tuple[str, Lease, list[str]]:
+    """A noise sweep whose runs have ended: one failed, the others with different estimates."""
+    job, lease, runs = swept(place)
+    results = {run: conclude(L=(0.5 + 0.01 * n, 0.1 + 0.1 * n)) for n, run in enumerate(runs[1:])}
+    write_results(place.database, lease, results)
+    fail(place, lease, runs[0])
+    return job, lease, runs
+
+
+def finish(place: Place, lease: Lease, state: JobState = JobState.SUCCEEDED) -> None:
+    with place.database.write_session() as session:
+        LeaseQueue(session).finish_job(lease, state)
+
+
+def summarise_without_runs(place: Place, job: str) -> SummaryOut:
+    """The summary of a job, which must not look at its runs."""
+    with record_statements(place.database) as statements:
+        told = summarise(place, job)
+    assert not [one for one, _ in statements if "FROM runs" in one]
+    return told
+
+
+def test_a_dispatcher_stores_what_the_first_reader_would_compute(
+    stored_place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = stored_place
+    job, lease, _ = ended(place)
+    claim = Claim(lease, place.job(job))
+    maker = job_end.build_end_maker(
+        place.database, claim, JobRuns(place.database, claim, place.store)
+    )
+    assert maker is not None
+    *_, floors = maker()
+    assert floors is not None
+    assert floors["axes"] == []
+    finish(place, lease)
+    stored = summarise_without_runs(place, job)
+    with place.database.write_session() as session:
+        session.delete(session.get_one(StoredSummary, job))
+    forget(monkeypatch)
+    assert summarise(place, job) == stored
+    assert [group.failed for group in stored.groups] == [1, 0]
+
+
+def test_the_first_reader_of_an_ended_job_stores_what_it_has_computed(
+    stored_place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, lease, _ = ended(stored_place)
+    finish(stored_place, lease, JobState.CANCELLED)
+    first = summarise(stored_place, job)
+    forget(monkeypatch)
+    assert summarise_without_runs(stored_place, job) == first
+
+
+def test_nothing_is_stored_of_a_job_that_runs_or_was_lost(stored_place: Place) -> None:
+    job, lease, _ = ended(stored_place)
+    summarise(stored_place, job)
+    with pytest.raises(LeaseLost):
+        job_summary.store_summary(stored_place.database, Lease(job, lease.attempt + 1, "late"))
+    with stored_place.database.read_session() as session:
+        assert session.get(StoredSummary, job) is None
+
+
+def test_what_was_stored_of_a_job_is_forgotten_when_it_is_resumed(
+    stored_place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, lease, _ = ended(stored_place)
+    finish(stored_place, lease, JobState.FAILED)
+    assert summarise(stored_place, job).groups[0].failed == 1
+    with stored_place.database.write_session() as session:
+        JobRepository(session).resume(job)
+        assert session.get(StoredSummary, job) is None
+        JobRepository(session).cancel(job)
+    forget(monkeypatch)
+    group, _ = summarise(stored_place, job).groups
+    assert (group.runs, group.failed, group.succeeded) == (4, 0, 3)
+
+
+def test_too_many_groups_are_refused_before_a_run_is_read(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, _, _ = swept(place)
+    monkeypatch.setattr(summary, "MAX_GROUPS", 3)
+    with (
+        record_statements(place.database) as statements,
+        pytest.raises(InvalidRequest, match="more than 3 groups"),
+    ):
+        summarise(place, job, ["/seed"])
+    assert not [one for one, _ in statements if "FROM runs" in one]
+    assert len(summarise(place, job, ["/noise/sigma"]).groups) == 2
+
+
+def test_a_summary_that_takes_long_is_used_again_while_the_job_runs(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, lease, (first, second, *_) = swept(place)
+    assert summarise(place, job).groups[0].succeeded == 0
+    write_results(place.database, lease, {first: conclude(L=(0.5, 0.1))})
+    assert summarise(place, job).groups[0].succeeded == 1  # it took less than FRESH_SECONDS
+    monkeypatch.setattr(computed, "FRESH_SECONDS", 0.0)
+    monkeypatch.setattr(computed, "REUSE_FACTOR", 1e9)
+    write_results(place.database, lease, {second: conclude(L=(0.5, 0.1))})
+    assert summarise_without_runs(place, job).groups[0].succeeded == 1
+    monkeypatch.setattr(computed, "REUSE_FACTOR", 0.0)
+    assert summarise(place, job).groups[0].succeeded == 2
+
+
+def test_readers_that_come_at_once_compute_a_summary_once(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, lease, _ = ended(place)
+    finish(place, lease)
+    with record_statements(place.database) as statements, ThreadPoolExecutor(4) as pool:
+        told = list(pool.map(lambda _: summarise(place, job), range(8)))
+    assert told == [told[0]] * 8
+    assert len([one for one, _ in statements if "FROM runs" in one and "estimates" in one]) == 1

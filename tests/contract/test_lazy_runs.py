@@ -3,6 +3,7 @@
 from datetime import timedelta
 
 import pytest
+from sqlalchemy import update
 
 from service.core.states import JobState
 from service.dispatch import job_runs
@@ -13,11 +14,11 @@ from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
-from service.repositories.summaries import GroupKey, read_groups
 from service.runs.runs import RunQuery, list_runs
 from service.storage.errors import RowConflict
-from service.storage.tables import Dataset
-from service.sweeps.groups import group_all_runs
+from service.storage.tables import Dataset, Run
+from service.sweeps.groups import GroupKey, SweepGroups
+from service.sweeps.job_summary import load_groups
 from service.sweeps.summary import summarise_job
 from tests.dispatching import Place, carry_out
 from workers.inline_executor import InlineExecutor
@@ -174,8 +175,8 @@ def test_a_job_cannot_succeed_before_all_its_runs_are_made(place):
     place.submit(**SWEEP)
     got = claim(place)
     with place.database.write_session() as session:
-        for run in RunWriter(session, got.lease).list_pending():
-            run.state = JobState.SUCCEEDED
+        of_job = update(Run).where(Run.job_id == got.job.id)
+        session.execute(of_job.values(state=JobState.SUCCEEDED))
     left = N_RUNS - AT_ONCE
     said = f"{left} of its runs did not finish"
     with pytest.raises(RowConflict, match=said), place.database.write_session() as session:
@@ -188,7 +189,8 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
     place.cancel(job)
     assert len(place.runs(job)) == AT_ONCE
     with place.database.read_session() as session:
-        (group,) = group_all_runs(session, place.job(job), [], [], 10)
+        cancelled = place.job(job)
+        (group,) = load_groups(session, cancelled, SweepGroups(cancelled.spec, [], 10))
     assert group.states[JobState.CANCELLED] == N_RUNS
     with place.database.write_session() as session:
         submit.resume_job(session, job, place.settings)
@@ -213,8 +215,10 @@ def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, b
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     keys = [GroupKey("label" if one == "x" else "axis", one) for one in by]
     with place.database.read_session() as session:
-        expected = read_groups(session, whole, keys, [], 100)
-        found = group_all_runs(session, place.job(job), keys, [], 100)
+        expected, found = (
+            load_groups(session, one, SweepGroups(one.spec, keys, 100))
+            for one in (place.job(whole), place.job(job))
+        )
         told = summarise_job(session, job, by)
     assert [(one.key, one.first_number, one.states) for one in found] == [
         (one.key, one.first_number, one.states) for one in expected

@@ -14,7 +14,7 @@ from service.repositories.runs import RunRepository
 from service.storage.tables import Checkpoint
 from sysid.identification.run import begin_run
 from tests.dispatching import Place
-from tests.runs import RECORDS, spec
+from tests.runs import RECORDS, encode_runs, spec
 from tests.searching import bits
 from workers.protocol import QueuedRun, RunFailure
 from workers.tasks import build_pack_problems
@@ -46,7 +46,7 @@ def claim_again(place, lease):
 
 
 def recorder(place, claim):
-    return RunRecorder(place.database, claim, lambda run, found: None, lambda run: None)
+    return RunRecorder(place.database, claim, place.store, encode_runs, lambda *_: None)
 
 
 def point(run, number):

@@ -1,14 +1,17 @@
 """What a dispatcher writes about the runs of a job, and when; the stopwatch is the test's."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from service.core.states import JobState
+from service.dispatch import fitted_signals, recorder
 from service.dispatch.checkpoints import unpack_state
-from service.dispatch.fitted_signals import SignalsLocation
+from service.dispatch.encoding import ResultEncoder
 from service.dispatch.recorder import (
     CHECKPOINT_SECONDS,
     MAX_REASONS,
@@ -17,20 +20,24 @@ from service.dispatch.recorder import (
     RunRecorder,
 )
 from service.queue.leases import LeaseOwners, LeaseQueue
+from service.queue.packed_results import LAYOUTS, Dialect, PackedResults, pack_rows
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import LeaseLost, ObjectStoreFailed
+from service.storage.objects import StoredObject
+from service.storage.sessions import Database
 from service.storage.tables import Checkpoint
 from sysid.islands.state import RunState
 from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
 from tests.dispatching import Place
-from tests.results import conclude
+from tests.results import conclude, encode_results
+from tests.runs import encode_runs, spec
 from tests.searching import bits
-from workers.protocol import RunConclusion, RunFailure
+from workers.protocol import CompleteRun, RunConclusion, RunFailure
 
 N_RUNS, GENERATIONS = 4, 100
 
@@ -50,8 +57,8 @@ class Desk:
 
     def __init__(self, place: Place) -> None:
         self.place, self.stopwatch = place, Stopwatch()
-        self.signals: dict[str, SignalsLocation | ObjectStoreFailed] = {}
-        self.failed: list[str] = []
+        self.ended: list[tuple[str, Mapping[str, float] | None]] = []
+        self.states_told: dict[str, RunState] = {}
         axes = [{"path": "/seed", "range": [0, N_RUNS]}]
         self.job = place.submit(sweep={"axes": axes}, algorithm={"generations": GENERATIONS})
         self.runs = [run.id for run in place.runs(self.job)]
@@ -65,10 +72,22 @@ class Desk:
         return RunRecorder(
             self.place.database,
             claim,
-            lambda run, _: ShelvedFile(self.signals[run]) if run in self.signals else None,
-            self.failed.append,
+            self.place.store,
+            encode_runs,
+            lambda run, estimates: self.ended.append((run, estimates)),
             stopwatch=self.stopwatch,
         )
+
+    def tell_progress(self, run: str, state: RunState, seconds: float) -> None:
+        """Tell the recorder of a state, from which the run goes on."""
+        self.states_told[run] = state
+        self.recorder.record_progress(run, state, seconds)
+
+    def tell_result(self, run: str, state: RunState) -> None:
+        """Tell the recorder of a run that ended in this state, by itself in a pack."""
+        results, told = {run: concluded(state)}, {run: self.states_told.get(run)}
+        reported = {name: one for name, one in told.items() if one is not None}
+        self.recorder.record_results(encode_results(results, self.place.database, reported))
 
     def claim_again(self) -> RunRecorder:
         """Give the job back and claim it under the next attempt."""
@@ -95,23 +114,9 @@ class Desk:
         return [event.data["message"] for event in events if event.kind == "log"]
 
 
-class ShelvedFile:
-    """A file that the store takes, or refuses with this error."""
-
-    def __init__(self, told: SignalsLocation | ObjectStoreFailed) -> None:
-        self._told = told
-
-    def store_file(self) -> SignalsLocation:
-        if isinstance(self._told, ObjectStoreFailed):
-            raise self._told
-        return self._told
-
-
 @pytest.fixture
-def desk(tmp_path: Path) -> Iterator[Desk]:
-    made = Desk(Place(tmp_path / "data"))
-    yield made
-    made.place.database.dispose()
+def desk(tmp_path: Path, database: Database) -> Desk:
+    return Desk(Place(tmp_path / "data", database))
 
 
 def searched(
@@ -142,11 +147,11 @@ def concluded(state: RunState) -> RunConclusion:
 
 def test_progress_is_written_every_second_and_checkpoints_every_four(desk: Desk) -> None:
     run = desk.runs[0]
-    desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
     assert desk.checkpoints() == {run: 100}
     assert desk.place.job(desk.job).evaluations == 100
-    desk.recorder.record_progress(run, searched(20, 200, 0.5), 2.0)
+    desk.tell_progress(run, searched(20, 200, 0.5), 2.0)
     desk.write_after(PROGRESS_SECONDS - 0.1)
     assert desk.place.job(desk.job).evaluations == 100
     desk.write_after(0.2)
@@ -167,10 +172,10 @@ def test_a_run_that_did_not_go_on_is_not_saved_again(desk: Desk) -> None:
             return [session.get_one(Checkpoint, run).created_at for run in desk.runs[:2]]
 
     for run in desk.runs[:2]:
-        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
     before = saved_at()
-    desk.recorder.record_progress(desk.runs[0], searched(20, 200, 0.5), 2.0)
+    desk.tell_progress(desk.runs[0], searched(20, 200, 0.5), 2.0)
     desk.write_after(CHECKPOINT_SECONDS + 0.1)
     assert [old == new for old, new in zip(before, saved_at(), strict=True)] == [False, True]
 
@@ -190,7 +195,7 @@ def test_starts_are_collected_for_a_second_and_deaths_are_written_at_once(desk: 
 
 
 def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
-    desk.recorder.record_progress(desk.runs[0], searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(desk.runs[0], searched(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
     with desk.place.database.read_session() as session:
         before = EventRepository(session).list_after(desk.job)[-1].id
@@ -202,9 +207,9 @@ def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
 def test_each_evaluation_counts_once_whatever_becomes_of_its_run(desk: Desk) -> None:
     done, fails, goes_on, refused = desk.runs
     for run in (done, fails, goes_on):
-        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
-    desk.recorder.record_result(done, concluded(searched(30, 310, 0.5, 0.2)), 3.0)
+    desk.tell_result(done, searched(30, 310, 0.5, 0.2))
     desk.recorder.record_failure(fails, RunFailure("as told"))
     desk.recorder.record_failure(refused, RunFailure("late", evaluations=40))
     desk.recorder.write_all()
@@ -214,13 +219,13 @@ def test_each_evaluation_counts_once_whatever_becomes_of_its_run(desk: Desk) -> 
     assert desk.checkpoints() == {goes_on: 100}
     runs = {run.id: run for run in desk.place.runs(desk.job)}
     assert [runs[run].evaluations for run in desk.runs] == [310, 100, 0, 40]
-    assert desk.failed == [fails, refused]
+    assert desk.ended == [(fails, None), (refused, None)]
 
 
 def test_a_run_that_begins_and_ends_between_two_writes_has_both_times(desk: Desk) -> None:
     run = desk.runs[0]
     desk.recorder.record_start(run)
-    desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+    desk.tell_result(run, searched(5, 50, 0.5))
     desk.recorder.write_due()
     row = desk.place.runs(desk.job)[0]
     assert row.state is JobState.SUCCEEDED
@@ -232,15 +237,13 @@ def test_history_is_whole_whatever_was_written_before_the_end(desk: Desk) -> Non
     first, second = desk.runs[:2]
     migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(3))
     for run in (first, second):
-        desk.recorder.record_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+        desk.tell_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
     desk.recorder.write_due()
-    desk.recorder.record_progress(
-        first, searched(20, 200, 0.9, 0.8, 0.7, migrants=migrants[:2]), 2.0
-    )
+    desk.tell_progress(first, searched(20, 200, 0.9, 0.8, 0.7, migrants=migrants[:2]), 2.0)
     desk.write_after(PROGRESS_SECONDS + 0.1)
     end = searched(30, 300, 0.9, 0.8, 0.7, 0.6, migrants=migrants)
     for run in (first, second):
-        desk.recorder.record_result(run, concluded(end), 3.0)
+        desk.tell_result(run, end)
     desk.write_after(PROGRESS_SECONDS + 0.1)
     with desk.place.database.read_session() as session:
         for run in (first, second):
@@ -255,12 +258,26 @@ def test_history_is_whole_whatever_was_written_before_the_end(desk: Desk) -> Non
             assert [(one.number, one.epoch) for one in log] == [(0, 0), (1, 1), (2, 2)]
 
 
+def test_points_that_were_told_but_not_written_before_the_end_are_not_lost(desk: Desk) -> None:
+    run = desk.runs[0]
+    migrants = tuple(Migrant(epoch, 0, 1, 0.5) for epoch in range(2))
+    desk.recorder.write_all()
+    desk.tell_progress(run, searched(10, 100, 0.9, 0.8, migrants=migrants[:1]), 1.0)
+    desk.tell_result(run, searched(30, 300, 0.9, 0.8, 0.7, migrants=migrants))
+    desk.recorder.write_all()
+    with desk.place.database.read_session() as session:
+        history = RunRepository(session).read_history(run)
+        log = RunRepository(session).read_migrations(run)
+    assert [point.rms for point in history] == [0.9, 0.8, 0.7]
+    assert [one.epoch for one in log] == [0, 1]
+
+
 def end_all(desk: Desk, n_failed: int) -> None:
     for number, run in enumerate(desk.runs):
         if number < n_failed:
             desk.recorder.record_failure(run, RunFailure(f"reason {number}"))
         else:
-            desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+            desk.tell_result(run, searched(5, 50, 0.5))
     desk.recorder.finish_job()
 
 
@@ -283,13 +300,13 @@ def test_a_job_fails_when_all_its_runs_failed_and_tells_some_reasons(
 
 def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Desk) -> None:
     run = desk.runs[0]
-    desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+    desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
     desk.recorder.write_due()
-    desk.recorder.record_progress(run, searched(20, 200, 0.5), 1.5)
+    desk.tell_progress(run, searched(20, 200, 0.5), 1.5)
     desk.recorder.write_all()
     assert desk.checkpoints() == {run: 200}
     desk.recorder = desk.claim_again()
-    desk.recorder.record_progress(run, searched(30, 300, 0.5), 2.0)
+    desk.tell_progress(run, searched(30, 300, 0.5), 2.0)
     desk.recorder.cancel_job()
     assert desk.place.job(desk.job).state is JobState.CANCELLED
     assert desk.place.job(desk.job).evaluations == 300  # those of its checkpoint are among them
@@ -304,13 +321,13 @@ def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Des
 def test_a_checkpoint_counts_until_its_run_goes_on_or_ends(desk: Desk) -> None:
     fails, ends, waits, _ = desk.runs
     for run in (fails, ends, waits):
-        desk.recorder.record_progress(run, searched(10, 100, 0.5), 1.0)
+        desk.tell_progress(run, searched(10, 100, 0.5), 1.0)
     desk.recorder.write_all()
     desk.recorder = desk.claim_again()
     desk.recorder.write_all()
     assert desk.place.job(desk.job).evaluations == 300
     desk.recorder.record_failure(fails, RunFailure("as told"))
-    desk.recorder.record_result(ends, concluded(searched(30, 310, 0.5)), 3.0)
+    desk.tell_result(ends, searched(30, 310, 0.5))
     desk.recorder.write_all()
     assert desk.place.job(desk.job).evaluations == 100 + 310 + 100
     assert [run.evaluations for run in desk.place.runs(desk.job)[:2]] == [100, 310]
@@ -347,7 +364,7 @@ def test_a_result_that_is_taken_over_counts_once(desk: Desk) -> None:
     desk.recorder.record_reuse(desk.runs[0], source)
     desk.recorder.write_due()
     for number, run in enumerate(desk.runs[1:]):
-        desk.recorder.record_result(run, concluded(searched(5, 50, 0.5)), 0.2)
+        desk.tell_result(run, searched(5, 50, 0.5))
         desk.write_after(PROGRESS_SECONDS + 0.1)
         assert desk.place.job(desk.job).evaluations == 1000 + 50 * (number + 1)
     desk.recorder.finish_job()
@@ -360,11 +377,11 @@ def test_a_result_that_is_taken_over_counts_once(desk: Desk) -> None:
 def test_what_is_left_is_told_from_what_was_computed_in_this_attempt(desk: Desk) -> None:
     first, second, third, _ = desk.runs
     source = computed_before(desk, 1000)
-    desk.recorder.record_progress(first, searched(50, 100, 0.5), 1.0)
+    desk.tell_progress(first, searched(50, 100, 0.5), 1.0)
     desk.recorder.write_all()
     desk.recorder = desk.claim_again()
-    desk.recorder.record_progress(first, searched(60, 120, 0.5), 1.0)
-    desk.recorder.record_progress(second, searched(10, 20, 0.5), 1.0)
+    desk.tell_progress(first, searched(60, 120, 0.5), 1.0)
+    desk.tell_progress(second, searched(10, 20, 0.5), 1.0)
     desk.stopwatch.now += 10.0
     desk.recorder.write_all()
     # 10 generations in 10 s: those of the second run, as the first one went on at 60.
@@ -372,27 +389,121 @@ def test_what_is_left_is_told_from_what_was_computed_in_this_attempt(desk: Desk)
     desk.recorder.record_reuse(third, source)
     desk.recorder.write_all()
     assert desk.place.job(desk.job).seconds_left == pytest.approx(300 - 60 - 10)
-    desk.recorder.record_result(second, concluded(searched(100, 200, 0.5)), 3.0)
+    desk.tell_result(second, searched(100, 200, 0.5))
     desk.recorder.write_all()
     assert desk.place.job(desk.job).seconds_left == pytest.approx(10 * (200 - 60) / 100)
 
 
-def test_signals_that_the_store_refuses_cost_no_result_and_are_told(desk: Desk) -> None:
-    full = ObjectStoreFailed("the disk is full")
-    location = SignalsLocation("c" * 64, 10, 20)
-    desk.signals = dict(zip(desk.runs, [full, location, full], strict=False))
-    end_all(desk, 0)
+def pack_signals(desk: Desk, runs: list[str], signals: bytes) -> PackedResults:
+    """Results of runs whose signals are one object, in parts of two bytes."""
+    complete = [CompleteRun(run, spec(), concluded(searched(5, 50, 0.5)), 1.0) for run in runs]
+    plain = ResultEncoder("sqlite", keeps_signals=False)(complete, {})
+    name = sha256(signals).hexdigest()
+    tables = [list(rows) for rows in plain.rows]
+    tables[0] = [(*row[:-3], name, 2 * i, 2) for i, row in enumerate(tables[0])]
+    dialect: Dialect = "sqlite" if desk.place.database.is_sqlite else "postgresql"
+    rows = tuple(
+        pack_rows(rows, layout, dialect) for rows, layout in zip(tables, LAYOUTS, strict=True)
+    )
+    return replace(plain, rows=rows, signals=signals, signals_sha256=name)
+
+
+def test_signals_that_the_store_refuses_cost_no_result_and_are_told(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, first = desk.place.store.put_stream, desk.runs[:2]
+
+    def refuse_first(blocks: list[bytes]) -> StoredObject:
+        if blocks == [b"aabb"]:
+            raise ObjectStoreFailed("the disk is full")
+        return put(blocks)
+
+    monkeypatch.setattr(fitted_signals, "RETRY_SECONDS", -1.0)
+    monkeypatch.setattr(desk.place.store, "put_stream", refuse_first)
+    desk.recorder.record_results(pack_signals(desk, first, b"aabb"))
+    desk.recorder.record_results(pack_signals(desk, desk.runs[2:], b"ccdd"))
+    desk.recorder.finish_job()
     rows = desk.place.runs(desk.job)
     assert {row.state for row in rows} == {JobState.SUCCEEDED}
+    stored = sha256(b"ccdd").hexdigest()
     assert [(row.signals_sha256, row.signals_start, row.signals_size) for row in rows] == [
         (None, None, None),
-        location,
         (None, None, None),
-        (None, None, None),
+        (stored, 0, 2),
+        (stored, 2, 2),
     ]
+    assert desk.place.store.get_bytes(stored) == b"ccdd"
     assert desk.messages() == [
         f"the signals of {desk.runs[0]} and 1 others are not stored: the disk is full"
     ]
+
+
+def test_a_run_that_has_ended_already_keeps_its_result_and_counts_once(desk: Desk) -> None:
+    first, second = desk.runs[:2]
+    desk.tell_result(first, searched(5, 50, 0.5))
+    desk.recorder.write_all()
+    results = {run: concluded(searched(9, 90, 0.7)) for run in (first, second)}
+    desk.recorder.record_results(encode_results(results, desk.place.database))
+    desk.recorder.write_all()
+    rows = desk.place.runs(desk.job)[:2]
+    assert [(row.best_rms, row.evaluations) for row in rows] == [(0.5, 50), (0.7, 90)]
+    assert [row.estimates for row in rows] == [{}, {}]
+    assert desk.place.job(desk.job).n_done == 2
+    with desk.place.database.read_session() as session:
+        points = [RunRepository(session).read_history(row.id) for row in rows]
+    assert [len(one) for one in points] == [1, 1]
+
+
+@pytest.mark.parametrize("is_refused", [False, True])
+def test_many_results_are_written_in_several_transactions_each_once(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, is_refused: bool
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_ENDED", 2)
+    written: list[int] = []
+    record_results = RunWriter.record_results
+
+    def record(writer: RunWriter, packs: list[PackedResults], lost: set[str]) -> None:
+        if is_refused and len(written) == 1 and written[0] >= 0:
+            written[0] = -written[0]
+            raise ConnectionError("as told")
+        record_results(writer, packs, lost)
+        written.append(len(packs))
+
+    monkeypatch.setattr(RunWriter, "record_results", record)
+    for run in desk.runs:
+        desk.tell_result(run, searched(5, 50, 0.5))
+    if is_refused:
+        with pytest.raises(ConnectionError):
+            desk.recorder.finish_job()
+    desk.recorder.finish_job()
+    assert [abs(count) for count in written] == [2, 2]
+    assert desk.states() == [JobState.SUCCEEDED] * 4
+    assert (desk.place.job(desk.job).n_done, desk.place.job(desk.job).evaluations) == (4, 200)
+
+
+def test_of_many_runs_that_begin_the_first_are_marked_and_the_others_later(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_STARTED", 1)
+    _, second, third, _ = desk.runs
+    for run in desk.runs:
+        desk.recorder.record_start(run)
+    desk.tell_result(second, searched(5, 50, 0.5))
+    expected = [JobState.RUNNING, JobState.SUCCEEDED, JobState.QUEUED, JobState.QUEUED]
+    desk.recorder.write_due()
+    assert desk.states() == expected
+    desk.tell_result(third, searched(5, 50, 0.5))
+    desk.write_after(RESULTS_SECONDS + 0.1)
+    assert desk.states()[2:] == [JobState.SUCCEEDED, JobState.RUNNING]
+
+
+def test_results_of_another_jobs_runs_change_nothing(desk: Desk) -> None:
+    other = desk.place.runs(desk.place.submit())[0].id
+    desk.tell_result(other, searched(5, 50, 0.5))
+    desk.recorder.write_all()
+    assert desk.place.job(desk.job).n_done == 0
+    with desk.place.database.read_session() as session:
+        assert RunRepository(session).get(other).state is JobState.QUEUED
 
 
 def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: Desk) -> None:
@@ -401,8 +512,8 @@ def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: 
     desk.recorder.record_start(desk.runs[0])
     with pytest.raises(LeaseLost):
         desk.recorder.write_due()
-    desk.recorder.record_result(desk.runs[0], concluded(searched(5, 50, 0.5)), 0.2)
-    desk.recorder.record_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
+    desk.tell_result(desk.runs[0], searched(5, 50, 0.5))
+    desk.tell_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
     for write in (desk.recorder.write_due, desk.recorder.cancel_job, desk.recorder.finish_job):
         with pytest.raises(LeaseLost):
             write()

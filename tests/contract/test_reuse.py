@@ -5,15 +5,14 @@ from datetime import timedelta
 import pytest
 
 from service.core.states import JobState
-from service.dispatch import job_runs
+from service.dispatch import fitted_signals
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
+from service.storage.errors import ObjectStoreFailed
 from service.storage.garbage import delete_orphans
-from sysid.identification.fit_problems import FitRecords
 from tests.dispatching import Place, carry_out
 from workers import tasks
 from workers.inline_executor import InlineExecutor
-from workers.tasks import process_pack
 
 pytestmark = pytest.mark.slow
 
@@ -27,9 +26,9 @@ class CountingExecutor(InlineExecutor):
         super().__init__()
         self.computed = []
 
-    def submit_pack(self, pack, keys, shared):
+    def submit_pack(self, pack, keys, shared, encoder):
         self.computed += [item.run for item in pack]
-        return super().submit_pack(pack, keys, shared)
+        return super().submit_pack(pack, keys, shared, encoder)
 
 
 @pytest.fixture
@@ -89,12 +88,20 @@ def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
     assert computed == []
 
 
+def test_a_job_that_keeps_signals_takes_over_no_run_without_them(place):
+    carried_out(place, **sweep(2))
+    _, runs, computed = carried_out(place, **sweep(2, keep_signals=True))
+    assert computed == [run.id for run in runs]
+    assert carried_out(place, **sweep(2, keep_signals=True))[2] == []
+
+
 def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(place):
-    first, before, _ = carried_out(place, **sweep(2))
+    kept = {"keep_signals": True}
+    first, before, _ = carried_out(place, **sweep(2, **kept))
     with place.database.write_session() as session:
         JobRepository(session).delete(first)
     delete_orphans(place.database, place.store, older_than=timedelta(0))
-    _, after, computed = carried_out(place, **sweep(2))
+    _, after, computed = carried_out(place, **sweep(2, **kept))
     assert computed == [run.id for run in after]
     assert [run.best_rms for run in after] == [run.best_rms for run in before]
     assert all(place.store.exists(run.signals_sha256) for run in after)
@@ -127,16 +134,10 @@ def test_a_run_that_the_clock_may_end_is_computed_again(place):
 
 
 def test_a_run_that_failed_is_tried_again(place, monkeypatch):
-    def broken(pack, keys, *shared):
-        done = process_pack(pack, keys, *shared)
-        raise MemoryError(f"{len(done)} lost")
+    def broken(*_, **__):
+        raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(
-            job_runs,
-            "prepare_run_records",
-            lambda *_: FitRecords((), None, None, None),
-        )
         patched.setattr(tasks, "conclude_run", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
     assert run.state is JobState.FAILED
@@ -146,8 +147,12 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
 
 
 def test_a_run_without_its_signals_is_computed_again(place, monkeypatch):
+    def full(_):
+        raise ObjectStoreFailed("the disk is full")
+
     with monkeypatch.context() as patched:
-        patched.setattr(job_runs, "add_fitted_signals", lambda *_: None)
+        patched.setattr(fitted_signals, "RETRY_SECONDS", -1.0)
+        patched.setattr(place.store, "put_stream", full)
         _, (first,), _ = carried_out(place, **sweep(1))
     assert first.signals_sha256 is None
     _, (again,), computed = carried_out(place, **sweep(1))

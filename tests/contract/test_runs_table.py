@@ -9,16 +9,20 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
-from service.runs import table
 from service.storage.sessions import Database
+from service.sweeps import table
 from tests.stored import claim
 
 EVIL = '=HYPERLINK("http://x","y")'
 
 
-def submit(database: Database, n_runs: int) -> str:
+def submit(database: Database, n_runs: int, path: str = "/seed") -> str:
+    """A queued job with so many values of one axis."""
+    values = [str(number) for number in range(n_runs)]
+    axes = [{"path": path, "values": values, "labels": None}]
+    spec = {"model": "silverbox", "sweep": {"axes": axes}}
     with database.write_session() as session:
-        new = NewJob(name="many", spec={"model": "silverbox", "sweep": {"axes": []}}, n_runs=n_runs)
+        new = NewJob(name="many", spec=spec, n_runs=n_runs)
         return JobRepository(session).submit(new).job.id
 
 
@@ -67,7 +71,7 @@ def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database
 def test_a_table_of_runs_without_estimates_has_no_columns_of_parameters(database: Database) -> None:
     found = rows(database, ended(database, [NewRun(number=0)], {}))
     assert [one["state"] for one in found] == ["failed"]
-    assert list(found[0])[-1] == "error"
+    assert list(found[0])[-2:] == ["error", "/seed"]
 
 
 def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> None:
@@ -125,7 +129,7 @@ def test_headings_have_units_and_estimates_their_status(database: Database) -> N
 
 
 def test_a_parameter_of_two_units_has_columns_for_each(database: Database) -> None:
-    job = submit(database, n_runs=2)
+    job = submit(database, n_runs=2, path="/model")
     estimated(database, job, [("T", "s", "identified"), ("T", "min", "fixed")])
     first, second = rows(database, job)
     assert (first["T [s]"], first["T [min]"]) == ("0.5", "")

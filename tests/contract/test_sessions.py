@@ -7,9 +7,12 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
+from service.core.settings import Settings
 from service.storage.errors import UnstorableValue
+from service.storage.open_storage import open_storage
 from service.storage.sessions import Database
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, Base, Job, Project
+from tests.database import copy_sqlite_template
 from tests.stored import job_of, submit
 
 
@@ -113,9 +116,31 @@ def test_sqlite_runs_as_agreed(sqlite_database):
     }
 
 
+def test_what_a_request_was_told_survives_a_power_cut(tmp_path):
+    settings = Settings(data_dir=tmp_path, database_url=None)
+    copy_sqlite_template(tmp_path)
+    database, _ = open_storage(settings)  # as the web process does
+    with database.write_session() as session:
+        assert session.scalar(text("PRAGMA synchronous")) == 2  # FULL: each commit is synced
+    database.dispose()
+
+
+def test_statistics_are_those_of_the_rows_and_wait_for_nobody(database):
+    for number in range(3):
+        submit(database, name=str(number))
+    with database.write_session():
+        database.update_statistics()  # another writer holds SQLite's lock
+    database.update_statistics()
+    if database.is_sqlite:
+        query = "SELECT stat FROM sqlite_stat1 WHERE idx = 'ix_jobs_open'"
+        with database.read_session() as session:
+            assert session.scalar(text(query)).startswith("3 ")
+
+
 def test_every_table_a_user_owns_names_its_project():
     # The others belong to a run or a job, which does, or to the service itself.
     within = {"projects", "run_history", "migrations_log", "checkpoints", "events", "dispatchers"}
+    within |= {"job_summaries"}
     for name, table in Base.metadata.tables.items():
         assert ("project_id" in table.columns) != (name in within), name
 

@@ -4,38 +4,39 @@ import numpy as np
 import pytest
 
 from service.core.states import JobState
+from service.jobs.stored_cells import build_stored_cells, read_axis_groups
 from service.queue.leases import Lease, LeaseQueue
-from service.queue.run_writes import NewRun, RunOutcome, RunWriter
-from service.repositories.summaries import (
-    QUANTILES_PER_MILLE,
-    GroupKey,
-    SummaryQuantity,
-    find_quietest_run,
-    read_groups,
-)
+from service.queue.run_writes import RunOutcome, RunWriter
+from service.repositories.summaries import SummaryQuantity, find_quietest_run, read_run_table
 from service.storage.errors import LeaseLost
-from service.storage.tables import Job
-from tests.stored import runs_of, submit
+from service.storage.tables import DEFAULT_PROJECT, Job
+from service.sweeps.groups import QUANTILES_PER_MILLE, GroupKey, SweepGroups, aggregate_runs
+from tests.stored import job_of, runs_of, submit
 
 SIGMA = GroupKey("axis", "/noise/sigma")
 METHOD = GroupKey("axis", "/algorithm/method")
+LABEL = GroupKey("label", "length_m")
+RMS, LAG = SummaryQuantity("rms"), SummaryQuantity("estimate", "L")
+BODY = {
+    "model": "tube",
+    "seed": 1,
+    "algorithm": {"method": "improved"},
+    "noise": {"sigma": 0.0, "seed": 0},
+}
 
 
-def filled(database, cells, values):
-    """A job with these cells, whose runs gave these values; None: the run failed."""
-    submit(database, n_runs=len(cells))
+def seeds(count):
+    return {"path": "/seed", "range": [0, count]}
+
+
+def filled(database, axes, values):
+    """A job with these axes, whose runs gave these values; None: the run failed."""
+    spec = {**BODY, "sweep": {"axes": axes}}
+    submit(database, n_runs=len(values), spec=spec)
     with database.write_session() as session:
         got = LeaseQueue(session).claim_job("d1")
-        ledger = RunWriter(session, got.lease)
-        ledger.create_runs(
-            NewRun(
-                number=i,
-                cell=cell,
-                labels={"length_m": 5.0 * (i % 2)},
-                sigma=cell.get("/noise/sigma"),
-            )
-            for i, cell in enumerate(cells)
-        )
+        cells = build_stored_cells(spec, read_axis_groups(spec))
+        RunWriter(session, got.lease).create_runs(cells)
     outcomes = [
         RunOutcome(run_id=run.id, state=JobState.FAILED, error="diverged")
         if value is None
@@ -55,34 +56,31 @@ def filled(database, cells, values):
     return got.job.id
 
 
-def summary(database, job, keys, *quantities, limit=100):
+def summary(database, job, keys, *, limit=100, project=DEFAULT_PROJECT):
+    groups = SweepGroups(job_of(database, job).spec, keys, limit)
     with database.read_session() as session:
-        return read_groups(session, job, keys, quantities, limit)
+        return aggregate_runs(read_run_table(session, job, project), groups)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 100])
 def test_quantiles_are_those_of_the_values(database, count):
     values = np.random.default_rng(count).random(count).tolist()
-    job = filled(database, [{"/seed": i} for i in range(count)], values)
-    (whole,) = summary(database, job, [], SummaryQuantity("rms"), SummaryQuantity("estimate", "L"))
+    job = filled(database, [seeds(count)], values)
+    (whole,) = summary(database, job, [])
     expected = np.quantile(values, np.array(QUANTILES_PER_MILLE) / 1000)
-    np.testing.assert_allclose(whole.quantiles[SummaryQuantity("rms")], expected, rtol=1e-12)
-    np.testing.assert_allclose(
-        whole.quantiles[SummaryQuantity("estimate", "L")], 2 * expected, rtol=1e-12
-    )
+    np.testing.assert_allclose(whole.quantiles[RMS], expected, rtol=1e-12)
+    np.testing.assert_allclose(whole.quantiles[LAG], 2 * expected, rtol=1e-12)
     assert whole.mean_evaluations == pytest.approx(100 + (count - 1) / 2)
 
 
 def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
-    cells = [
-        {"/noise/sigma": sigma, "/algorithm/method": method, "/seed": seed}
-        for sigma in (0.2, 0, 0.1)
-        for method in ("simple", "improved")
-        for seed in range(3)
+    axes = [
+        {"path": "/noise/sigma", "values": [0.2, 0, 0.1]},
+        {"path": "/algorithm/method", "values": ["simple", "improved"]},
+        seeds(3),
     ]
-    values = [float(i) for i in range(len(cells))]
-    job = filled(database, cells, values)
-    found = summary(database, job, [SIGMA, METHOD], SummaryQuantity("rms"))
+    job = filled(database, axes, [float(i) for i in range(18)])
+    found = summary(database, job, [SIGMA, METHOD])
     assert [one.key for one in found] == [
         (0.2, "simple"),
         (0.2, "improved"),
@@ -91,81 +89,110 @@ def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
         (0.1, "simple"),
         (0.1, "improved"),
     ]
-    medians = [one.quantiles[SummaryQuantity("rms")][2] for one in found]
-    assert medians == [1.0, 4.0, 7.0, 10.0, 13.0, 16.0]
+    assert [one.quantiles[RMS][2] for one in found] == [1.0, 4.0, 7.0, 10.0, 13.0, 16.0]
 
 
 def test_failed_runs_are_counted_and_enter_no_quantile(database):
-    job = filled(database, [{"/seed": i} for i in range(4)], [1.0, None, 3.0, None])
-    (whole,) = summary(database, job, [], SummaryQuantity("rms"))
+    job = filled(database, [seeds(4)], [1.0, None, 3.0, None])
+    (whole,) = summary(database, job, [])
     assert whole.states[JobState.SUCCEEDED] == 2
     assert whole.states[JobState.FAILED] == 2
     assert whole.n_valid == 2
-    assert whole.quantiles[SummaryQuantity("rms")][2] == 2.0
+    assert (whole.mean_evaluations, whole.quantiles[RMS][2]) == (101.0, 2.0)
 
 
 def test_runs_may_be_grouped_by_a_label_and_by_values_that_are_no_numbers(database):
     model = {"name": "own", "form": "difference"}
-    job = filled(database, [{"/model": model}, {"/model": "tube"}], [1.0, 2.0])
+    labels = [{"length_m": 0.0}, {"length_m": 5.0}, {"length_m": 0.0}]
+    axis = {"path": "/model", "values": [model, "tube", "mine"], "labels": labels}
+    job = filled(database, [axis], [1.0, 2.0, 3.0])
     by_model = summary(database, job, [GroupKey("axis", "/model")])
-    assert [one.key for one in by_model] == [(model,), ("tube",)]
-    by_label = summary(database, job, [GroupKey("label", "length_m")])
-    assert [one.key for one in by_label] == [(0.0,), (5.0,)]
+    assert [one.key for one in by_model] == [(model,), ("tube",), ("mine",)]
+    by_label = summary(database, job, [LABEL])
+    assert [(one.key, one.quantiles[RMS][2]) for one in by_label] == [((0.0,), 2.0), ((5.0,), 2.0)]
 
 
 def test_a_quantity_that_no_run_has_gives_no_quantiles(database):
-    job = filled(database, [{"/seed": 0}], [1.0])
-    (whole,) = summary(
-        database, job, [], SummaryQuantity("stderr", "L"), SummaryQuantity("estimate", "x")
-    )
-    assert whole.quantiles == {}
+    job = filled(database, [seeds(1)], [1.0])
+    (whole,) = summary(database, job, [])
+    assert set(whole.quantiles) == {RMS, SummaryQuantity("rms_noise_free"), LAG}
 
 
-def test_at_most_one_group_more_than_the_limit_is_read(database):
-    job = filled(database, [{"/noise/sigma": i} for i in range(9)], [1.0] * 9)
-    assert len(summary(database, job, [SIGMA], SummaryQuantity("rms"), limit=4)) == 5
+def test_groups_beyond_the_limit_are_left_out(database):
+    axes = [{"path": "/noise/sigma", "values": list(range(9))}, seeds(2)]
+    job = filled(database, axes, [float(i) for i in range(18)])
+    found = summary(database, job, [SIGMA], limit=4)
+    assert [(one.key, one.quantiles[RMS][2]) for one in found] == [
+        ((sigma,), 2 * sigma + 0.5) for sigma in range(4)
+    ]
 
 
 def test_a_group_knows_between_which_deviations_its_noise_lies(database):
-    cells = [{"/noise/sigma": sigma, "/seed": seed} for sigma in (0.0, 0.5) for seed in (1, 2)]
-    job = filled(database, cells, [1.0] * 4)
+    axes = [{"path": "/noise/sigma", "values": [0.0, 0.5]}, seeds(2)]
+    job = filled(database, axes, [1.0] * 4)
     assert [one.sigma for one in summary(database, job, [SIGMA])] == [(0.0, 0.0), (0.5, 0.5)]
     assert [one.sigma for one in summary(database, job, [])] == [(0.0, 0.5)]
 
 
-def test_several_quantities_have_the_quantiles_that_each_has_alone(database):
+def test_runs_with_other_parameters_have_their_own_columns(database):
+    axes = [{"path": "/model", "values": ["one", "other"]}, seeds(2)]
+    spec = {**BODY, "sweep": {"axes": axes}}
+    submit(database, n_runs=4, spec=spec)
+    with database.write_session() as session:
+        got = LeaseQueue(session).claim_job("d1")
+        ledger = RunWriter(session, got.lease)
+        ledger.create_runs(build_stored_cells(spec, read_axis_groups(spec)))
+        outcomes = [
+            RunOutcome(
+                run_id=run.id,
+                state=JobState.SUCCEEDED,
+                result={"parameters": [{"name": name, "value": number, "stderr": 0.5}]},
+            )
+            for number, (run, name) in enumerate(
+                zip(ledger.list_pending(), ("L", "L", "T", "T"), strict=True)
+            )
+        ]
+        ledger.record_outcomes(outcomes)
+    with database.read_session() as session:
+        table = read_run_table(session, got.job.id)
+    assert table.names == (("L",), ("T",))
+    assert table.kinds.tolist() == [0, 0, 1, 1]
+    for name, expected in (("L", [0, 1, np.nan, np.nan]), ("T", [np.nan, np.nan, 2, 3])):
+        np.testing.assert_equal(table.values[SummaryQuantity("estimate", name)], expected)
+
+
+@pytest.mark.parametrize("keys", [[], [SIGMA], [METHOD], [SIGMA, METHOD]])
+def test_the_quantiles_of_a_group_are_those_of_its_own_successes(database, keys):
     draws = np.random.default_rng(3)
-    cells = [{"/noise/sigma": draws.integers(3) / 10} for _ in range(60)]
-    values = [None if draws.random() < 0.2 else float(draws.random()) for _ in cells]
-    job = filled(database, cells, values)
-    wanted = (
-        SummaryQuantity("rms"),
-        SummaryQuantity("estimate", "L"),
-        SummaryQuantity("rms_noise_free"),
-    )
-    together = summary(database, job, [SIGMA], *wanted)
-    for quantity in wanted:
-        alone = summary(database, job, [SIGMA], quantity)
-        for one, other in zip(together, alone, strict=True):
-            assert one.key == other.key
-            assert one.quantiles.get(quantity) == other.quantiles.get(quantity)
-    for one in together:
-        mine = [v for v, c in zip(values, cells, strict=True) if c["/noise/sigma"] == one.key[0]]
-        left = [v for v in mine if v is not None]
-        expected = np.quantile(left, np.array(QUANTILES_PER_MILLE) / 1000)
-        np.testing.assert_allclose(one.quantiles[wanted[0]], expected, rtol=1e-12)
-        np.testing.assert_allclose(one.quantiles[wanted[2]], expected / 2, rtol=1e-12)
+    axes = [
+        seeds(5),
+        {"path": "/noise/sigma", "values": [0.1, 0.2, 0.1]},
+        {"path": "/algorithm/method", "values": ["simple", "improved"]},
+    ]
+    values = [None if draws.random() < 0.2 else float(draws.random()) for _ in range(30)]
+    job = filled(database, axes, values)
+    cells = [run.cell for run in runs_of(database, job)]
+    found = summary(database, job, keys)
+    assert sum(sum(one.states.values()) for one in found) == 30
+    for one in found:
+        mine = [
+            value
+            for value, cell in zip(values, cells, strict=True)
+            if value is not None and [cell[key.name] for key in keys] == list(one.key)
+        ]
+        expected = np.quantile(mine, np.array(QUANTILES_PER_MILLE) / 1000)
+        np.testing.assert_allclose(one.quantiles[RMS], expected, rtol=1e-12)
+        assert one.states[JobState.SUCCEEDED] == len(mine)
 
 
 def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(database):
-    cells = [
-        {"/noise/sigma": sigma, "/model": model, "/seed": seed}
-        for model in ("tube", {"name": "own"})
-        for sigma in (0.3, 0.1)
-        for seed in range(3)
+    axes = [
+        {"path": "/model", "values": ["tube", {"name": "own"}]},
+        {"path": "/noise/sigma", "values": [0.3, 0.1]},
+        seeds(3),
     ]
     values = [0.1, 0.1, 0.1, 4.0, 2.0, None, 0.1, 0.1, 0.1, 5.0, 6.0, 5.0]
-    job = filled(database, cells, values)
+    job = filled(database, axes, values)
     with database.read_session() as session:
         found = [
             find_quietest_run(session, job, cell).number
@@ -175,10 +202,10 @@ def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(
     assert found == [4, 4, 9]
 
 
-def test_groups_of_a_job_are_not_told_to_another_project(database):
-    job = filled(database, [{"/noise/sigma": 0.0}], [1.0])
-    with database.read_session() as session:
-        assert read_groups(session, job, [SIGMA], [SummaryQuantity("rms")], 10, "proj_other") == []
+def test_runs_of_a_job_are_not_told_to_another_project(database):
+    job = filled(database, [{"path": "/noise/sigma", "values": [0.0]}], [1.0])
+    (group,) = summary(database, job, [SIGMA], project="proj_other")
+    assert (group.states[JobState.SUCCEEDED], group.quantiles) == (0, {})
 
 
 def test_floors_are_written_under_the_lease_only(database):

@@ -7,10 +7,14 @@ from typing import Any
 import pytest
 
 from service.core.states import JobState
+from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
+from service.repositories.references import ReferenceRepository
+from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
 from service.trends.trend import compute_trend
 from sysid.trends.trend import compute_drift_limit
+from tests.database import record_statements
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
 from tests.stored import record_outcomes
@@ -95,3 +99,40 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
     record_outcomes(place.database, lease, outcome)
     found = trend(place, job)
     assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])
+
+
+def end(place: Place, job: str) -> None:
+    with place.database.write_session() as session:
+        lease = Lease(job, place.job(job).attempt, str(place.job(job).lease_owner))
+        LeaseQueue(session).finish_job(lease, JobState.SUCCEEDED)
+
+
+def test_the_trend_of_an_ended_batch_is_computed_once(place: Place) -> None:
+    job, _ = batch(place)
+    end(place, job)
+    first = trend(place, job)
+    with record_statements(place.database) as statements:
+        assert trend(place, job) == first
+    assert not [one for one, _ in statements if "FROM runs" in one]
+
+
+def test_a_trend_has_the_names_under_which_its_reference_was_accepted_later(place: Place) -> None:
+    _, runs = batch(place)
+    job, _ = batch(place, None, runs[2.0])
+    end(place, job)
+    assert trend(place, job).reference_names == []
+    with place.database.write_session() as session:
+        ReferenceRepository(session).accept_run("tubes", runs[2.0])
+    assert trend(place, job).reference_names == ["tubes"]
+
+
+def test_a_trend_follows_the_batch_of_its_reference(place: Place) -> None:
+    first, runs = batch(place)
+    job, _ = batch(place, None, runs[2.0])
+    end(place, job)
+    limit = drifts(trend(place, job), "trend")["L", 4.0].expected
+    assert limit == pytest.approx(0.4)
+    with place.database.write_session() as session:  # as if a run of it had come later
+        session.get_one(Run, runs[4.0]).state = JobState.FAILED
+        session.get_one(Job, first).n_failed = 1
+    assert drifts(trend(place, job), "trend") == {}

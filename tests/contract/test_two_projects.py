@@ -4,7 +4,7 @@ import pytest
 
 from service.core.states import JobState
 from service.queue.leases import Claim, LeaseQueue
-from service.queue.reuse import find_computed_runs, take_over_runs, write_hashes
+from service.queue.reuse import find_computed_runs, take_over_runs
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository, NewJob
@@ -35,7 +35,7 @@ def shared(database):
     return database
 
 
-def claimed(database, project: str, spec_hash: str | None = None) -> tuple[Claim, str]:
+def claimed(database, project: str) -> tuple[Claim, str]:
     """A claimed job of a project with one run."""
     with database.write_session() as session:
         new = NewJob(name="tube", spec={"model": "tube"})
@@ -45,14 +45,12 @@ def claimed(database, project: str, spec_hash: str | None = None) -> tuple[Claim
         writer = RunWriter(session, got.lease)
         writer.create_runs([NewRun(number=0, sigma=0.5)])
         (run,) = writer.list_pending()
-        if spec_hash:
-            write_hashes(session, got.lease, {run.id: spec_hash})
         return got, run.id
 
 
 def computed(database, project: str, rms: float = 0.5) -> tuple[Claim, str]:
     """The same with a result."""
-    got, run = claimed(database, project, HASH)
+    got, run = claimed(database, project)
     result = {"parameters": [{"name": "L", "value": rms, "stderr": None}]}
     with database.write_session() as session:
         RunWriter(session, got.lease).record_outcomes(
@@ -61,6 +59,7 @@ def computed(database, project: str, rms: float = 0.5) -> tuple[Claim, str]:
                     run_id=run,
                     state=JobState.SUCCEEDED,
                     result=result,
+                    spec_hash=HASH,
                     valid=True,
                     best_rms=rms,
                     signals_sha256="b" * 64,

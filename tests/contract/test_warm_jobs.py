@@ -3,7 +3,7 @@
 from itertools import takewhile
 
 import pytest
-from sqlalchemy import event
+from sqlalchemy import event, select
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
@@ -13,10 +13,10 @@ from service.dispatch.warm_starts import WarmStarts
 from service.jobs import submit
 from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
-from service.jobs.to_core import to_algorithm
 from service.queue.leases import LeaseQueue
-from service.queue.run_writes import RunWriter
+from service.storage.tables import Run
 from sysid.core.errors import InvalidSettings
+from sysid.data.noise import Noise
 from tests.dispatching import Place, carry_out
 from workers.inline_executor import InlineExecutor
 from workers.protocol import RunNotReady
@@ -33,9 +33,9 @@ class KeepingExecutor(InlineExecutor):
         super().__init__(slots)
         self.warm = {}
 
-    def submit_pack(self, pack, keys, shared):
+    def submit_pack(self, pack, keys, shared, encoder):
         self.warm.update({item.run: item.spec.warm_starts for item in pack})
-        return super().submit_pack(pack, keys, shared)
+        return super().submit_pack(pack, keys, shared, encoder)
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(job_runs, "to_algorithm", broken_second_time())
+        patched.setattr(job_runs, "Noise", broken_second_time())
         runs, warm = carried_out(place, **chained(NOISE))
     assert [one.state for one in runs] == [JobState.SUCCEEDED, JobState.FAILED, JobState.SUCCEEDED]
     assert warm[2] == (values(runs[0]),)
@@ -103,10 +103,10 @@ def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
 def broken_second_time():
     calls = iter(range(100))
 
-    def made(body):
+    def made(*arguments):
         if next(calls) == 1:
-            raise InvalidSettings("/algorithm", "as told")
-        return to_algorithm(body)
+            raise InvalidSettings("/noise", "as told")
+        return Noise(*arguments)
 
     return made
 
@@ -212,12 +212,19 @@ def test_runs_that_begin_cold_do_not_wait_beside_those_that_follow_one_another(p
     assert warm == [(), (), (), (), (values(runs[3]),), (values(runs[4]),)]
 
 
+def all_rows(session, claim):
+    of_job = select(Run).where(Run.job_id == claim.job.id)
+    return session.scalars(of_job.order_by(Run.number)).all()
+
+
 def statements_behind(place, n_failed):
     """SQL statements that it takes to learn what the last of a chain begins with."""
     job = place.submit(**chained({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK))
     with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
-        rows = RunWriter(session, claim.lease).list_pending()
+        rows = session.scalars(
+            select(Run).where(Run.job_id == claim.job.id).order_by(Run.number)
+        ).all()
         rows[0].state, rows[0].estimates = JobState.SUCCEEDED, {"T": {"value": 2.0, "stderr": None}}
         for row in rows[1:-1]:
             row.state = JobState.FAILED
@@ -235,7 +242,9 @@ def test_chains_of_an_earlier_attempt_go_on_each_from_its_own_runs(place):
     place.submit(**chained(LABELLED, {"path": "/seed", "values": [1, 2, 3, 4]}))
     with place.database.write_session() as session:
         claim = LeaseQueue(session).claim_job("d1")
-        rows = RunWriter(session, claim.lease).list_pending()
+        rows = session.scalars(
+            select(Run).where(Run.job_id == claim.job.id).order_by(Run.number)
+        ).all()
         assert [row.cell["/seed"] for row in rows[:5]] == [1, 2, 3, 4, 1]
         for row in rows[:6]:  # of four chains the first two have two runs behind them
             row.state = JobState.SUCCEEDED

@@ -16,6 +16,7 @@ from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
 from tests.rest import recording, settings_of, store_csv
+from workers import job_queue
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 SIGMAS = [0.0, 0.1, 0.2]
@@ -37,10 +38,13 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "datasets": [store_csv(server, recording())],
             "algorithm": SMALL,
             "reuse": False,
+            "keep_signals": True,
             "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
         }
-        _, runs = identified(app.state.parts, body)
-        yield Served(server, app.state.parts, runs, body)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(job_queue, "choose_pack_size", lambda cost, waiting, slots: waiting)
+            _, runs = identified(app.state.parts, body)
+            yield Served(server, app.state.parts, runs, body)
 
 
 def rows(served: Served, runs: list[str]) -> list[Run]:
@@ -48,7 +52,7 @@ def rows(served: Served, runs: list[str]) -> list[Run]:
         return [RunRepository(session).get(run) for run in runs]
 
 
-def test_each_run_has_a_file_of_its_own_in_one_object(served: Served) -> None:
+def test_each_run_has_a_file_of_its_own_in_the_object_of_its_pack(served: Served) -> None:
     found = [served.server.get(f"/v1/runs/{run}/signals.mcap") for run in served.runs]
     assert len({row.signals_sha256 for row in rows(served, served.runs)}) == 1
     assert len({one.headers["etag"] for one in found}) == len(found)
@@ -102,7 +106,14 @@ def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(
         job, runs = identified(served.parts, served.body)
     found = rows(served, runs)
     assert [(row.state.value, row.signals_sha256) for row in found] == [("succeeded", None)] * 3
-    assert served.server.get(f"/v1/runs/{runs[0]}/signals.mcap").status_code == 404
+    again = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap")
+    assert (again.status_code, again.headers["etag"][0]) == (200, '"')
+    stored = served.server.get(f"/v1/runs/{served.runs[0]}/signals.mcap")
+    assert [fit.simulated.tobytes() for fit in read_fitted_outputs(again.content)] == [
+        fit.simulated.tobytes() for fit in read_fitted_outputs(stored.content)
+    ]
+    part = served.server.get(f"/v1/runs/{runs[0]}/signals.mcap", headers={"Range": "bytes=5-20"})
+    assert (part.status_code, part.content) == (206, again.content[5:21])
     events = served.server.get(f"/v1/jobs/{job}/events").text
     assert events.count("are not stored") == 1
     assert f"{runs[0]} and 2 others" in events

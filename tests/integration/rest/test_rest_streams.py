@@ -10,8 +10,10 @@ import pytest
 from sqlalchemy import event
 from starlette.testclient import TestClient
 
+from service.api import event_feed
 from service.api.app import create_app
 from service.api.event_feed import EventFeed
+from service.repositories.events import JobHead
 from service.storage.sessions import Database
 from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
 from tests.serving import serve_in_thread
@@ -126,10 +128,47 @@ def test_readings_of_one_event_are_shared_and_a_reader_that_leaves_stops_nobody(
         batches = await asyncio.gather(*tasks[1:])
         assert {batch.text.count("event: state") for batch in batches} == {1}
         assert reads == [0]
-        await feed.read_after(job, 0)
-        assert reads == [0, 0]
+        assert await feed.read_after(job, 0) == batches[0]  # a stream that comes a little later
+        last = batches[0].last
+        for _ in range(2):  # what had no events is read again
+            assert not (await feed.read_after(job, last)).text
+        assert reads == [0, last, last]
         async with feed.watch_job(job):
             assert await feed.wait_for_news(job, 0, 60)
             assert not await feed.wait_for_news(job, batches[0].last, 0.1)
+
+    awaited(play)
+
+
+def test_many_streams_are_woken_in_turns_and_those_of_other_jobs_not_at_all(
+    own: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, woken, seen, sleep = parts_of(own), [], [], asyncio.sleep
+    monkeypatch.setattr(event_feed, "WOKEN_STREAMS", 3)
+    feed = EventFeed(parts.database, parts.stopping, 60, 20)
+
+    async def wait(job: str) -> None:
+        assert await feed.wait_for_news(job, 0, 60)
+        woken.append(job)
+
+    async def run_others(_seconds: float = 0.0) -> None:
+        for _ in range(10):
+            await sleep(0)
+        seen.append(len(woken))
+
+    async def play() -> None:
+        async with feed.watch_job("a"), feed.watch_job("b"):
+            tasks = [asyncio.create_task(wait(job)) for job in "abaaaaaa"]
+            await run_others()
+            monkeypatch.setattr(asyncio, "sleep", run_others)
+            feed._heads = {"a": JobHead(1, is_over=False), "b": JobHead(0, is_over=False)}
+            await feed._wake_streams(["a"])
+            await run_others()
+            assert seen == [0, 3, 6, 7]  # others had their turns between them
+            assert woken == ["a"] * 7
+            for task in tasks:
+                task.cancel()
+            await run_others()
+        assert not feed._waiting
 
     awaited(play)

@@ -11,6 +11,7 @@ from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.storage import garbage as garbage_collection
+from service.storage import statements
 from service.storage.columns import utc_now
 from service.storage.garbage import (
     MINIMUM_AGE,
@@ -63,7 +64,7 @@ def test_collecting_deletes_the_garbage_only(database, store):
         DatasetRepository(session).add(new_dataset(sha256=kept))
     assert delete_orphans(database, store, AT_ONCE) == (1, len(b"stray"))
     with database.read_session() as session:
-        assert find_lost_hashes(session, store) == set()
+        assert list(find_lost_hashes(session, store)) == []
     assert store.exists(kept)
     assert not store.exists(stray)
 
@@ -72,7 +73,35 @@ def test_an_object_that_a_row_names_but_is_not_there_is_lost(database, store):
     with database.write_session() as session:
         DatasetRepository(session).add(new_dataset(sha256="e" * 64))
     with database.read_session() as session:
-        assert find_lost_hashes(session, store) == {"e" * 64}
+        assert list(find_lost_hashes(session, store)) == ["e" * 64]
+
+
+def test_the_signals_of_runs_are_lost_too_unless_their_job_was_deleted(database, store):
+    kept = store.put_stream([b"kept"]).sha256
+    got, runs = claimed(database, n_runs=4)
+    hashes = ("f" * 64, kept, "0" * 64, "f" * 64)
+    outcomes = [
+        RunOutcome(run_id=run, state=JobState.SUCCEEDED, signals_sha256=sha256)
+        for run, sha256 in zip(runs, hashes, strict=True)
+    ]
+    with database.write_session() as session:
+        RunWriter(session, got.lease).record_outcomes(outcomes)
+        LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
+    with database.read_session() as session:
+        assert list(find_lost_hashes(session, store)) == ["0" * 64, "f" * 64]
+    with database.write_session() as session:
+        JobRepository(session).delete(got.job.id)
+    with database.read_session() as session:
+        assert list(find_lost_hashes(session, store)) == []
+
+
+def test_objects_are_looked_up_in_parts(database, store, monkeypatch):
+    monkeypatch.setattr(statements.split_chunks, "__defaults__", (3,))
+    stray = {store.put_stream([bytes([number])]).sha256 for number in range(10)}
+    kept = store.put_stream([b"kept"]).sha256
+    with database.write_session() as session:
+        DatasetRepository(session).add(new_dataset(sha256=kept))
+    assert garbage(database, store) == stray
 
 
 OLD = 2 * MINIMUM_AGE.total_seconds()

@@ -14,7 +14,10 @@ import migrations
 from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
-from service.storage.tables import Base, Project
+from service.storage.tables import Base, Event, Job, Project, Run, StoredSummary
+from tests.stored import claimed, record_success
+
+HEAD = migrate.find_head_revision()
 
 
 def tables(database):
@@ -25,6 +28,51 @@ def test_the_migrations_build_exactly_the_tables_of_the_program(empty_database):
     migrate.upgrade_database(empty_database)
     assert tables(empty_database) == set(Base.metadata.tables)
     assert migrate.list_differences(empty_database) == []
+
+
+def test_indexes_are_those_of_the_program_with_their_conditions(empty_database):
+    migrate.upgrade_database(empty_database)
+    migrated = indexes(empty_database)
+    migrate.downgrade_database(empty_database)
+    Base.metadata.create_all(empty_database.engine)
+    assert migrated == indexes(empty_database)
+    assert any("WHERE" in definition for definition in migrated.values())
+    Base.metadata.drop_all(empty_database.engine)
+
+
+def indexes(database):
+    """The definition of each index that has a name of ours."""
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
+    if not database.is_sqlite:
+        query = "SELECT indexname, indexdef FROM pg_indexes WHERE schemaname = 'public'"
+    with database.engine.connect() as connection:
+        return {
+            name: definition.replace('"', "")
+            for name, definition in connection.execute(text(query))
+            if name != "alembic_version_pkc"
+        }
+
+
+def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back(empty_database):
+    migrate.upgrade_database(empty_database)
+    claim, runs = claimed(empty_database, n_runs=2)
+    record_success(empty_database, claim.lease, runs[0], rms=0.5)
+    with empty_database.write_session() as session:
+        session.add(StoredSummary(job_id=claim.job.id, attempt=1, document={"a": 1}))
+    kinds = (Job, Run, Event)
+    before = [rows(empty_database, kind) for kind in kinds]
+    migrate.downgrade_database(empty_database, "0001")
+    with empty_database.engine.connect() as connection:
+        query = text("SELECT n_done, best_rms FROM jobs")
+        assert [tuple(row) for row in connection.execute(query)] == [(1, 0.5)]
+    migrate.upgrade_database(empty_database)
+    assert [rows(empty_database, kind) for kind in kinds] == before
+    assert rows(empty_database, StoredSummary) == []  # the next reader computes it again
+
+
+def rows(database, kind):
+    with database.engine.connect() as connection:
+        return sorted(map(tuple, connection.execute(kind.__table__.select())), key=repr)
 
 
 def test_going_down_removes_every_table_and_up_again_brings_them_back(empty_database):
@@ -55,12 +103,12 @@ def test_a_database_of_a_later_version_is_not_touched(database):
     actions = (migrate.upgrade_database, migrate.downgrade_database, migrate.check_revision)
     try:
         for action in actions:
-            with pytest.raises(DatabaseIsNewer, match=r"9999.*up to 0001"):
+            with pytest.raises(DatabaseIsNewer, match=rf"9999.*up to {HEAD}"):
                 action(database)
         assert migrate.read_current_revision(database) == "9999"
     finally:  # PostgreSQL's is that of all tests
         with database.engine.begin() as connection:
-            connection.execute(text("UPDATE alembic_version SET version_num = '0001'"))
+            connection.execute(text(f"UPDATE alembic_version SET version_num = '{HEAD}'"))
 
 
 def test_upgrading_again_changes_nothing(database):
@@ -130,12 +178,12 @@ def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_databa
     assert migrate.list_differences(empty_database) == []
 
 
-SECOND = """
+NEXT = """
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0002"
-down_revision = "0001"
+revision = "next"
+down_revision = "{head}"
 
 
 def upgrade():
@@ -167,38 +215,42 @@ def columns(database):
     return {one["name"] for one in inspect(database.engine).get_columns("projects")}
 
 
-def test_a_second_revision_carries_the_rows_over_and_back(database, revisions):
+def test_a_further_revision_carries_the_rows_over_and_back(database, revisions):
     before = columns(database)
-    (revisions / "second.py").write_text(SECOND.format(last=""))
-    with pytest.raises(DatabaseNotAtHead, match="0002"):
+    (revisions / "next.py").write_text(NEXT.format(head=HEAD, last=""))
+    with pytest.raises(DatabaseNotAtHead, match="next"):
         migrate.check_revision(database)
     migrate.upgrade_database(database)
     assert copies(database) == ["default"]
     undone = migrate.list_undone_migrations(database, "base")
-    assert [name for name, _ in undone] == ["0002", "0001"]
-    assert [name for name, _ in migrate.list_undone_migrations(database, "0001")] == ["0002"]
-    with pytest.raises(UnknownRevision, match="Earlier ones, the latest first: 0001, base"):
-        migrate.list_undone_migrations(database, "0002")
-    migrate.downgrade_database(database, "0001")
+    assert [name for name, _ in undone] == ["next", HEAD, "0001"]
+    assert [name for name, _ in migrate.list_undone_migrations(database, HEAD)] == ["next"]
+    with pytest.raises(
+        UnknownRevision, match=f"Earlier ones, the latest first: {HEAD}, 0001, base"
+    ):
+        migrate.list_undone_migrations(database, "next")
+    migrate.downgrade_database(database, HEAD)
     assert columns(database) == before
     with database.read_session() as session:
         assert [one.name for one in session.query(Project)] == ["default"]
     assert migrate.list_differences(database) == []
 
 
-def test_a_second_revision_that_fails_leaves_the_database_as_it_was(database, revisions):
+def test_a_further_revision_that_fails_leaves_the_database_as_it_was(database, revisions):
     before = columns(database)
-    (revisions / "second.py").write_text(SECOND.format(last='raise OSError("in the middle")'))
+    (revisions / "next.py").write_text(
+        NEXT.format(head=HEAD, last='raise OSError("in the middle")')
+    )
     with pytest.raises(OSError, match="in the middle"):
         migrate.upgrade_database(database)
     assert columns(database) == before
-    assert migrate.read_current_revision(database) == "0001"
+    assert migrate.read_current_revision(database) == HEAD
 
 
 def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_wrote(
     database, revisions
 ):
-    (revisions / "second.py").write_text(SECOND.format(last=""))
+    (revisions / "next.py").write_text(NEXT.format(head=HEAD, last=""))
     with ThreadPoolExecutor(1) as pool:
         with database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'early'"))
@@ -221,7 +273,7 @@ def wait_for_a_lock(database, upgraded):
 
 def test_an_upgrade_waits_longer_for_its_turn_than_other_writers(database, revisions, monkeypatch):
     monkeypatch.setattr(sessions, "BUSY_SECONDS", 0.01)
-    (revisions / "second.py").write_text(SECOND.format(last=""))
+    (revisions / "next.py").write_text(NEXT.format(head=HEAD, last=""))
     with ThreadPoolExecutor(1) as pool:
         with database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'late'"))

@@ -119,9 +119,9 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     most = 0
     submit, fetch = ray_executor.submit_pack, ray_executor.fetch_results
 
-    def counted(pack, keys, shared) -> Any:
+    def counted(pack, keys, shared, encoder) -> Any:
         nonlocal most
-        handle = submit(pack, keys, shared)
+        handle = submit(pack, keys, shared, encoder)
         if isinstance(pack[0], EvolveIsland):
             flying.add(handle)
             most = max(most, len(flying))

@@ -1,16 +1,26 @@
-"""Telling of results takes time: it holds up no other job's slices, and no result is forgotten."""
+"""Results come back as bytes of a pack: each once, and a run that cannot be encoded fails alone."""
 
-from collections.abc import Iterator
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
 
 import pytest
 
-from tests.runs import RECORDS, Notebook, spec
+from tests.runs import RECORDS, Notebook, encode_runs, spec
 from tests.unit.workers.test_scheduler import ScriptedExecutor, jobs
-from workers import scheduler
-from workers.packing import PACK_SECONDS, PACKS_PER_CPU
-from workers.protocol import AdvanceRun, ItemResult, RunConclusion, RunProgress, WorkItem
+from workers.packing import PACK_SECONDS
+from workers.protocol import (
+    AdvanceRun,
+    CompleteRun,
+    ItemResult,
+    Records,
+    RunConclusion,
+    RunEnd,
+    RunFailure,
+    RunProgress,
+    WorkItem,
+)
 from workers.scheduler import Scheduler
-from workers.tasks import process_pack
+from workers.tasks import encode_pack, process_pack
 
 pytestmark = pytest.mark.usefixtures("time_to_read")
 
@@ -28,13 +38,6 @@ def advanced() -> RunProgress:
     (done,) = process_pack((AdvanceRun("any", spec(), None, 0.0),), ("short",), RECORDS["short"])
     assert isinstance(done.outcome, RunProgress)
     return done.outcome
-
-
-@pytest.fixture(autouse=True)
-def slow_observers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every observer takes all the time that a step has for it: each is told of one result."""
-    monkeypatch.setattr(scheduler, "MIN_REPORT_SECONDS", 0.0)
-    monkeypatch.setattr(scheduler, "MAX_REPORT_SECONDS", 0.0)
 
 
 def told(notebook: Notebook) -> list[str]:
@@ -79,33 +82,7 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
     for _ in range(8 + 2):  # a slice a step, and a step for its way in and out
         feeder.run_step(0.0)
     assert told(single) == ["single0"]
-    assert len(told(notebook)) - before <= 10  # one a step
-    assert len(notebook.begun) - len(told(notebook)) > 10  # and more had come back
-
-
-def test_a_job_whose_results_are_not_told_yet_gets_no_more_packs(concluded: RunConclusion) -> None:
-    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.05))
-    feeder = Scheduler(executor)
-    notebook = jobs(feeder, a=500)["a"]
-    most = 0
-    for _ in steps(feeder):
-        flying = sum(len(pack) for pack in executor.packs.values())
-        most = max(most, len(notebook.begun) - len(told(notebook)) - flying)
-    # One core's pack above what it may leave, and those in flight when it came to that.
-    room = scheduler.MAX_UNREPORTED_SECONDS * executor.slots / 0.05
-    in_flight = PACKS_PER_CPU * executor.slots * PACK_SECONDS / 0.05
-    assert room < most <= room + in_flight + 1
-
-
-def test_what_has_come_back_is_told_when_the_dispatcher_stops(concluded: RunConclusion) -> None:
-    executor = ScriptedExecutor(lambda item: ItemResult(item.run, concluded, 0.01))
-    feeder = Scheduler(executor)
-    notebook = jobs(feeder, a=400)["a"]
-    for _ in range(20):
-        feeder.run_step(0.0)
-    flying = sum(len(pack) for pack in executor.packs.values())
-    feeder.stop_jobs()
-    assert len(told(notebook)) == len(notebook.begun) - flying > 20
+    assert len(told(notebook)) > before
 
 
 def test_a_job_that_is_stopped_alone_still_tells_what_has_come_back(
@@ -121,3 +98,46 @@ def test_a_job_that_is_stopped_alone_still_tells_what_has_come_back(
     for _ in steps(feeder):
         pass
     assert len(told(notebook)) == come
+
+
+def test_a_run_that_cannot_be_encoded_fails_and_no_other(concluded: RunConclusion) -> None:
+    def encode(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> bytes:
+        if any(run.run == "bad" for run in complete):
+            raise ValueError("as told")
+        return encode_runs(complete, records)
+
+    items = [AdvanceRun(run, spec(), None, 1.0, spent=2.0) for run in ("a", "bad", "b")]
+    results = [ItemResult(item.run, concluded, 0.5) for item in items]
+    pack = encode_pack(encode, items, results, {})
+    assert [type(one.outcome) for one in pack.results] == [RunEnd, RunFailure, RunEnd]
+    failure = pack.results[1].outcome
+    assert isinstance(failure, RunFailure)
+    assert failure.reason == "internal error: its result cannot be stored: ValueError: as told"
+    assert failure.evaluations == concluded.identification.evaluations
+    assert pack.encoded is not None
+    assert [run for run, _ in pickle.loads(pack.encoded)] == ["a", "b"]
+    alone = encode_pack(encode, items[1:2], results[1:2], {})
+    assert (len(alone.results), alone.encoded) == (1, None)
+
+
+def test_an_encoder_is_told_the_whole_time_of_a_run_and_what_was_reported(
+    concluded: RunConclusion, advanced: RunProgress
+) -> None:
+    seen: list[CompleteRun] = []
+
+    def encode(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> bytes:
+        seen.extend(complete)
+        return b""
+
+    state = advanced.state
+    items = [
+        AdvanceRun("new", spec(), None, 1.0),
+        AdvanceRun("saved", spec(), state, 1.0, spent=0.0),
+        AdvanceRun("sliced", spec(), state, 1.0, spent=2.0, is_reported=True),
+    ]
+    encode_pack(encode, items, [ItemResult(item.run, concluded, 0.5) for item in items], {})
+    assert [(run.run, run.seconds, run.reported) for run in seen] == [
+        ("new", 0.5, None),
+        ("saved", 0.5, None),
+        ("sliced", 2.5, state),
+    ]

@@ -7,7 +7,7 @@ import pytest
 
 from sysid.core.errors import InvalidSettings
 from sysid.identification.run import begin_run
-from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
+from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, encode_runs, spec
 from workers import packing, tasks
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.inline_executor import InlineExecutor
@@ -15,10 +15,12 @@ from workers.job_queue import JobQueue
 from workers.packing import PACKS_PER_CPU
 from workers.protocol import (
     AdvanceRun,
+    Encoder,
     EvolveIsland,
     InvalidRun,
     IslandProgress,
     ItemResult,
+    PackResult,
     QueuedRun,
     Records,
     RunFailure,
@@ -26,7 +28,7 @@ from workers.protocol import (
     WorkItem,
 )
 from workers.scheduler import Scheduler
-from workers.tasks import build_pack_problems
+from workers.tasks import build_pack_problems, encode_pack
 
 pytestmark = pytest.mark.usefixtures("time_to_read")
 
@@ -47,7 +49,7 @@ class ScriptedExecutor:
         return records
 
     def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any], encoder: Encoder
     ) -> int:
         self.packs[len(self.sent)] = tuple(pack)
         self.sent.append(tuple(item.run for item in pack))
@@ -56,12 +58,14 @@ class ScriptedExecutor:
     def wait_for_packs(self, timeout: float) -> tuple[int, ...]:
         return () if self.is_slow else tuple(reversed(self.packs))
 
-    def fetch_results(self, handle: int) -> tuple[ItemResult, ...]:
-        answers = [self.answer(item) for item in self.packs.pop(handle)]
+    def fetch_results(self, handle: int) -> PackResult:
+        items = self.packs.pop(handle)
+        answers = [self.answer(item) for item in items]
         for one in answers:
             if isinstance(one, PackLost):
                 raise one
-        return tuple(one for one in answers if isinstance(one, ItemResult))
+        results = [one for one in answers if isinstance(one, ItemResult)]
+        return encode_pack(encode_runs, items, results, {})
 
     def cancel_pack(self, handle: int, *, force: bool) -> None:
         self.cancelled.append((handle, force))
@@ -128,9 +132,9 @@ def test_runs_of_known_cost_share_a_pack() -> None:
 
 def test_runs_of_different_records_do_not_share_a_pack() -> None:
     class Keeping(ScriptedExecutor):
-        def submit_pack(self, pack, keys, shared):  # type: ignore[no-untyped-def]
+        def submit_pack(self, pack, keys, shared, encoder):  # type: ignore[no-untyped-def]
             assert [item.spec.problem.record_keys for item in pack] == [keys] * len(pack)
-            return super().submit_pack(pack, keys, shared)
+            return super().submit_pack(pack, keys, shared, encoder)
 
     executor, notebook = Keeping(fails), Notebook()
     feeder: Scheduler[str] = Scheduler(executor)
@@ -292,7 +296,7 @@ def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
     executor = ScriptedExecutor(fails)
     feeder = Scheduler(executor)
     notebook = jobs(feeder, a=1)["a"]
-    executor.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), ())
+    executor.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), (), encode_runs)
     assert finish(feeder) == ["a"]
     assert (executor.packs, list(notebook.failures)) == ({}, ["a0"])
     assert "a pack of no job came back" in caplog.messages
@@ -363,7 +367,7 @@ def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
         ItemResult("a0", IslandProgress(island.island, island.target), 0.1),
         ItemResult("a0", None, 0.0),
     )
-    work.absorb_pack(first, done)
+    work.absorb_pack(first, PackResult(done))
     assert (work.in_flight, work.has_waiting_runs) == ({}, True)
 
 
@@ -378,7 +382,7 @@ def test_a_run_that_goes_on_is_not_sent_a_second_time_when_an_older_pack_is_lost
     assert (len(work.in_flight), work.has_waiting_runs) == (1, False)
     assert notebook.kills == {"a0": [1]}
     [whole] = work.in_flight
-    work.absorb_pack(whole, (ItemResult("a0", RunFailure("as told"), 0.1),))
+    work.absorb_pack(whole, PackResult((ItemResult("a0", RunFailure("as told"), 0.1),)))
     assert notebook.failures == {"a0": [RunFailure("as told")]}
 
 
@@ -389,7 +393,8 @@ def test_what_an_older_pack_says_of_a_run_that_goes_on_is_not_heard(
     first, second = work.in_flight
     work.requeue_lost_pack(first, "killed")
     work.absorb_pack(
-        second, (ItemResult("a0", RunFailure("too late"), 0.1), ItemResult("a0", None, 0.0))
+        second,
+        PackResult((ItemResult("a0", RunFailure("too late"), 0.1), ItemResult("a0", None, 0.0))),
     )
     assert (notebook.failures, work.has_waiting_runs) == ({}, True)
     work.send_next_pack(2)

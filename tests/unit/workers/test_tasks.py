@@ -1,7 +1,6 @@
 """A pack of work as a worker sees it."""
 
 import os
-import pickle
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -46,19 +45,6 @@ def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.Monke
     assert isinstance(first.outcome, RunConclusion)
     assert isinstance(last.outcome, RunConclusion)
     assert faulty.outcome == RunFailure("internal error: OverflowError: too large", "InternalError")
-
-
-def test_a_result_that_travels_arrives_whole() -> None:
-    pack = [AdvanceRun("r", spec(2, generations=60), None, 100.0)]
-    (done,) = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
-    assert isinstance(done.outcome, RunConclusion)
-    sent, back = done.outcome, pickle.loads(pickle.dumps(done.outcome))
-    assert bits(back.identification) == bits(sent.identification)
-    assert back.identification.history == sent.identification.history
-    assert back.identification.migrations == sent.identification.migrations != ()
-    assert back.identification.history[0][0].phase == "start"  # by name, as it was
-    noisy = pickle.loads(pickle.dumps(RunConclusion(sent.identification, 0.5)))
-    assert (back.rms_noise_free, noisy.rms_noise_free) == (sent.rms_noise_free, 0.5)
 
 
 def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None:

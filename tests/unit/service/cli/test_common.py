@@ -50,6 +50,7 @@ def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
         "algorithm",
         "priority",
         "reuse",
+        "keep_signals",
     }
     assert by_options | by_set == set(NoiseSweepIn.model_fields)
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.jobs.axes import AxisPosition, SweepCell, expand_values, group_axes, iterate_cells
+from service.jobs.axes import build_axis_groups, expand_values, group_axes, iterate_cells
 from service.jobs.schemas import SweepAxisIn
 from service.jobs.warm_start_order import ChainLayout
 
@@ -31,10 +31,7 @@ def test_the_run_before_differs_in_that_axis_only_by_one_step(
 ) -> None:
     chain = ChainLayout.from_axes(axes)
     assert chain is not None
-    groups = [
-        [AxisPosition("", cell) for cell in _cells(axes[numbers[0]])]
-        for numbers in group_axes(axes)
-    ]
+    groups = build_axis_groups(axes, group_axes(axes))
     cells = [dict(cell.values) for cell in iterate_cells(groups)]
     order = expand_values(next(axis for axis in axes if axis.path == along))
     for number, cell in enumerate(cells):
@@ -45,10 +42,6 @@ def test_the_run_before_differs_in_that_axis_only_by_one_step(
         else:
             assert before is not None
             assert cells[before] == {**cell, along: order[place - 1]}
-
-
-def _cells(axis: SweepAxisIn) -> list[SweepCell]:
-    return [SweepCell({axis.path: value}) for value in expand_values(axis)]
 
 
 @given(st.integers(1, 50), st.integers(1, 50), st.integers(0, 10_000))

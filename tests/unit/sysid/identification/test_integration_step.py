@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sysid.core.settings import GeneticAlgorithm, Loss, Stop
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, Stop
 from sysid.data.records import Channel, Record
 from sysid.identification import integration_step
 from sysid.identification.conclude import conclude_run
+from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
 from sysid.identification.integration_step import (
     HalfStep,
@@ -19,6 +20,7 @@ from sysid.identification.integration_step import (
     compare_half_step,
     find_limit,
 )
+from sysid.identification.resimulate import resimulate_run
 from sysid.identification.result import Identification
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
@@ -148,6 +150,20 @@ def test_a_stiff_plant_is_identified_at_any_substeps(substeps: int) -> None:
     notes = [text for text in found.warnings if f"substeps: {found.substeps}" in text]
     assert len(notes) == (found.substeps > substeps)
     assert not any("substeps" in text for text in found.warnings if text not in notes)
+
+
+def test_signals_of_a_finer_step_are_computed_again_bit_for_bit() -> None:
+    record = sampled(STIFF)
+    found = identify(two_lags(1), record, QUICK, validation_fraction=0.3)
+    assert found.substeps > 1
+    records = prepare_records([record], fraction=0.3)
+    again = resimulate_run(two_lags(1), records, FitSettings(), found.estimates, found.substeps)
+    assert [one.tobytes() for one in again.simulated[0]] == [
+        one.tobytes() for one in found.simulated[0]
+    ]
+    assert [one.tobytes() for one in again.simulated_validation[0]] == [
+        one.tobytes() for one in found.simulated_validation[0]
+    ]
 
 
 @pytest.mark.parametrize("substeps", [2, 4])

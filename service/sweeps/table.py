@@ -13,6 +13,7 @@ from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
+from service.sweeps.job_summary import load_summary
 from sysid.core.text import append_unit
 
 RUNS_PER_PART = 500
@@ -63,13 +64,15 @@ def stream_table(database: Database, job_id: str) -> Iterator[str]:
         If there is no such job; at the call, before the first line.
     """
     with database.read_session() as session:
-        spec = JobRepository(session).get(job_id).spec
+        job = JobRepository(session).get(job_id)
+        spec = job.spec
         runs = RunRepository(session)
         best = runs.list_page(job_id, limit=1, order="best_rms").items
+        others = [(one.name, one.unit) for one in load_summary(session, job).parameters]
         first = [
             (estimate["name"], estimate["unit"]) for run in best for estimate in _get_estimates(run)
         ]
-        parameters = tuple(dict.fromkeys([*first, *runs.list_parameters(job_id)]))
+        parameters = tuple(dict.fromkeys([*first, *others]))
         units = {**COLUMN_UNITS, "best_rms": find_rms_unit(session, spec)}
     axes = spec["sweep"]["axes"]
     labels = dict.fromkeys(

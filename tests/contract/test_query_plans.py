@@ -1,0 +1,376 @@
+"""Every hot query finds its rows by an index, on a filled database: no whole table is read.
+
+The databases plan the statements of the use cases themselves, with their parameters. SQLite plans
+without statistics of the tables, with those of the filled ones, and with those of empty ones.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from itertools import islice
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from service.core.states import JobState
+from service.queue.admission import Admission, count_unfinished
+from service.queue.leases import Claim, LeaseOwners, LeaseQueue
+from service.queue.notifications import read_queue_status
+from service.queue.previous_attempts import delete_progress
+from service.queue.reuse import find_computed_runs
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
+from service.repositories.datasets import DatasetRepository
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.lineage import LineageRepository
+from service.repositories.runs import RunRepository
+from service.repositories.summaries import (
+    find_quietest_run,
+    read_run_table,
+    read_summary,
+    write_summary,
+)
+from service.repositories.trends import count_succeeded, read_trend_rows
+from service.storage.garbage import _find_named_hashes, _select_hashes
+from service.storage.sessions import Database
+from service.storage.tables import (
+    DEFAULT_PROJECT,
+    Checkpoint,
+    IdempotencyKey,
+    Job,
+    MigrationLog,
+    RunHistory,
+    StoredSummary,
+)
+from tests.database import record_statements
+from tests.stored import claimed, new_dataset
+
+N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
+GROWING = {"jobs", "runs", "events", "datasets", "checkpoints", "run_history", "migrations_log"}
+GROWING |= {"idempotency_keys", "lineage_edges", "job_summaries", "models"}
+BOUNDED_INDEXES = ("ix_jobs_open", "ix_jobs_owned")
+"""Indexes of open jobs: to read them whole is to read what is open."""
+NUMBERS = {
+    True: "WITH RECURSIVE s(n) AS (SELECT 0 UNION ALL SELECT n + 1 FROM s WHERE n < {last})",
+    False: "WITH s AS (SELECT generate_series(0, {last}) AS n)",
+}
+
+
+def copy_row(database: Database, table: str, count: int, **changes: str) -> None:
+    """Copy the first row of a table many times, with other values by SQL of the number `s.n`."""
+    with database.engine.begin() as connection:
+        row = connection.execute(text(f"SELECT * FROM {table} LIMIT 1")).mappings().one()
+        names = ", ".join(row)
+        values = ", ".join(changes.get(name, f"t.{name}") for name in row)
+        numbers = NUMBERS[database.is_sqlite].format(last=count - 1)
+        connection.execute(
+            text(
+                f"INSERT INTO {table} ({names}) {numbers} SELECT {values} FROM s "
+                f"CROSS JOIN (SELECT * FROM {table} LIMIT 1) t"
+            )
+        )
+
+
+def pad(prefix: str, database: Database) -> str:
+    """SQL of an identifier with a number at its end."""
+    number = "CAST(s.n AS TEXT)"
+    if database.is_sqlite:
+        return f"'{prefix}' || substr('0000000000' || {number}, -10)"
+    return f"'{prefix}' || lpad({number}, 10, '0')"
+
+
+LARGE = "job_00000000003"
+Filled = tuple[Database, Claim, list[str]]
+STATISTICS = [("sqlite", "none"), ("sqlite", "old"), ("sqlite", "fresh")]
+ON_POSTGRES = pytest.param(("postgres", "fresh"), marks=pytest.mark.postgres)
+
+
+@pytest.fixture(params=[*STATISTICS, ON_POSTGRES], ids="-".join)
+def filled(request: pytest.FixtureRequest) -> Filled:
+    """A database with many ended jobs, one of them large, and a claimed job with two runs."""
+    kind, statistics = request.param
+    database: Database = request.getfixturevalue(f"{kind}_database")
+    if statistics == "old":
+        database.update_statistics()
+    ended, runs_of_ended = claimed(database, n_runs=2)
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(ended.lease, JobState.CANCELLED)
+    copy_row(
+        database,
+        "jobs",
+        N_JOBS,
+        id=pad("job_0", database),
+        state="CASE WHEN s.n % 100 = 0 THEN 'failed' ELSE 'succeeded' END",
+        spec=f"""'{{"model": "{"m" * 1000}"}}'""",
+    )
+    open_one, ids = claimed(database, n_runs=2)
+    owners = [f"job_0000000000{number}" for number in range(5)]
+    for number, job in enumerate([*owners, open_one.job.id]):
+        copy_row(
+            database,
+            "runs",
+            N_RUNS,
+            id=pad(f"run_{number}", database),
+            job_id=f"'{job}'",
+            number="s.n + 2",
+            state="'succeeded'",
+            best_rms="1.0 + s.n",
+            spec_hash=pad(f"h{number}", database),
+            signals_sha256=pad(f"a{number}", database),
+        )
+    copy_row(
+        database,
+        "events",
+        N_EVENTS,
+        id="s.n + 100000",
+        job_id=f"'{LARGE}'",
+        kind="CASE WHEN s.n % 500 = 0 THEN 'log' ELSE 'progress' END",
+    )
+    with database.write_session() as session:  # one row of each other table that grows
+        session.add(
+            IdempotencyKey(key="k", project_id=DEFAULT_PROJECT, request_hash="", job_id=LARGE)
+        )
+        session.add(StoredSummary(job_id=ended.job.id, attempt=1, document={}))
+        LineageRepository(session).add_links("job_1", ["ds_1"], "estimation")
+        DatasetRepository(session).add(new_dataset())
+        history = {"digest": 1, "n_parameters": 1, "generation": 1, "evaluations": 1, "rms": 1.0}
+        session.add(RunHistory(run_id=runs_of_ended[0], points=b"", **history))
+        session.add(MigrationLog(run_id=runs_of_ended[0], digest=1, migrants=b""))
+        number = {"attempt": 1, "evaluations": 1, "state": b""}
+        session.add(Checkpoint(run_id=runs_of_ended[0], job_id=LARGE, **number))
+    run = pad("run_0", database)
+    copy_row(database, "idempotency_keys", N_OTHERS, key=pad("k", database))
+    copy_row(database, "job_summaries", N_OTHERS, job_id=pad("job_0", database))
+    copy_row(database, "lineage_edges", N_OTHERS, child=pad("job_0", database))
+    copy_row(
+        database,
+        "datasets",
+        N_OTHERS,
+        id=pad("ds_0", database),
+        sha256=pad("a0", database),
+        source_key=pad("s", database),
+    )
+    for table in ("run_history", "migrations_log"):
+        copy_row(database, table, N_OTHERS, run_id=run)
+    copy_row(database, "checkpoints", N_OTHERS, run_id=run, job_id=pad("job_0", database))
+    with database.write_session() as session:
+        writer = RunWriter(session, open_one.lease)
+        writer.save_checkpoints([(ids[0], 1, b"state")])
+    if statistics == "fresh":
+        database.update_statistics()
+        if not database.is_sqlite:
+            with database.engine.connect() as connection:
+                connection.execution_options(isolation_level="AUTOCOMMIT")
+                connection.exec_driver_sql("VACUUM ANALYZE")
+    return database, open_one, ids
+
+
+def plan(database: Database, statement: str, given: Any) -> list[str]:
+    """The steps of a statement's plan that read a table, as texts of SQLite's form."""
+    with database.engine.connect() as connection:
+        if database.is_sqlite:
+            rows = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", given)
+            return [str(row[3]) for row in rows]
+        (answer,) = connection.exec_driver_sql(f"EXPLAIN (FORMAT JSON) {statement}", given)
+    found = answer[0] if isinstance(answer[0], list) else json.loads(answer[0])
+    return list(describe_node(found[0]["Plan"]))
+
+
+def describe_node(node: dict[str, Any]) -> Iterator[str]:
+    kind, name = node["Node Type"], node.get("Relation Name", "")
+    if kind == "Seq Scan":
+        yield f"SCAN {name}"
+    elif "Index Name" in node:
+        condition = node.get("Index Cond", "")
+        yield f"SEARCH {name} USING INDEX {node['Index Name']} {condition}"
+    for child in node.get("Plans", ()):
+        yield from describe_node(child)
+
+
+def find_faults(database: Database, statement: str, given: Any) -> list[str]:
+    """The steps of a plan that read a whole table, or all rows of a project to choose from."""
+    steps = plan(database, statement, given)
+    is_ordered = "LIMIT" in statement and not any("TEMP B-TREE" in step for step in steps)
+    faults = []
+    for step in steps:
+        if any(index in step for index in BOUNDED_INDEXES):
+            continue
+        whole = re.match(r"SCAN (\w+)", step)
+        if whole and resolve_alias(statement, whole[1]) in GROWING:
+            faults.append(step)
+        if re.search(r"_project_id_\w+ \(project_id=\?\)$", step) and not is_ordered:
+            faults.append(step)
+    return faults
+
+
+def resolve_alias(statement: str, name: str) -> str:
+    found = re.search(rf"\b(\w+) AS {re.escape(name)}\b", statement)
+    return found[1] if found else name
+
+
+def submit(at: Filled) -> None:
+    with at[0].write_session() as session:
+        new = NewJob(name="new", spec={"model": "tube"})
+        job = JobRepository(session).submit(new, key="key", request_hash="h").job
+        insert_runs(session, job, [NewRun(number=0)])
+        LineageRepository(session).add_links(job.id, ["ds_1"], "estimation")
+        count_unfinished(session, DEFAULT_PROJECT)
+
+
+def list_failed(at: Filled) -> None:
+    with at[0].read_session() as session:
+        jobs = JobRepository(session)
+        page = jobs.list_page(states=[JobState.FAILED], limit=20)
+        assert [job.state for job in page.items] == [JobState.FAILED] * 20
+        assert len(jobs.list_page(cursor=page.next, states=[JobState.FAILED]).items) == 10
+        jobs.list_page(cursor=page.next)
+
+
+def count_jobs(at: Filled) -> None:
+    with at[0].read_session() as session:
+        assert JobRepository(session).count_states()[JobState.SUCCEEDED] == N_JOBS * 99 // 100
+
+
+def poll_and_claim(at: Filled) -> None:
+    admission = Admission(8, 0)
+    with at[0].write_session() as session:
+        JobRepository(session).submit(NewJob(name="waits", spec={}))
+    with at[0].read_session() as session:
+        assert read_queue_status(session, "d1", admission).has_waiting_job
+        read_queue_status(session, "d1")
+    with at[0].write_session() as session:
+        queue = LeaseQueue(session)
+        assert queue.recover_claim("d1", [at[1].job.id]) is None
+        claim = queue.claim_job("d1", admission=admission)
+        assert claim is not None
+        queue.renew_leases([claim.lease, at[1].lease])
+
+
+def reap(at: Filled) -> None:
+    owners = LeaseOwners(frozenset({"gone"}), frozenset({"d2"}), {"d1": timedelta(seconds=1)})
+    with at[0].write_session() as session:
+        queue = LeaseQueue(session)
+        assert queue.claim_job("d1") is not None
+        queue.has_expired(owners)
+        assert queue.reap_expired(LeaseOwners(ended=frozenset({"d1"}))).requeued
+
+
+def write_runs(at: Filled) -> None:
+    database, claim, ids = at
+    with database.write_session() as session:
+        writer = RunWriter(session, claim.lease)
+        writer.start_runs(ids)
+        writer.list_pending()
+        writer.list_unfinished([0, 1])
+        writer.read_checkpoints()
+        writer.write_kills({ids[0]: 1})
+        delete_progress(session, claim.lease, ids)
+        writer.record_outcomes([RunOutcome(run_id=ids[0], state=JobState.SUCCEEDED, best_rms=1.0)])
+        find_computed_runs(session, ["h10000000001", "h10000000002"])
+
+
+def end_large_job(at: Filled) -> None:
+    """End a job that has many results."""
+    database, claim, _ = at
+    with database.write_session() as session:
+        writer = RunWriter(session, claim.lease)
+        ends = [RunOutcome(run_id=run, state=JobState.SUCCEEDED) for run in at[2]]
+        writer.record_outcomes(ends)
+        session.get_one(Job, claim.job.id).n_runs = N_RUNS + 2
+        session.flush()
+        assert LeaseQueue(session).finish_job(claim.lease, JobState.SUCCEEDED).best_rms == 1.0
+
+
+def lose_workers_cancel_and_resume(at: Filled) -> None:
+    with at[0].write_session() as session:
+        queue, jobs = LeaseQueue(session), JobRepository(session)
+        claim = queue.recover_claim("d1", [])
+        assert claim is not None
+        assert not queue.has_progressed("d1")
+        queue.release_job(claim.lease, lost=True)
+        jobs.cancel(claim.job.id)
+        assert jobs.resume(claim.job.id).state is JobState.QUEUED
+
+
+def show_job(at: Filled) -> None:
+    with at[0].read_session() as session:
+        job = JobRepository(session).get(LARGE)
+        runs = RunRepository(session)
+        assert runs.count_created(LARGE) == N_RUNS + 2
+        page = runs.list_page(LARGE, limit=20)
+        runs.list_page(LARGE, cursor=page.next, limit=20, descending=True)
+        (best,) = runs.list_page(LARGE, limit=1, order="best_rms").items
+        assert best.number == 2
+        worst = runs.list_page(LARGE, limit=3, order="best_rms", descending=True)
+        runs.list_page(
+            LARGE, limit=3, cursor=worst.next, order="best_rms", states=[JobState.SUCCEEDED]
+        )
+        runs.read_history(best.id)
+        runs.read_migrations(best.id)
+        assert len(EventRepository(session).list_latest(LARGE)) == 6
+        read_summary(session, job)
+
+
+def stream_events(at: Filled) -> None:
+    with at[0].read_session() as session:
+        events = EventRepository(session)
+        heads = events.read_heads([LARGE, at[1].job.id])
+        assert not events.list_after(LARGE, heads[LARGE].last)
+
+
+def summarise(at: Filled) -> None:
+    with at[0].write_session() as session:
+        job = session.get_one(Job, LARGE)
+        assert len(read_run_table(session, LARGE).numbers) == N_RUNS
+        write_summary(session, job, {})
+        find_quietest_run(session, LARGE, {})
+        read_trend_rows(session, LARGE, 5)
+        count_succeeded(session, LARGE)
+
+
+def collect_garbage(at: Filled) -> None:
+    with at[0].read_session() as session:
+        assert len(_find_named_hashes(session, ["a00000000001", "c" * 64])) == 1
+        DatasetRepository(session).list_page(limit=5)
+        for query in _select_hashes():
+            column = query.selected_columns[0]
+            part = session.scalars(query.where(column >= "ac", column < "acg").distinct())
+            assert list(islice(part, 2)) == []
+
+
+USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
+    submit: ("ix_jobs_open",),
+    list_failed: ("ix_jobs_by_state",),
+    count_jobs: ("ix_jobs_by_state",),
+    show_job: ("ix_runs_job_id_best_rms", "ix_events_told"),
+    stream_events: ("ix_events_job_id_id",),
+    summarise: (),
+    collect_garbage: ("ix_runs_signals_sha256",),
+    poll_and_claim: ("ix_jobs_open", "ix_jobs_owned"),
+    write_runs: ("ix_runs_project_id_spec_hash",),
+    end_large_job: ("ix_runs_job_id_best_rms", "ix_runs_job_id_state_number"),
+    lose_workers_cancel_and_resume: ("ix_jobs_owned", "ix_runs_job_id_state_number"),
+    reap: ("ix_jobs_open",),
+}
+"""What is done often or under the write lock, and the indexes that it must use."""
+
+
+def test_no_hot_query_reads_a_whole_table(filled: Filled) -> None:
+    faults, used = [], {}
+    for use_case in USE_CASES:  # in this order
+        with record_statements(filled[0]) as statements:
+            use_case(filled)
+        assert statements
+        used[use_case] = " ".join(
+            step for statement, given in statements for step in plan(filled[0], statement, given)
+        )
+        faults += [
+            (use_case.__name__, fault, statement)
+            for statement, given in statements
+            for fault in find_faults(filled[0], statement, given)
+        ]
+    assert not faults, "\n".join(map(str, faults))
+    for use_case, indexes in USE_CASES.items():
+        assert {index for index in indexes if index not in used[use_case]} == set(), use_case

@@ -1,0 +1,83 @@
+"""Values that take long are computed once, and those that may change not too often."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+from service.core import computed
+from service.core.computed import FRESH_SECONDS, REUSE_FACTOR, ComputedValues
+
+
+class Clock:
+    """A clock that only tests move."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(computed, "time", SimpleNamespace(monotonic=made))
+    return made
+
+
+def counting(clock: Clock, seconds: float) -> tuple[list[int], Callable[[], int]]:
+    """The results so far, and a computation that takes some time."""
+    made: list[int] = []
+
+    def compute() -> int:
+        clock.now += seconds
+        made.append(len(made))
+        return made[-1]
+
+    return made, compute
+
+
+def test_what_is_final_is_computed_once(clock: Clock) -> None:
+    made, compute = counting(clock, 0.0)
+    values = ComputedValues(2)
+    for _ in range(3):
+        assert values.get("a", compute, is_final=True) == 0
+        clock.now += 1e9
+    assert made == [0]
+
+
+def test_what_may_change_and_takes_little_is_computed_each_time(clock: Clock) -> None:
+    _, compute = counting(clock, FRESH_SECONDS / 2)
+    values = ComputedValues(2)
+    assert [values.get("a", compute, is_final=False) for _ in range(3)] == [0, 1, 2]
+
+
+def test_what_may_change_and_takes_long_is_used_for_many_times_its_time(clock: Clock) -> None:
+    _, compute = counting(clock, 1.0)
+    values = ComputedValues(2)
+    assert values.get("a", compute, is_final=False) == 0
+    clock.now += REUSE_FACTOR - 0.1
+    assert values.get("a", compute, is_final=False) == 0
+    clock.now += 0.2
+    assert values.get("a", compute, is_final=False) == 1
+
+
+def test_the_values_that_were_asked_for_last_are_remembered(clock: Clock) -> None:
+    made, compute = counting(clock, 0.0)
+    values = ComputedValues(2)
+    for key in "abac":  # c takes the place of b
+        values.get(key, compute, is_final=True)
+    assert values.get("a", compute, is_final=True) == 0
+    assert values.get("b", compute, is_final=True) == len(made) - 1 == 3
+
+
+def test_what_failed_is_tried_again(clock: Clock) -> None:
+    values = ComputedValues(2)
+
+    def fail() -> int:
+        raise OSError
+
+    with pytest.raises(OSError):  # noqa: PT011 - any
+        values.get("a", fail, is_final=True)
+    assert values.get("a", lambda: 7, is_final=True) == 7
