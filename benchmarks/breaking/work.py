@@ -31,7 +31,8 @@ def bodies(dataset: str, size: float = 1.0) -> dict[str, dict[str, Any]]:
     A sweep; one of which half the cells diverge; a long run on islands; a sweep with runs that
     kill their workers or take all memory; one to be cancelled, which ends with making floors.
     """
-    common = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False}
+    # Signals of sweeps are kept here, so that faults meet their storage too.
+    common = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False, "keep_signals": True}
     unstable = {
         "path": "/parameters/b",
         "values": [{"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8}],
