@@ -5,7 +5,14 @@ from dataclasses import replace
 
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
 from sysid.data.noise import Noise
-from sysid.identification.arguments import Change, Data, check_kinds, read_changes, read_records
+from sysid.identification.arguments import (
+    Change,
+    Data,
+    check_kinds,
+    check_warm,
+    read_changes,
+    read_records,
+)
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
@@ -117,6 +124,8 @@ def identify(
             "weights": weights,
             "warm": warm,
             "validation_fraction": validation_fraction,
+            "posterior": posterior,
+            "progress": progress,
         }
     )
     algorithm = settings or GeneticAlgorithm()
@@ -131,6 +140,7 @@ def identify(
     fit = FitSettings(changes, prediction, loss or Loss(), weights, skip)
     prepared = prepare_records(whole, validation_records, validation_fraction, noise)
     problem, validation_problem = problems = build_problems(model, prepared, fit)
+    check_warm(warm, [parameter.name for parameter in problem.all_parameters])
     found = conclude_run(
         problem,
         algorithm,

@@ -431,6 +431,21 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
         check_experiment(read_recording(str(path)))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"source": None}, "found None; need the path of a file"),
+        ({"source": 3}, "found 3; need the path of a file"),
+        ({"sample_time": "0.1 s"}, "sample_time is '0.1 s'; need a positive number"),
+        ({"sample_time": -1}, "sample_time is -1; need a positive number"),
+        ({"segments": "run"}, "segments is 'run'; need a list of columns: ['run']"),
+    ],
+)
+def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told: str) -> None:
+    with pytest.raises(InvalidUpload, match=re.escape(told)):
+        read_recording(**{"source": ROWS.encode(), **arguments})
+
+
 def test_every_kind_comes_through_the_child_with_its_clock(tmp_path: Path) -> None:
     stamps = join_rows("Zeit;u;y", ";", time=stamp("%d.%m.%Y %H:%M:%S,%f"))
     recording, notes = read_with_notes(stamps.encode())
