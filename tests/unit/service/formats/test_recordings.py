@@ -305,6 +305,47 @@ def test_a_text_that_begins_like_another_kind_is_a_text() -> None:
     check_experiment(read_csv(b"RIFF test\n\n" + ROWS.encode())[0])
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 42 to 43 are below the data ('Mean')"),
+        (ROWS + "\n\nEnd of file\n", "row 44 is below the data ('End of file')"),
+        (
+            join_rows("time;u;y", ";", time=stamp("%Y-%m-%d %H:%M:%S.%f")) + "Mittel;0.5;0.3\n",
+            "row 42 is below the data ('Mittel')",
+        ),
+        (
+            "u,y,t\n"
+            + "".join(f"{u},{y},{t}\n" for u, y, t in zip(INPUT, OUTPUT, TIMES, strict=True))
+            + "End\n",
+            "row 42 is below the data ('End')",
+        ),
+    ],
+)
+def test_words_below_the_data_are_left_out_and_said(text: str, told: str) -> None:
+    recording, notes = read_with_notes(text.encode())
+    check_experiment(recording)
+    assert f"{told} and left out" in notes
+
+
+def test_words_below_the_data_are_found_wherever_blocks_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for rows in range(N - 2, N + 4):
+        monkeypatch.setattr("service.formats.table_columns.BLOCK_ROWS", rows)
+        recording, notes = read_with_notes((ROWS + "Mean,1,2\n" * 3).encode())
+        check_experiment(recording)
+        assert notes == ("rows 42 to 44 are below the data ('Mean') and left out",)
+
+
+@pytest.mark.parametrize(
+    "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
+)
+def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
+    with pytest.raises(InvalidUpload, match="^row 42"):
+        read_with_notes((ROWS + end).encode())
+
+
 def test_labels_that_divide_every_row_are_refused() -> None:
     text = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
     with pytest.raises(InvalidUpload, match="into 40 segments, of which 40 have one sample"):
