@@ -48,7 +48,8 @@ def assign_channels(
         example = ", ".join(f"{signal!r}: …" for signal in left)
         raise InvalidRecord(
             f"model {model.name!r} has inputs {inputs} and outputs {outputs}; the recording has "
-            f"{', '.join(names) or 'no channels'}. Say which channel is which: channels={{{example}}}"
+            f"{', '.join(names) or 'no channels'}. Say which channel is which: "
+            f"channels={{{example}}}"
         )
     by_order = dict(zip(left, free, strict=True)) if left else {}
     return Assignment({**assigned, **by_order}, _describe_order(by_order))

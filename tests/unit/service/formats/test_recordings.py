@@ -31,6 +31,7 @@ from tests.recorded_files import (
     write_experiment_sheet,
     write_mat,
     write_npz,
+    write_old_sheet,
     write_open_sheet,
     write_parquet,
     write_sheet,
@@ -205,6 +206,20 @@ def test_times_of_day_go_on_after_midnight() -> None:
     assert any("times of day, 0.1 s apart, from 23:59:58" in note for note in notes)
 
 
+@pytest.mark.parametrize("heading", ["time", "Zeit", "time [day]"])
+def test_serial_dates_of_a_spreadsheet_are_time_stamps(heading: str) -> None:
+    days = (START - datetime.fromisoformat("1899-12-30")) / timedelta(days=1)
+    text = join_rows(f"{heading},u,y", time=lambda t: repr(float(days + t / 86_400)))
+    recording, notes = read_with_notes(text.encode())
+    check_experiment(recording)
+    assert recording.started_at == START
+    assert any("serial dates of a spreadsheet" in note for note in notes)
+    seconds, _ = read_with_notes(
+        join_rows("time,u,y", time=lambda t: repr(float(days + 10 * t))).encode()
+    )
+    assert seconds.duration == 10 * TIMES[-1]
+
+
 def test_midnight_that_is_written_as_a_date_is_one_of_the_stamps() -> None:
     text = join_rows("t,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
     assert " 00:00:00.000" in text
@@ -342,7 +357,7 @@ def test_words_below_the_data_are_found_wherever_blocks_end(
     "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
 )
 def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
-    with pytest.raises(InvalidUpload, match="^row 42"):
+    with pytest.raises(InvalidUpload, match=r"^row 42"):
         read_with_notes((ROWS + end).encode())
 
 
@@ -453,10 +468,13 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
         read_bytes(tmp_path, write_experiment_sheet()[:700])
 
 
-def test_an_open_document_is_a_sheet_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [write_open_sheet, write_old_sheet])
+def test_an_open_document_and_an_old_excel_file_are_sheets_too(tmp_path: Path, write: Any) -> None:
     rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
-    content = write_open_sheet([["t", "u", "y"], *rows])
+    content = write([["t", "u", "y"], *rows])
     check_experiment(read_bytes(tmp_path, content)[0])
+    with pytest.raises(InvalidUpload, match="cannot be opened"):
+        read_bytes(tmp_path, content[: len(content) // 2])
 
 
 def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
