@@ -53,6 +53,19 @@ def _restore_notes() -> None:
     err.quiet = False
 
 
+def complete_model_name(incomplete: str) -> list[str]:
+    """List the built-in models that a shell may complete a name to; files are its own task."""
+    from sysid.models.catalogue.load import catalogue
+
+    return [name for name in catalogue() if name.startswith(incomplete)]
+
+
+ModelName = Annotated[
+    str,
+    typer.Option(
+        "--model", help="Name of a model, or a YAML file.", autocompletion=complete_model_name
+    ),
+]
 DOCUMENT_HELP = "YAML or JSON file with the body of the request; - for standard input."
 SERVER_PANEL, OUTPUT_PANEL = "Server", "Output"
 Url = Annotated[
@@ -357,12 +370,15 @@ def write_file(path: Path, text: str) -> None:
         fail(f"{path} cannot be written: {error.strerror}")
 
 
-def protect_file(path: Path, force: bool) -> None:
-    """Ask before a file is overwritten; end the command where nobody can answer."""
+def protect_file(path: Path, force: bool, option: str = "--output") -> None:
+    """Ask before a file is overwritten; end the command where nobody can answer.
+
+    `option` names another file.
+    """
     if not force and path.exists():
         ask_to_go_on(
             f"{path} exists. Overwrite it?",
-            f"{path} exists, and nothing was written. Add --force, or name another by --output",
+            f"{path} exists, and nothing was written. Add --force, or name another by {option}",
         )
 
 

@@ -17,6 +17,8 @@ from service.cli.common import (
     STANDARD_INPUT,
     AsJson,
     FieldOrigins,
+    Force,
+    ModelName,
     Quiet,
     SampleTime,
     Segments,
@@ -32,6 +34,7 @@ from service.cli.common import (
     parse_channels,
     print_json,
     print_table,
+    protect_file,
     read_file,
     split_names,
     split_setting_path,
@@ -93,7 +96,7 @@ def identify(
         Path,
         typer.Argument(metavar="DATA", help=DATA_HELP),
     ],
-    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    model: ModelName,
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", help="path=value of the job body: algorithm.population=100."),
@@ -130,6 +133,7 @@ def identify(
             rich_help_panel=OUTPUT_PANEL,
         ),
     ] = None,
+    force: Force = False,
     output: ResultFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -141,7 +145,7 @@ def identify(
     if posterior:
         changes.append("posterior=true")
     if report is not None:
-        _check_report(report)
+        _check_report(report, force)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
@@ -164,7 +168,7 @@ def identify(
         _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
 
 
-def _check_report(path: Path) -> None:
+def _check_report(path: Path, force: bool) -> None:
     """End the command before the search if no report could be written after it."""
     from importlib.util import find_spec
 
@@ -175,6 +179,7 @@ def _check_report(path: Path) -> None:
         fail_usage(f"--report {path}: this is a folder; name a file")
     if not path.parent.is_dir():
         fail_usage(f"--report {path}: there is no folder {path.parent}")
+    protect_file(path, force, "--report")
 
 
 def _write_report(

@@ -20,6 +20,7 @@ from service.client.calls import ClientError, NotFinite, ProblemError
 from service.core.errors import ServiceError
 
 SERVER_ERROR_STATUS = 500
+EXTRA_ARGUMENT = "unexpected extra argument"
 SURROGATE_REASON = "surrogates not allowed"
 """Python's reason for an argument or a file name in another encoding."""
 app = typer.Typer(
@@ -177,7 +178,18 @@ def _usage_message(error: TyperException) -> str:
         text = text.replace(error.message, describe_error(cause.errors()[0], ()))
     context = getattr(error, "ctx", None)
     command = "lagid" if context is None else context.command_path
-    return f"{text[:1].lower()}{text[1:].rstrip('.')} ({command} --help)"
+    hint = "" if context is None or EXTRA_ARGUMENT not in text else _advise_on_json(context.command)
+    return f"{text[:1].lower()}{text[1:].rstrip('.')}{hint} ({command} --help)"
+
+
+def _advise_on_json(command: Any) -> str:
+    """Say how JSON is written to a file, if a word that is none of the options follows --json."""
+    words = sys.argv[sys.argv.index("--json") + 1 :] if "--json" in sys.argv else []
+    if not words or words[0].startswith("-"):
+        return ""
+    has_output = any("--output" in option.opts for option in command.params)
+    file = f"--output {words[0]}" if has_output else f"--json > {words[0]}"
+    return f"; --json takes no file, it prints on standard output. To write one: {file}"
 
 
 def _exit_with_message(message: str, code: int = 1) -> None:

@@ -11,6 +11,7 @@ from service.cli.common import (
     Limit,
     Listing,
     Url,
+    complete_model_name,
     connect_client,
     err,
     fetch_listing,
@@ -83,7 +84,12 @@ def list_models(
     "show", epilog=show_examples("lagid models show tube > mine.yaml", "lagid models show mine@2")
 )
 def show_model(
-    name: Annotated[str, typer.Argument(help="Name, or name@version of your own model.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name, or name@version of your own model.", autocompletion=complete_model_name
+        ),
+    ],
     url: Annotated[
         str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of your own models.")
     ] = None,

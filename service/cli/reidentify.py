@@ -16,6 +16,7 @@ from service.cli.common import (
     FieldOrigins,
     Key,
     Limit,
+    ModelName,
     Quiet,
     Url,
     apply_setting,
@@ -57,7 +58,6 @@ Experiments = Annotated[
         "joined by a comma are fitted together.",
     ),
 ]
-Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")]
 Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
 Reference = Annotated[
     str | None,
@@ -97,7 +97,7 @@ TrendFile = Annotated[
 
 def reidentify(
     experiments: Experiments,
-    model: Model,
+    model: ModelName,
     label: Label,
     reference: Reference = None,
     parameters: Parameters = "",

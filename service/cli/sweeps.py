@@ -9,6 +9,7 @@ from service.cli.common import (
     AsJson,
     FieldOrigins,
     Key,
+    ModelName,
     Quiet,
     Url,
     apply_setting,
@@ -118,7 +119,7 @@ IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns t
     ),
 )
 def sweep_noise(
-    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    model: ModelName,
     sigma: Sigma,
     data: Data = None,
     true: TrueParameters = None,
