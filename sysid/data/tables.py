@@ -366,19 +366,23 @@ def _name_column(name: Any, values: Any, otherwise: str) -> tuple[str, str]:
     return plain, str(unit or "1")
 
 
-def align_starts(starts: Iterable[datetime | None]) -> list[float]:
-    """Compute the seconds by which series of dates start after the first of them.
-
-    Series of seconds are not shifted.
+def find_first_start(starts: Iterable[datetime | None]) -> datetime | None:
+    """Find the first of some moments; None if there is none.
 
     Raises
     ------
     InvalidRecord
-        If only some of the dates have a time zone.
+        If only some of them have a time zone.
     """
-    known = list(starts)
     try:
-        first = min((start for start in known if start is not None), default=_EPOCH)
-        return [0.0 if start is None else (start - first).total_seconds() for start in known]
+        return min((start for start in starts if start is not None), default=None)
+    except TypeError:
+        raise InvalidRecord(_MIXED_ZONES) from None
+
+
+def measure_distance(later: datetime, earlier: datetime) -> float:
+    """Measure the seconds from one moment to another; raises as `find_first_start`."""
+    try:
+        return (later - earlier).total_seconds()
     except TypeError:
         raise InvalidRecord(_MIXED_ZONES) from None

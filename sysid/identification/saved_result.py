@@ -8,6 +8,7 @@ against the declared types, so that a damaged file is told by the place of its f
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from datetime import datetime
 from functools import cache
 from os import PathLike
 from pathlib import Path
@@ -111,6 +112,8 @@ def _encode(value: Any) -> Any:
         return [_encode(item) for item in value]
     if isinstance(value, float) and not np.isfinite(value):
         return "nan" if np.isnan(value) else "inf" if value > 0 else "-inf"
+    if isinstance(value, datetime):
+        return value.isoformat()
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -208,10 +211,19 @@ def _decode_scalar(hint: Any, value: Any, pointer: str) -> Any:
             return _NOT_FINITE[value]
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         return float(_require(is_number, value, pointer, "a number"))
+    if hint is datetime:
+        return _decode_moment(value, pointer)
     if hint is int:
         return _require(type(value) is int, value, pointer, "a whole number")
     names = {str: "a text", bool: "true or false"}
     return _require(type(value) is hint, value, pointer, names.get(hint, str(hint)))
+
+
+def _decode_moment(value: Any, pointer: str) -> datetime:
+    try:
+        return datetime.fromisoformat(value)
+    except (TypeError, ValueError):
+        raise _Misfit(pointer, value, "a date such as 2026-01-31T12:00:00") from None
 
 
 def _require(holds: bool, value: Any, pointer: str, need: str) -> Any:

@@ -13,7 +13,7 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Channels, Record, Recording, to_channels
-from sysid.data.tables import read_times
+from sysid.data.tables import TimeAxis, measure_distance, read_times
 from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.model import (
@@ -111,9 +111,15 @@ def simulate(
         _fix_initial(start, state.name, values, is_measured=bool(measured))
         for start, state in zip(model.initial, model.states, strict=True)
     )
-    at = _choose_times(signals, times)
+    at, start = _choose_times(signals, times)
     outputs = tuple(
-        Channel(output.name, at, _read_measured(measured, output.name, at), output.unit)
+        Channel(
+            output.name,
+            at,
+            _read_measured(measured, output.name, at),
+            output.unit,
+            started_at=start,
+        )
         for output in model.outputs
     )
     problem = build_simulation_problem(
@@ -182,13 +188,21 @@ def _restore(
     return model, held, {k: v for k, v in numbers.items() if not others.fullmatch(k)}
 
 
-def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> FloatArray:
+def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> TimeAxis:
+    """Choose the times of the outputs, on the clock of the inputs if they have one."""
     if times is None and not inputs:
         raise InvalidSettings("/times", "the model has no input; give the times of the outputs")
-    at = inputs[0].times if times is None else read_times(times, "the times").seconds
-    if at.ndim != 1 or at.size < 2:
-        raise InvalidRecord(f"times have shape {at.shape}. Need two times or more")
-    return at
+    start = inputs[0].started_at if inputs else None
+    if times is None:
+        axis = TimeAxis(inputs[0].times, start)
+    else:
+        at, first = read_times(times, "the times")
+        if first is not None and start is not None:
+            at = at + measure_distance(first, start)
+        axis = TimeAxis(at, start if inputs else first)
+    if axis.seconds.ndim != 1 or axis.seconds.size < 2:
+        raise InvalidRecord(f"times have shape {axis.seconds.shape}. Need two times or more")
+    return axis
 
 
 def complete_values(model: Model, values: Mapping[str, float]) -> dict[str, float]:
