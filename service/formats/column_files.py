@@ -12,7 +12,6 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from service.formats.cells import CellKind
 from service.formats.errors import InvalidUpload
 from service.formats.limits import ReadOptions
 from service.formats.table_columns import (
@@ -23,14 +22,13 @@ from service.formats.table_columns import (
     parse_texts,
 )
 from service.formats.table_layout import (
-    Heading,
     TableColumn,
     assign_roles,
     classify_cells,
-    is_time_name,
-    split_headings,
+    read_headings,
 )
 from sysid.core.types import IntArray
+from sysid.data.table_rules import CellKind, Heading, is_time_name
 
 if TYPE_CHECKING:
     import polars as pl
@@ -248,9 +246,7 @@ def build_column_table(
         raise InvalidUpload("the file holds no samples")
     headings = [
         Heading(name, unit, _classify_values(values, name))
-        for (name, unit), values in zip(
-            split_headings(list(columns)), columns.values(), strict=True
-        )
+        for (name, unit), values in zip(read_headings(list(columns)), columns.values(), strict=True)
     ]
     roles = assign_roles(
         headings, options.segments, options.sample_time, options.limits.channels, None

@@ -24,7 +24,6 @@ from service.formats.mcap_content import (
     sort_columns,
 )
 from service.formats.mcap_writer import McapWriter
-from service.formats.time_columns import find_clock_start
 from service.formats.topics import (
     DATASET_RECORD,
     TIME_FIELD,
@@ -40,6 +39,7 @@ from service.formats.topics import (
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Record, Recording
+from sysid.data.table_rules import find_clock_start
 
 
 class ByteSink(Protocol):

@@ -1,7 +1,6 @@
 """Read a recording from a file of any kind: the one reader of Python, command line and service."""
 
 import os
-import warnings
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
@@ -11,10 +10,7 @@ from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from sysid.data.records import Recording
-
-
-class ReadingNote(UserWarning):
-    """What was guessed or found while a file was read."""
+from sysid.data.table_rules import tell_notes
 
 
 def read_recording(
@@ -49,6 +45,7 @@ def read_recording(
     Examples
     --------
     >>> content = b"t [ms],valve [%],flow [l/min]\n0,0,1.5\n100,50,1.6\n200,50,2.8\n"
+    >>> import warnings
     >>> with warnings.catch_warnings(action="ignore"):
     ...     recording = read_recording(content)
     >>> recording.names, recording.channel("flow").unit, recording.duration
@@ -57,8 +54,7 @@ def read_recording(
     recording, notes = read_with_notes(
         source, sample_time=sample_time, segments=segments, limits=limits
     )
-    for note in notes:
-        warnings.warn(note, ReadingNote, stacklevel=2)
+    tell_notes(notes)
     return recording
 
 

@@ -10,65 +10,42 @@ import csv
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 from service.core.text import unescape_formula
-from service.formats.cells import CellKind, begins_like_number, classify_cell, classify_column
+from service.formats.cells import begins_like_number, classify_cell, classify_column
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import suggest_name
-from sysid.core.units import find_conversion_factor, is_known_unit
+from sysid.data.table_rules import (
+    INDEX_NAMES,
+    STAMP_KINDS,
+    CellKind,
+    Heading,
+    counts_rows,
+    find_time_column,
+    find_time_unit,
+    find_unit_seconds,
+    is_nameless,
+    is_plain_time_name,
+    is_time_name,
+    is_unit,
+    split_headings,
+)
 
 SEPARATORS: Final = ("\t", ";", ",", "|", " ")
 COMMENT_SIGNS: Final = ("#", "%", "//")
-TIME_NAMES: Final = ("t", "time")
-TIME_WORDS: Final = frozenset(
-    (
-        *TIME_NAMES,
-        *("timestamp", "time stamp", "datetime", "date time", "date/time", "date"),
-        *("elapsed", "elapsed time", "time elapsed", "sec", "secs", "seconds"),
-        *("zeit", "zeitstempel", "uhrzeit", "datum", "datum/zeit", "datum/uhrzeit"),
-        *("datum zeit", "datum uhrzeit", "temps", "tiempo", "tempo", "tijd", "tid", "x value"),
-    )
-)
-_DATE_WORDS: Final = frozenset(("date", "datum"))
-NO_NAMES: Final = ("", "unnamed: 0", "__index_level_0__")
-INDEX_NAMES: Final = (*NO_NAMES, "index", "no", "no.", "nr", "nr.", "#")
-"""Names of a column that is left out if it counts rows, in small letters."""
-SECOND_NAMES: Final = ("", "s", "sec", "secs", "second", "seconds")
-_LONG_UNITS: Final = {
-    **dict.fromkeys(("minute", "minutes", "mins"), "min"),
-    **dict.fromkeys(("hour", "hours", "hrs"), "h"),
-    **dict.fromkeys(("millisecond", "milliseconds", "msec", "msecs"), "ms"),
-    **dict.fromkeys(("microsecond", "microseconds", "usec", "usecs", "μs"), "us"),
-    **dict.fromkeys(("nanosecond", "nanoseconds", "nsec"), "ns"),
-    "days": "day",
-}
-MAX_TIME_UNIT = 86_400.0
-"""Longest unit of time in s (a day); a longer one is taken for a mistake."""
 PEEK_CELLS = 20_000
 """Most cells of the first rows that are looked at."""
 MAX_FOOTER_ROWS = 20
 """Most rows of words below the data, such as mean values; more are faults."""
 _MAX_UNIT_CHARACTERS = 12
 
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
-_PARENTHESES = re.compile(r"^(?P<name>.*?)\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
-_SLASH = re.compile(r"^(?P<name>[^/]+?)\s*(?:/|\s+in\s+)\s*\(?(?P<unit>[^()]+?)\)?$", re.DOTALL)
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
 _DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
 
 ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
 """``date`` completes a time of day; ``nameless`` and ``text`` are left out of the recording."""
-
-
-class Heading(NamedTuple):
-    """Name and unit of a column, and what its first cells hold."""
-
-    name: str
-    unit: str
-    kind: CellKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +295,7 @@ def _build_layout(
     names, cells = _align_header(names, cells)
     headings = [
         Heading(name, unit, classify_cells([row[i] for row in cells], name))
-        for i, (name, unit) in enumerate(split_headings(names, units))
+        for i, (name, unit) in enumerate(read_headings(names, units))
     ]
     row = header.place + 1
     if len(headings) == 1 and (sample_time is None or _is_number(names[0])):
@@ -400,15 +377,15 @@ def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
     times = [
         unit
         for unit, name in zip(units, names, strict=False)
-        if _find_time_word(_split_heading(name, slashes=True)[0]) is not None
+        if is_time_name(split_headings([name])[0][0])
     ]
-    if not times and any(_find_time_word(unit) in TIME_NAMES for unit in full):
+    if not times and any(map(is_plain_time_name, full)):
         return False  # it names the time, and the row above does not
     return (
         bool(full)
         and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)
         and (not times or any(find_unit_seconds(unit) is not None for unit in times))
-        and 2 * sum(map(_is_unit, full)) > len(full)
+        and 2 * sum(map(is_unit, full)) > len(full)
     )
 
 
@@ -428,46 +405,15 @@ def _align_header(names: list[str], cells: list[list[str]]) -> tuple[list[str], 
     return names, cells if width == len(names) else []
 
 
-def counts_rows(texts: Sequence[str]) -> bool:
-    """Whether cells count rows from 0 or from 1."""
-    first = texts[0].strip() if texts else ""
-    return (
-        len(texts) > 1
-        and first in ("0", "1")
-        and all(text.strip() == str(number) for number, text in enumerate(texts, int(first)))
-    )
-
-
-def split_headings(names: Sequence[str], units: Sequence[str] = ()) -> list[tuple[str, str]]:
+def read_headings(names: Sequence[str], units: Sequence[str] = ()) -> list[tuple[str, str]]:
     """Split the names of columns into name and unit; `units` are those of a row below them."""
-    slashes = any(
-        _find_time_word(name) is not None and find_unit_seconds(unit) is not None and unit
-        for name, unit in (_split_heading(text, slashes=True) for text in names)
-    )
-    split = [_split_heading(text, slashes=slashes) for text in names]
+    split = split_headings([unescape_formula(name.strip()) for name in names])
     if not units:
         return split
     return [
         (name, unit or _strip_brackets(below))
         for (name, unit), below in zip(split, units, strict=False)
     ]
-
-
-def _split_heading(field: str, *, slashes: bool) -> tuple[str, str]:
-    """Split ``u [V]``, ``u (V)`` or, as a standard writes it, ``u/V`` into name and unit."""
-    text = unescape_formula(field.strip())
-    if match := _BRACKETS.match(text):
-        return match["name"], match["unit"].strip()
-    if (match := _PARENTHESES.match(text)) and _is_unit(match["unit"]) and match["name"]:
-        return match["name"].rstrip(" /"), match["unit"].strip()
-    if slashes and (match := _SLASH.match(text)) and _is_unit(match["unit"]):
-        return match["name"], match["unit"].strip()
-    return text, ""
-
-
-@lru_cache(maxsize=1024)
-def _is_unit(text: str) -> bool:
-    return is_known_unit(text) or (bool(text.strip()) and find_unit_seconds(text) is not None)
 
 
 def _is_number(field: str) -> bool:
@@ -494,7 +440,7 @@ def assign_roles(
         time. Also if the time is given twice.
     """
     named = [
-        TableColumn(*heading, role="nameless" if _is_nameless(heading) else "value")
+        TableColumn(*heading, role="nameless" if is_nameless(heading) else "value")
         for heading in headings
     ]
     _check_names(named, row)
@@ -510,9 +456,7 @@ def assign_roles(
             )
     columns = _assign_time(columns, sample_time, row)
     columns = [
-        replace(c, role="text")
-        if c.role == "value" and c.kind in ("text", "stamp", "date", "clock")
-        else c
+        replace(c, role="text") if c.role == "value" and c.kind in ("text", *STAMP_KINDS) else c
         for c in columns
     ]
     for number, column in enumerate(columns, 1):
@@ -534,11 +478,6 @@ def build_nameless_error(number: int, row: int | None = 1) -> InvalidUpload:
     return InvalidUpload(f"column {number} of the header has no name", row=row)
 
 
-def _is_nameless(heading: Heading) -> bool:
-    """Whether a column has no name of its own: that of an index, or none."""
-    return heading.kind == "count" or heading.name.lower() in NO_NAMES
-
-
 def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
     if all(_is_number(column.name) for column in columns):
         raise _build_header_error(row)
@@ -555,7 +494,14 @@ def _assign_time(
     columns: Sequence[TableColumn], sample_time: float | None, row: int | None
 ) -> list[TableColumn]:
     """Give their roles to the column of times, and to that of dates beside times of day."""
-    time = _find_time_column(columns)
+    time = find_time_column(
+        [
+            Heading(column.name, column.unit, column.kind)
+            if column.role in ("value", "nameless")
+            else None
+            for column in columns
+        ]
+    )
     if sample_time is not None and not 0 < sample_time < float("inf"):
         raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
     if time is None:
@@ -568,14 +514,14 @@ def _assign_time(
             )
         return list(columns)
     column = columns[time]
-    name, unit = _split_time_name(column.name, column.unit)
-    if sample_time is not None and column.kind not in ("stamp", "date", "clock"):
+    name, unit = column.name, find_time_unit(column.name, column.unit)
+    if sample_time is not None and column.kind not in STAMP_KINDS:
         raise InvalidUpload(
             "the file has this time column, and sample_time is given too; remove one of them",
             row=row,
             column=name,
         )
-    if column.kind in ("stamp", "date", "clock"):
+    if column.kind in STAMP_KINDS:
         unit = ""
     elif find_unit_seconds(unit) is None:
         raise InvalidUpload(
@@ -594,34 +540,6 @@ def _assign_time(
     return roles
 
 
-def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
-    """Find the column of times: by a usual name, or because it holds time stamps."""
-    free = [(i, column) for i, column in enumerate(columns) if column.role in ("value", "nameless")]
-    ranks = []
-    for i, column in free:
-        word = _find_time_word(column.name)
-        is_stamp = column.kind in ("stamp", "date", "clock")
-        if word in TIME_NAMES and column.role == "value":
-            ranks.append((0 if column.name != "T" else 5, i))  # T is often a temperature
-        elif word is not None and (is_stamp or word not in _DATE_WORDS):
-            ranks.append((1 if column.kind == "stamp" else 2, i))
-        elif is_stamp:
-            ranks.append((3 if column.kind == "stamp" else 4, i))
-        elif column.role == "nameless" and column.kind == "number" and (i == 0 or column.name):
-            ranks.append((6, i))  # the index of a table, which is its time
-    return min(ranks)[1] if ranks else None
-
-
-def is_plain_time_name(name: str) -> bool:
-    """Whether a column is called ``t`` or ``time``, so that its unit is s unless it has one."""
-    return _find_time_word(name) in TIME_NAMES
-
-
-def is_time_name(name: str) -> bool:
-    """Whether a column of this name holds times."""
-    return _find_time_word(name) is not None
-
-
 def _find_other_half(columns: Sequence[TableColumn], time: int) -> int | None:
     """Find the column of dates of a column of times of day, or the reverse."""
     wanted = {"clock": "date", "date": "clock"}.get(columns[time].kind)
@@ -633,29 +551,3 @@ def _find_other_half(columns: Sequence[TableColumn], time: int) -> int | None:
         ),
         None,
     )
-
-
-def _find_time_word(name: str) -> str | None:
-    """Return the usual name of time that a name is, without a unit at its end."""
-    text = " ".join(re.sub(r"[_-]", " ", name.lower()).split())
-    if text in TIME_WORDS:
-        return text
-    word, _, unit = text.rpartition(" ")
-    return word if unit and word in TIME_WORDS and find_unit_seconds(unit) is not None else None
-
-
-def _split_time_name(name: str, unit: str) -> tuple[str, str]:
-    """Split a unit from the name of a time column, such as ``time_ms``."""
-    end = re.split(r"[ _-]", name)[-1].lower()
-    if unit or end in SECOND_NAMES or end == name.lower() or find_unit_seconds(end) is None:
-        return name, unit
-    return name, end
-
-
-def find_unit_seconds(unit: str) -> float | None:
-    """Return the seconds in one unit of a time column; None if it is no unit of time."""
-    lower = unit.strip().lower()
-    if lower in SECOND_NAMES:
-        return 1.0
-    seconds = find_conversion_factor(_LONG_UNITS.get(lower, unit.strip()), "s")
-    return seconds if seconds is not None and 0 < seconds <= MAX_TIME_UNIT else None

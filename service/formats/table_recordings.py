@@ -8,21 +8,16 @@ import numpy as np
 from service.formats.cells import begins_like_number, classify_cell
 from service.formats.errors import InvalidUpload
 from service.formats.table_columns import ColumnValues, Table, holds_numbers, shorten_text
-from service.formats.table_layout import (
-    TableColumn,
-    build_nameless_error,
-    counts_rows,
-)
+from service.formats.table_layout import TableColumn, build_nameless_error
 from service.formats.time_columns import (
-    ClockTimes,
     join_dates,
     parse_stamps,
     read_clock_times,
-    read_number_times,
     read_stamp_times,
 )
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
+from sysid.data.table_rules import TimeAxis, counts_rows, read_number_times
 
 SegmentLabels = Mapping[str, float | str]
 
@@ -74,7 +69,7 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
     clock = _build_times(table, starts, notes)
-    times, spans = clock.times, tuple[Segment, ...]()
+    times, spans = clock.seconds, tuple[Segment, ...]()
     if labels:
         times, spans = _build_segments(table, labels, times, starts, notes)
     else:
@@ -151,7 +146,7 @@ def _explain_text(text: str) -> str:
     return ", which is not a number; write numbers alone, and their unit in the header: u [V]"
 
 
-def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes:
+def _build_times(table: Table, starts: IntArray, notes: list[str]) -> TimeAxis:
     """Build the times in s before segments are placed on one axis."""
     sample_time = table.sample_time
     time = next((column for column in table.columns if column.role == "time"), None)
@@ -164,15 +159,15 @@ def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes
                 f"samples are {sample_time:g} s apart; column {time.name!r} gives the start"
             )
         start = None if clock is None else clock.started_at
-        return ClockTimes(np.concatenate(counts) * sample_time, start)
+        return TimeAxis(np.concatenate(counts) * sample_time, start)
     assert time is not None  # checked with the layout
     assert clock is not None
-    _check_increasing(clock.times, starts, table, time)
-    _report_repeated_times(clock.times, starts, notes)
+    _check_increasing(clock.seconds, starts, table, time)
+    _report_repeated_times(clock.seconds, starts, notes)
     return clock
 
 
-def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -> ClockTimes:
+def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -> TimeAxis:
     """Read the column of times; without `tell` only its first one counts."""
     values, told = table.find_values(time.name), notes if tell else []
     rows = table.rows

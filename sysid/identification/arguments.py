@@ -9,7 +9,7 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, sugg
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
-from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns, split_unit
+from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns
 from sysid.models.model import Model
 from sysid.models.signals import assign_channels, assign_record
 
@@ -51,7 +51,8 @@ def _read_one(
         recording = data
     elif is_labelled(data):
         columns = read_columns(data, "the table")
-        plain = {key: split_unit(str(name))[0] for key, name in (channels or {}).items()}
+        by_label = {column.label: column.name for column in columns}
+        plain = {key: by_label.get(str(name), name) for key, name in (channels or {}).items()}
         assigned = assign_channels(model, [column.name for column in columns], plain)
         used = set(assigned.by_signal.values())
         recording = Recording(tuple(to_channel(c) for c in columns if c.name in used))

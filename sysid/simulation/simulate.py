@@ -13,7 +13,8 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Channels, Record, Recording, to_channels
-from sysid.data.tables import TimeAxis, measure_distance, read_times
+from sysid.data.table_rules import TimeAxis
+from sysid.data.tables import measure_distance, read_times
 from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.model import (

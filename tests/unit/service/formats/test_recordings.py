@@ -16,9 +16,10 @@ from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
-from service.formats.recordings import ReadingNote, read_recording, read_with_notes
+from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
 from sysid.data.records import Recording
+from sysid.data.table_rules import ReadingNote
 from tests.recorded_files import (
     INPUT,
     OUTPUT,

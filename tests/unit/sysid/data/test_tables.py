@@ -147,6 +147,7 @@ def test_a_history_may_be_lists() -> None:
         "array of channels",
     ],
 )
+@pytest.mark.filterwarnings("ignore:times were converted from ms")
 def test_a_table_is_a_recording(table: object) -> None:
     recording = Recording(table)
     assert recording.names == ("P1", "P2")
