@@ -336,6 +336,12 @@ def read_file(path: Path) -> bytes:
         fail(f"{name_file(path)} cannot be read: {error.strerror}")
 
 
+def check_file(path: Path) -> None:
+    """End the command if a file that the user names is none."""
+    if path != STANDARD_INPUT and not path.is_file():
+        fail(f"{path} is a folder; name a file" if path.is_dir() else f"there is no file {path}")
+
+
 def name_file(path: Path) -> str:
     """Name a file in a message."""
     return "standard input" if path == STANDARD_INPUT else str(path)
@@ -433,6 +439,7 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
+UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
 READ_OPTIONS = (
     (re.compile(r"\bsample_time\b"), "--sample-time"),
     (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
@@ -482,6 +489,11 @@ class FieldOrigins:
                 return _format_option(self.options[above], pointer.removeprefix(above))
         return _format_option(self.rest, pointer, is_whole=True)
 
+    @property
+    def file(self) -> str:
+        """The file that the whole body was read from; empty if options made it."""
+        return "" if "{}" in self.rest else self.rest.removesuffix(" …")
+
     def describe_faults(self, faults: Iterable[FieldError]) -> str:
         """Describe faults in one line."""
         return "; ".join(self._describe_fault(fault) for fault in faults)
@@ -496,7 +508,7 @@ class FieldOrigins:
         return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
 
     def _describe_fault(self, fault: FieldError) -> str:
-        origin = self.locate(fault.pointer) if fault.pointer else ""
+        origin = self.locate(fault.pointer) if fault.pointer else self.file
         column = "" if fault.column is None else f", column {fault.column}"
         detail = fault.detail
         if not self.rest.endswith("…"):
@@ -508,6 +520,11 @@ class FieldOrigins:
 def file_origins(path: Path, options: Mapping[str, str] | None = None) -> FieldOrigins:
     """Return the origins of a body that is read from a file, except fields that options set."""
     return FieldOrigins(options or {}, rest=f"{name_file(path)} …")
+
+
+def upload_origins(path: Path) -> FieldOrigins:
+    """Return the origins of an upload: options, and the file for all faults in it."""
+    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path), rewrite=name_read_options)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from service.cli.common import (
     SampleTime,
     Segments,
     apply_setting,
+    check_file,
     describe_status,
     err,
     fail,
@@ -290,8 +291,7 @@ def read_recording(path: Path, reading: FileOptions) -> "Recording":
     from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
 
-    if path != STANDARD_INPUT and not path.is_file():
-        fail(f"there is no file {path}")
+    check_file(path)
     try:
         recording, notes = read_with_notes(
             read_file(path) if path == STANDARD_INPUT else path,

@@ -38,6 +38,7 @@ from service.cli.common import (
     report_faults,
     show_examples,
     split_names,
+    upload_origins,
     write_file,
 )
 from service.cli.tables import print_reuse_note, print_trend
@@ -216,10 +217,13 @@ def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> lis
     for source in (name for _, sources in batch for name in sources):
         if source in dataset_ids:
             continue
-        is_file = Path(source).is_file()
-        if not is_file and source.endswith(SUFFIXES):
+        path = Path(source)
+        if not path.is_file() and source.endswith(SUFFIXES):
             fail(f"there is no file {source}")
-        dataset_ids[source] = client.add_dataset(Path(source))["id"] if is_file else source
+        dataset_ids[source] = source
+        if path.is_file():
+            with report_faults(upload_origins(path)):
+                dataset_ids[source] = client.add_dataset(path)["id"]
     return [{"x": x, "datasets": [dataset_ids[name] for name in sources]} for x, sources in batch]
 
 

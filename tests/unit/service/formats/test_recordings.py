@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.formats import recordings
+from service.formats import recordings, table_columns
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import SUFFIXES, detect_kind
@@ -348,7 +348,7 @@ def test_words_below_the_data_are_found_wherever_blocks_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for rows in range(N - 2, N + 4):
-        monkeypatch.setattr("service.formats.table_columns.BLOCK_ROWS", rows)
+        monkeypatch.setattr(table_columns, "BLOCK_ROWS", rows)
         recording, notes = read_with_notes((ROWS + "Mean,1,2\n" * 3).encode())
         check_experiment(recording)
         assert notes == ("rows 42 to 44 are below the data ('Mean') and left out",)
