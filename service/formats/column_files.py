@@ -22,6 +22,7 @@ from service.formats.table_columns import (
     parse_texts,
 )
 from service.formats.table_layout import (
+    PEEK_ROWS,
     TableColumn,
     assign_roles,
     classify_cells,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 PERIOD_NAMES: Final = ("ts", "dt", "sample_time", "sampletime", "sampling_time", "sample_period")
 RATE_NAMES: Final = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")
-PEEK_ROWS = 200
 _DAMAGES: Final = (
     *(ValueError, TypeError, KeyError, IndexError, OSError, EOFError, AttributeError),
     *(NotImplementedError, zlib.error, struct.error, zipfile.BadZipFile),

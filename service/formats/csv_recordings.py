@@ -12,14 +12,13 @@ also written as CSV, block by block, and its numbers come back bit for bit.
 import csv
 from collections.abc import Iterator, Sequence
 from io import StringIO
-from itertools import chain, islice
+from itertools import chain
 from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
 
 from service.core.text import escape_formula
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import GZIP_MAGIC, read_head
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.table_columns import read_lines
@@ -27,8 +26,6 @@ from service.formats.table_layout import detect_layout
 from service.formats.table_recordings import build_recording
 from service.formats.text_files import open_text
 from sysid.data.records import Channel, Recording
-
-PEEK_LINES = 200
 
 
 def read_csv(
@@ -65,8 +62,7 @@ def read_csv(
     """
     notes: list[str] = []
     with open_text(source, limits, notes) as lines:
-        first = _peek_lines(lines)
-        layout = detect_layout(first, segments, sample_time, limits.channels)
+        layout, first = detect_layout(lines, segments, sample_time, limits.channels)
         notes += layout.notes
         table = read_lines(chain(first, lines), layout, notes, limits.messages)
     return build_recording(table, notes), tuple(notes)
@@ -82,17 +78,8 @@ def is_plain_text(
     if read_head(path).startswith(GZIP_MAGIC):
         return False
     with open_text(path, limits, []) as lines:
-        first = _peek_lines(lines)
-        return not detect_layout(first, segments, sample_time, limits.channels).has_stamps
-
-
-def _peek_lines(lines: Iterator[str]) -> list[str]:
-    first = list(islice(lines, PEEK_LINES))
-    if not first:
-        raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
-    if not any(map(str.strip, first)):
-        raise InvalidUpload("the first rows are empty; need a header such as t,u,y", row=1)
-    return first
+        layout, _ = detect_layout(lines, segments, sample_time, limits.channels)
+        return not layout.has_stamps
 
 
 WRITTEN_BLOCK_ROWS = 5000

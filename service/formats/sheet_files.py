@@ -10,7 +10,6 @@ from service.formats.limits import ReadOptions
 from service.formats.table_columns import Table, read_rows
 from service.formats.table_layout import TableLayout, detect_sheet_layout
 
-PEEK_ROWS = 200
 _EXACT_INTEGER = 2.0**53
 
 
@@ -48,7 +47,7 @@ def _find_table(sheet: CalamineSheet, options: ReadOptions) -> tuple[list[list[s
     rows = [[_write_cell(cell) for cell in row] for row in sheet.to_python(skip_empty_area=False)]
     rows = _cut_empty_columns(rows)
     layout = detect_sheet_layout(
-        rows[:PEEK_ROWS], options.segments, options.sample_time, options.limits.channels
+        rows, options.segments, options.sample_time, options.limits.channels
     )
     return rows, layout
 

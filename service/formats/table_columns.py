@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.text import unescape_formula
-from service.formats.cells import FLAGS, MISSING
+from service.formats.cells import FLAGS, MISSING, classify_cell
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.table_layout import (
@@ -91,18 +91,20 @@ def read_rows(
 ) -> Table:
     """Read the rows of the body, which are split into fields; raises as `read_lines`."""
     blocks = []
-    comments = 0
+    comments, sign = 0, "." if layout.separator == "," else ""
     for fields, numbers, skipped in _iterate_blocks(rows, layout, notes):
         comments += skipped
         if numbers.size and numbers[-1] > max_rows + layout.skipped:
             raise InvalidUpload(f"the file has more than {max_rows} rows")
         if fields:
-            blocks.append((_parse_block(fields, layout, numbers), numbers))
+            fit = _fit_rows(fields, layout, numbers)
+            sign = sign or _find_decimal_sign(fit, layout)
+            blocks.append((_parse_block(fit, layout, numbers, sign == ","), numbers))
     if not blocks:
         raise InvalidUpload("there are no rows below the header")
     if comments:
         notes.append(f"comments in {comments} of the rows were skipped")
-    if layout.has_decimal_commas:
+    if sign == ",":
         notes.append("decimal commas were read as decimal points")
     values = tuple(
         np.concatenate([block[i] for block, _ in blocks]) for i in range(len(layout.columns))
@@ -153,17 +155,40 @@ def _cut_footer(
     return fields[:stop], numbers[:stop]
 
 
-def _parse_block(
+def _fit_rows(
     fields: list[list[str]], layout: TableLayout, numbers: IntArray
-) -> list[ColumnValues]:
+) -> list[tuple[str, ...]]:
+    """Return the columns of rows, which all have the width of the header."""
     width = len(layout.columns)
     for place, (row, number) in enumerate(zip(fields, numbers, strict=True)):
         if len(row) != width:
             fields[place] = _pad_row(row, layout, int(number))
-    convert = _parse_decimal_comma if layout.has_decimal_commas else _parse_decimal_point
+    return list(zip(*fields, strict=True))
+
+
+def _find_decimal_sign(texts: Sequence[tuple[str, ...]], layout: TableLayout) -> str:
+    """Find the decimal sign of the first number that has one; empty if all are whole."""
+    numeric = [
+        cells for column, cells in zip(layout.columns, texts, strict=True) if holds_numbers(column)
+    ]
+    if not any(sign in "".join(cells) for cells in numeric for sign in ".,"):
+        return ""
+    signs = (
+        "," if "," in cell else "."
+        for row in zip(*numeric, strict=True)
+        for cell in row
+        if ("," in cell or "." in cell) and classify_cell(cell) == "number"
+    )
+    return next(signs, "")
+
+
+def _parse_block(
+    texts: Sequence[tuple[str, ...]], layout: TableLayout, numbers: IntArray, has_commas: bool
+) -> list[ColumnValues]:
+    convert = _parse_decimal_comma if has_commas else _parse_decimal_point
     return [
-        _parse_column(column, texts, convert, numbers)
-        for column, texts in zip(layout.columns, zip(*fields, strict=True), strict=True)
+        _parse_column(column, cells, convert, numbers)
+        for column, cells in zip(layout.columns, texts, strict=True)
     ]
 
 
@@ -270,8 +295,9 @@ def shorten_text(text: str) -> str:
 
 
 def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], float]) -> str:
-    if convert is _parse_decimal_comma and "." in text and not any(map(str.isalpha, text)):
-        return "; decimal points and commas are mixed: other numbers of the file have commas"
+    if classify_cell(text) == "number" and ("." in text or "," in text):
+        others = "commas" if convert is _parse_decimal_comma else "points"
+        return f"; decimal points and commas are mixed: other numbers of the file have {others}"
     if "," in text and "." in text:
         return "; decimal points and commas are mixed: write numbers without thousands separators"
     if column.role == "time":

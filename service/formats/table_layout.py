@@ -10,7 +10,8 @@ import csv
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, NamedTuple
+from itertools import islice
+from typing import Final, Literal, NamedTuple, TypeVar
 
 from service.core.text import unescape_formula
 from service.formats.cells import begins_like_number, classify_cell, classify_column
@@ -35,15 +36,18 @@ from sysid.data.table_rules import (
 
 SEPARATORS: Final = ("\t", ";", ",", "|", " ")
 COMMENT_SIGNS: Final = ("#", "%", "//")
-PEEK_CELLS = 20_000
+PEEK_ROWS = 200
+"""First rows that are looked at, and twice as many while they hold no data."""
+MAX_PEEK_ROWS = 3200
+PEEK_CELLS = 40_000
 """Most cells of the first rows that are looked at."""
 MAX_FOOTER_ROWS = 20
 """Most rows of words below the data, such as mean values; more are faults."""
 _MAX_UNIT_CHARACTERS = 12
 
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
-_DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
 
+_T = TypeVar("_T")
 ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
 """``date`` completes a time of day; ``nameless`` and ``text`` are left out of the recording."""
 
@@ -67,7 +71,6 @@ class TableLayout:
     columns : tuple of TableColumn
     separator : str
         Of the fields in a line; ``" "`` is any blanks, and empty if the rows are fields already.
-    has_decimal_commas : bool
     header_row : int
         Row of the header in the file, from 1.
     skipped : int
@@ -79,7 +82,6 @@ class TableLayout:
 
     columns: tuple[TableColumn, ...]
     separator: str
-    has_decimal_commas: bool
     header_row: int = 1
     skipped: int = 1
     sample_time: float | None = None
@@ -118,39 +120,67 @@ class _DataBlock(NamedTuple):
 
 
 def detect_layout(
-    lines: Sequence[str],
+    lines: Iterator[str],
     segments: Sequence[str],
     sample_time: float | None,
     max_channels: int = DEFAULT_LIMITS.channels,
-) -> TableLayout:
-    """Detect the layout of a text from its first lines.
+) -> tuple[TableLayout, list[str]]:
+    """Detect the layout of a text, and return the first lines, which were read for it.
 
     Raises
     ------
     InvalidUpload
         If there is no usable header, if it has too many signals, or if the time is missing or given
-        twice.
+        twice. Also if the text is empty.
     """
+    first: list[str] = []
+    for first in _peek(lines):
+        if not any(map(str.strip, first)):
+            continue
+        blocks = list(_find_text_blocks(first, len(segments), max_channels))
+        if any(block.data for block in blocks):
+            break
+    if not first:
+        raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
+    if not any(map(str.strip, first)):
+        raise InvalidUpload("the first rows are empty; need a header such as t,u,y", row=1)
+    block = _choose_block(blocks, first)
+    return _build_layout(block, segments, sample_time, max_channels), first
+
+
+def _find_text_blocks(lines: Sequence[str], labels: int, max_channels: int) -> Iterator[_DataBlock]:
+    """Find the data under each separator."""
     hint = re.match(r'"?sep=(.)"?\s*$', lines[0], re.IGNORECASE)
-    blocks = []
     for separator in (hint[1],) if hint else SEPARATORS:
         if hint or separator == " " or any(separator in line for line in lines):
             rows = _split_lines(lines[1:] if hint else lines, separator, int(bool(hint)))
-            _check_width(rows, len(segments), max_channels)
-            blocks.append(_find_block(rows, separator))
-    return _build_layout(_choose_block(blocks, lines), segments, sample_time, max_channels)
+            _check_width(rows, labels, max_channels)
+            yield _find_block(rows, separator)
 
 
 def detect_sheet_layout(
-    rows: Sequence[list[str]],
+    rows: Iterable[list[str]],
     segments: Sequence[str],
     sample_time: float | None,
     max_channels: int = DEFAULT_LIMITS.channels,
 ) -> TableLayout:
     """Detect the layout of rows that are split already; raises as `detect_layout`."""
-    numbered = [_Row(place, fields) for place, fields in enumerate(rows)]
-    _check_width(numbered, len(segments), max_channels)
-    return _build_layout(_find_block(numbered, ""), segments, sample_time, max_channels)
+    block = _DataBlock("", [], [])
+    for first in _peek(iter(rows)):
+        numbered = [_Row(place, fields) for place, fields in enumerate(first)]
+        _check_width(numbered, len(segments), max_channels)
+        block = _find_block(numbered, "")
+        if block.data:
+            break
+    return _build_layout(block, segments, sample_time, max_channels)
+
+
+def _peek(rows: Iterator[_T]) -> Iterator[list[_T]]:
+    """Yield the first rows, and all of more and more first rows while they are asked for."""
+    first: list[_T] = []
+    while len(first) < MAX_PEEK_ROWS and (more := list(islice(rows, len(first) or PEEK_ROWS))):
+        first += more
+        yield first
 
 
 def split_blanks(lines: Iterable[str]) -> Iterator[str]:
@@ -307,9 +337,8 @@ def _build_layout(
         notes.append(f"the header is in row {row}; the lines before it were skipped")
     if units:
         notes.append(f"row {row + 1} was read as the units of the columns")
-    commas = block.separator != "," and any(_DECIMAL_COMMA.match(c) for r in cells for c in r)
     skipped = block.data[0].place if block.data else header.place + 1
-    return TableLayout(columns, block.separator, commas, row, skipped, sample_time, tuple(notes))
+    return TableLayout(columns, block.separator, row, skipped, sample_time, tuple(notes))
 
 
 def classify_cells(cells: Sequence[str], name: str) -> CellKind:

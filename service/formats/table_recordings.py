@@ -1,13 +1,20 @@
 """Make a recording of the columns of a table: times, segments, channels, and notes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import floor, log10
 
 import numpy as np
 
 from service.formats.cells import begins_like_number, classify_cell
 from service.formats.errors import InvalidUpload
-from service.formats.table_columns import ColumnValues, Table, holds_numbers, shorten_text
+from service.formats.table_columns import (
+    ColumnValues,
+    Table,
+    holds_numbers,
+    parse_texts,
+    shorten_text,
+)
 from service.formats.table_layout import TableColumn, build_nameless_error
 from service.formats.time_columns import (
     join_dates,
@@ -17,7 +24,13 @@ from service.formats.time_columns import (
 )
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
-from sysid.data.table_rules import TimeAxis, counts_rows, read_number_times
+from sysid.data.table_rules import (
+    INDEX_NAMES,
+    NO_NAMES,
+    TimeAxis,
+    counts_rows,
+    read_number_times,
+)
 
 SegmentLabels = Mapping[str, float | str]
 
@@ -65,6 +78,7 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     InvalidUpload
         If the columns cannot be used, with the row and the column.
     """
+    table = _name_signals(table, notes)
     _check_left_out(table, notes)
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
@@ -91,6 +105,22 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
     if empty:
         notes.append(f"columns without any value were left out: {', '.join(empty)}")
     return Recording(tuple(channels), spans, clock.started_at)
+
+
+def _name_signals(table: Table, notes: list[str]) -> Table:
+    """Return the table with an index that does not count rows as a signal, and tell it."""
+    columns, values = list(table.columns), list(table.values)
+    for place, column in enumerate(columns):
+        if column.name.lower() not in INDEX_NAMES or column.name.lower() in NO_NAMES:
+            continue
+        texts = [str(value).removesuffix(".0") for value in values[place].tolist()]
+        if column.role == "nameless" and any(texts) and not counts_rows(texts):
+            columns[place] = replace(column, role="value", kind="number")
+            if values[place].dtype.kind == "U":
+                values[place] = parse_texts(columns[place], texts, table.rows)
+        if columns[place].role == "value":
+            notes.append(f"column {column.name!r} does not count the rows, so it is a signal")
+    return replace(table, columns=tuple(columns), values=tuple(values))
 
 
 def _check_left_out(table: Table, notes: list[str]) -> None:

@@ -17,6 +17,7 @@ from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.table_rules import (
     INDEX_NAMES,
+    NO_NAMES,
     CellKind,
     Heading,
     TimeAxis,
@@ -297,6 +298,8 @@ def _read_mapping(
                 [f"column {str(label) or 'no name'} of {owner} counts rows and was left out"]
             )
             continue
+        if heading.name.lower() in INDEX_NAMES and heading.name.lower() not in NO_NAMES:
+            tell_notes([f"column {heading.name!r} does not count the rows, so it is a signal"])
         unit = heading.unit or _find_unit_attribute(table[label])
         columns.append(Column(str(label), heading.name, unit, axis, table[label]))
     return columns

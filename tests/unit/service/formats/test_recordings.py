@@ -18,6 +18,7 @@ from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
 from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
+from service.formats.table_layout import PEEK_ROWS
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
 from tests.recorded_files import (
@@ -256,7 +257,7 @@ def test_words_of_missing_values_are_missing(word: str) -> None:
     text = ROWS.replace(f",{OUTPUT[7]:.6f}\n", f",{word}\n")
     recording, notes = read_csv(text.encode())
     assert np.flatnonzero(np.isnan(recording.channel("y").values)).tolist() == [7]
-    assert any("1 of 40 values are missing" in note and "row 9" in note for note in notes)
+    assert any(f"1 of {N} values are missing" in note and "row 9" in note for note in notes)
 
 
 def test_true_and_false_are_numbers_and_said() -> None:
@@ -324,17 +325,17 @@ def test_a_text_that_begins_like_another_kind_is_a_text() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 42 to 43 are below the data ('Mean')"),
-        (ROWS + "\n\nEnd of file\n", "row 44 is below the data ('End of file')"),
+        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 242 to 243 are below the data ('Mean')"),
+        (ROWS + "\n\nEnd of file\n", "row 244 is below the data ('End of file')"),
         (
             join_rows("time;u;y", ";", time=stamp("%Y-%m-%d %H:%M:%S.%f")) + "Mittel;0.5;0.3\n",
-            "row 42 is below the data ('Mittel')",
+            "row 242 is below the data ('Mittel')",
         ),
         (
             "u,y,t\n"
             + "".join(f"{u},{y},{t}\n" for u, y, t in zip(INPUT, OUTPUT, TIMES, strict=True))
             + "End\n",
-            "row 42 is below the data ('End')",
+            "row 242 is below the data ('End')",
         ),
     ],
 )
@@ -351,20 +352,20 @@ def test_words_below_the_data_are_found_wherever_blocks_end(
         monkeypatch.setattr(table_columns, "BLOCK_ROWS", rows)
         recording, notes = read_with_notes((ROWS + "Mean,1,2\n" * 3).encode())
         check_experiment(recording)
-        assert notes == ("rows 42 to 44 are below the data ('Mean') and left out",)
+        assert notes == ("rows 242 to 244 are below the data ('Mean') and left out",)
 
 
 @pytest.mark.parametrize(
     "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
 )
 def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
-    with pytest.raises(InvalidUpload, match=r"^row 42"):
+    with pytest.raises(InvalidUpload, match=r"^row 242"):
         read_with_notes((ROWS + end).encode())
 
 
 def test_labels_that_divide_every_row_are_refused() -> None:
     text = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
-    with pytest.raises(InvalidUpload, match="into 40 segments, of which 40 have one sample"):
+    with pytest.raises(InvalidUpload, match=f"into {N} segments, of which {N} have one sample"):
         read_csv(text.encode(), segments=("Zeit",), sample_time=0.1)
 
 
@@ -552,3 +553,54 @@ def test_the_page_lists_every_suffix_that_forms_offer() -> None:
     texts = (".txt", ".tsv", ".dat", ".asc")  # any name of a text
     missing = [s for s in SUFFIXES if s not in texts and names.get(s, f"`{s}`") not in page]
     assert missing == []
+
+
+LATE = PEEK_ROWS + 50  # a row after those that the layout is guessed from
+
+
+def read_rows(rows: list[str], **reading: object) -> tuple[Recording, tuple[str, ...]]:
+    return read_with_notes("\n".join(rows).encode(), **reading)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|", " "])
+@pytest.mark.parametrize("block", [3, 50_000])
+def test_decimal_commas_may_come_late(
+    separator: str, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_columns, "BLOCK_ROWS", block)
+    rows = ["t;u;y", *(f"{k};0;20" for k in range(LATE)), f"{LATE};1;20,5"]
+    recording, notes = read_rows([row.replace(";", separator) for row in rows])
+    assert recording.channel("y").values[-1] == 20.5
+    assert notes[-1] == "decimal commas were read as decimal points"
+
+
+def test_a_late_decimal_comma_is_a_fault_among_points() -> None:
+    rows = ["t;y", "0;1.5", *(f"{k};20" for k in range(1, LATE)), f"{LATE};20,5"]
+    with pytest.raises(InvalidUpload, match=f"row {LATE + 2}.*other numbers of the file have poin"):
+        read_rows(rows)
+
+
+@pytest.mark.parametrize("gap", [50, LATE])
+@pytest.mark.parametrize("name", ["No", "index", "Nr."])
+def test_an_index_with_a_gap_is_a_signal_with_a_note(name: str, gap: int) -> None:
+    rows = [f"{name},t,u", *(f"{k + (k >= gap)},{k},0" for k in range(LATE + 9))]
+    recording, notes = read_rows(rows)
+    assert recording.names == (name, "u")
+    assert recording.channel(name).values[-1] == LATE + 9
+    assert notes == (f"column {name!r} does not count the rows, so it is a signal",)
+
+
+def test_an_index_that_restarts_with_segments_is_a_signal_with_a_note() -> None:
+    rows = ["index,run,t,u", *(f"{k % 300},{k // 300},{k % 300},0" for k in range(600))]
+    recording, notes = read_rows(rows, segments=["run"])
+    assert recording.names == ("index", "u")
+    assert "column 'index' does not count the rows, so it is a signal" in notes
+
+
+def test_a_long_preamble_is_skipped() -> None:
+    rows = [*(f"meta line {k}" for k in range(LATE)), "t,u", *(f"{k},0" for k in range(50))]
+    recording, notes = read_rows(rows)
+    assert recording.samples == 50
+    assert notes == (f"the header is in row {LATE + 1}; the lines before it were skipped",)
+    sheet = write_sheet([["meta", k] for k in range(LATE)] + [["t", "u"], [0, 1], [1, 2]])
+    assert read_with_notes(sheet)[0].samples == 2
