@@ -529,7 +529,8 @@ def _assign_time(
             if column.role in ("value", "nameless")
             else None
             for column in columns
-        ]
+        ],
+        has_period=sample_time is not None,
     )
     if sample_time is not None and not 0 < sample_time < float("inf"):
         raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")

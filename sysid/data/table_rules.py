@@ -50,6 +50,8 @@ _LONG_UNITS: Final = {
 MAX_TIME_UNIT = 86_400.0
 """Longest unit of time in s (a day); a longer one is taken for a mistake."""
 
+_TEMPERATURE_RANK: Final = 5
+
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
 _PARENTHESES = re.compile(r"^(?P<name>.*?)\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
 _SLASH = re.compile(r"^(?P<name>[^/]+?)\s*(?:/|\s+in\s+)\s*\(?(?P<unit>[^()]+?)\)?$", re.DOTALL)
@@ -141,25 +143,29 @@ def counts_rows(texts: Sequence[str]) -> bool:
     )
 
 
-def find_time_column(headings: Sequence[Heading | None]) -> int | None:
+def find_time_column(headings: Sequence[Heading | None], *, has_period: bool = False) -> int | None:
     """Find the column of times: by a usual name, or because it holds time stamps.
 
-    A column that is None has another role.
+    A column that is None has another role. With a sampling period a column ``T`` is no time.
     """
     ranks = [
         (rank, place)
         for place, heading in enumerate(headings)
         if heading is not None and (rank := _rank_time(heading, place)) is not None
     ]
-    return min(ranks)[1] if ranks else None
+    rank, place = min(ranks, default=(_TEMPERATURE_RANK, None))
+    return None if has_period and rank == _TEMPERATURE_RANK else place
 
 
 def _rank_time(heading: Heading, place: int) -> int | None:
     """Rank a column as the one of times, the best first; None if it cannot be."""
     name, kind, is_stamp = heading.name, heading.kind, heading.kind in STAMP_KINDS
     word = find_time_word(name)
+    if is_temperature_name(name):
+        is_time = not is_stamp and find_unit_seconds(heading.unit) is not None
+        return _TEMPERATURE_RANK if is_time else 3 if is_stamp else None
     if word in _TIME_NAMES and not is_nameless(heading):
-        return 0 if name != "T" else 5  # T is often a temperature
+        return 0
     if word is not None and (is_stamp or word not in _DATE_WORDS):
         return 1 if kind == "stamp" else 2
     if is_stamp:
@@ -169,9 +175,14 @@ def _rank_time(heading: Heading, place: int) -> int | None:
     return 6 if is_index else None
 
 
+def is_temperature_name(name: str) -> bool:
+    """Whether a column is called ``T``, which is often a temperature and seldom the time."""
+    return name == "T"
+
+
 def is_plain_time_name(name: str) -> bool:
     """Whether a column is called ``t`` or ``time``, so that its unit is s unless it has one."""
-    return find_time_word(name) in _TIME_NAMES
+    return find_time_word(name) in _TIME_NAMES and not is_temperature_name(name)
 
 
 def is_time_name(name: str) -> bool:

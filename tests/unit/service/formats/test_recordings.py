@@ -555,6 +555,18 @@ def test_the_page_lists_every_suffix_that_forms_offer() -> None:
     assert missing == []
 
 
+def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_period() -> None:
+    rows = ["T,u", "20,0", "21,1", "22,1"]
+    assert read_rows(rows)[1] == ("column 'T' was read as the time in s",)
+    recording, notes = read_rows(rows, sample_time=0.5)
+    assert recording.names == ("T", "u")
+    assert recording.channel("T").times.tolist() == [0.0, 0.5, 1.0]
+    assert notes == ()
+    with pytest.raises(InvalidUpload, match=r"there is no time column; found T, u\."):
+        read_rows(["T [°C],u", *rows[1:]])
+    assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
+
+
 LATE = PEEK_ROWS + 50  # a row after those that the layout is guessed from
 
 
