@@ -4,7 +4,7 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -201,15 +201,18 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     except pl.exceptions.PolarsError as error:
         raise _build_damage_error("Parquet", error) from None
     columns: dict[str, ColumnValues] = {}
-    is_utc = False
+    in_utc, spans = set(), set()
     for series in frame:
         values = _convert_series(series)
         if values is None:
             notes.append(f"column {series.name!r} holds {series.dtype} and was left out")
             continue
         columns[series.name] = values
-        is_utc |= isinstance(series.dtype, pl.Datetime) and series.dtype.time_zone is not None
-    return build_column_table(columns, options, is_utc=is_utc)
+        if isinstance(series.dtype, pl.Datetime) and series.dtype.time_zone is not None:
+            in_utc.add(series.name)
+        if series.dtype == pl.Duration:
+            spans.add(series.name)
+    return build_column_table(columns, options, in_utc=in_utc, spans=spans)
 
 
 def _convert_series(series: "pl.Series") -> ColumnValues | None:
@@ -233,9 +236,20 @@ def _convert_series(series: "pl.Series") -> ColumnValues | None:
 
 
 def build_column_table(
-    columns: Mapping[str, ColumnValues], options: ReadOptions, *, is_utc: bool = False
+    columns: Mapping[str, ColumnValues],
+    options: ReadOptions,
+    *,
+    in_utc: Collection[str] = (),
+    spans: Collection[str] = (),
 ) -> Table:
     """Build the table of columns of equal length by their names.
+
+    Parameters
+    ----------
+    in_utc : collection of str
+        Columns of time stamps in UTC; others are local.
+    spans : collection of str
+        Columns of time spans, which are in s whatever their heading says.
 
     Raises
     ------
@@ -245,8 +259,10 @@ def build_column_table(
     if not columns or not len(next(iter(columns.values()))):
         raise InvalidUpload("the file holds no samples")
     headings = [
-        Heading(name, unit, _classify_values(values, name))
-        for (name, unit), values in zip(read_headings(list(columns)), columns.values(), strict=True)
+        Heading(name, "s" if label in spans else unit, _classify_values(values, name))
+        for (name, unit), (label, values) in zip(
+            read_headings(list(columns)), columns.items(), strict=True
+        )
     ]
     roles = assign_roles(
         headings, options.segments, options.sample_time, options.limits.channels, None
@@ -255,6 +271,9 @@ def build_column_table(
     values = tuple(
         _convert_values(role, column, rows)
         for role, column in zip(roles, columns.values(), strict=True)
+    )
+    is_utc = any(
+        role.role == "time" and label in in_utc for role, label in zip(roles, columns, strict=True)
     )
     return Table(roles, values, rows, options.sample_time, is_utc)
 

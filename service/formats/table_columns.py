@@ -42,7 +42,7 @@ class Table:
     sample_time : float or None
         Sampling period in s, if it was given.
     is_utc : bool
-        Whether time stamps are in UTC; else they are local.
+        Whether the time stamps of the times are in UTC; else they are local.
     """
 
     columns: tuple[TableColumn, ...]

@@ -567,6 +567,23 @@ def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_perio
     assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
 
 
+def test_a_zone_belongs_to_its_column() -> None:
+    local = [START + timedelta(seconds=k) for k in range(9)]
+    utc = [moment.replace(tzinfo=UTC) for moment in local]
+    for time, logged in ((local, utc), (utc, local)):
+        recording, notes = read_with_notes(write_parquet(time=time, logged=logged, u=[1.0] * 9))
+        assert recording.started_at == time[0]
+        zone = "UTC" if time is utc else "local"
+        assert any(f"column 'time' read as {zone} time stamps" in note for note in notes)
+
+
+@pytest.mark.parametrize("name", ["t [ms]", "time_ms", "t [min]", "elapsed"])
+def test_a_time_span_is_in_seconds_whatever_its_heading_says(name: str) -> None:
+    spans = [timedelta(seconds=k) for k in range(9)]
+    recording, _ = read_with_notes(write_parquet(**{name: spans, "u": [1.0] * 9}))
+    assert recording.channel("u").times.tolist() == list(range(9))
+
+
 LATE = PEEK_ROWS + 50  # a row after those that the layout is guessed from
 
 
