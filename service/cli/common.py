@@ -440,11 +440,6 @@ def format_decimals(value: float | None) -> str | None:
 
 INVALID_STATUS = 422
 UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
-READ_OPTIONS = (
-    (re.compile(r"\bsample_time\b"), "--sample-time"),
-    (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
-)
-"""Words of the reader of files, which are options here."""
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
@@ -453,13 +448,6 @@ SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
-
-
-def name_read_options(text: str) -> str:
-    """Name the options of reading a file as the user types them here."""
-    for pattern, option in READ_OPTIONS:
-        text = pattern.sub(option, text)
-    return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -474,13 +462,10 @@ class FieldOrigins:
         the pointer, which is a place in a file.
     rest : str
         The same for all other fields; in ``--set {}`` the braces stand for the whole path.
-    rewrite : callable
-        Changes the text of a fault, such as names of options in it.
     """
 
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
-    rewrite: Callable[[str], str] = str
 
     def locate(self, pointer: str) -> str:
         """Return the option or file where the field of a pointer was typed."""
@@ -513,7 +498,9 @@ class FieldOrigins:
         detail = fault.detail
         if not self.rest.endswith("…"):
             detail = POINTER_PATTERN.sub(lambda match: self.locate(match[0]), detail)
-        detail = self.rewrite(detail)
+        if fault.option is not None:  # the detail ends with advice that names it
+            before, _, after = detail.rpartition(fault.option)
+            detail = before + UPLOAD_OPTIONS.get(f"?{fault.option}", fault.option) + after
         return f"{origin}{column}: {detail}" if origin else detail
 
 
@@ -524,7 +511,7 @@ def file_origins(path: Path, options: Mapping[str, str] | None = None) -> FieldO
 
 def upload_origins(path: Path) -> FieldOrigins:
     """Return the origins of an upload: options, and the file for all faults in it."""
-    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path), rewrite=name_read_options)
+    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path))
 
 
 @contextmanager
@@ -541,7 +528,10 @@ def report_faults(origins: FieldOrigins) -> Iterator[None]:
         fail(
             origins.describe_faults(
                 FieldError(
-                    str(entry.get("pointer") or ""), str(entry.get("detail")), entry.get("column")
+                    str(entry.get("pointer") or ""),
+                    str(entry.get("detail")),
+                    entry.get("column"),
+                    entry.get("option"),
                 )
                 for entry in entries
             )

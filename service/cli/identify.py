@@ -30,7 +30,6 @@ from service.cli.common import (
     fail_usage,
     format_estimate,
     name_file,
-    name_read_options,
     out,
     parse_channels,
     print_json,
@@ -39,6 +38,7 @@ from service.cli.common import (
     read_file,
     split_names,
     split_setting_path,
+    upload_origins,
     write_file,
 )
 from sysid.core.errors import suggest_name
@@ -300,7 +300,7 @@ def read_recording(path: Path, reading: FileOptions) -> "Recording":
             limits=DEFAULT_LIMITS,
         )
     except InvalidUpload as error:
-        fail(f"{name_file(path)}: {name_read_options(error.detail)}")
+        fail(upload_origins(path).describe_faults(error.errors))
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

@@ -41,11 +41,14 @@ class FieldError:
         What was wrong, which value was received, what would be right.
     column : int or None
         Column (from 1) inside the text of the field, for equations.
+    option : str or None
+        Option of the request that the detail advises at its end, such as ``sample_time``.
     """
 
     pointer: str
     detail: str
     column: int | None = None
+    option: str | None = None
 
     def __str__(self) -> str:
         return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
@@ -53,7 +56,8 @@ class FieldError:
     def to_dict(self) -> dict[str, Any]:
         """Return the fault as an entry of a problem document's ``errors``."""
         entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
-        return entry if self.column is None else {**entry, "column": self.column}
+        others = {"column": self.column, "option": self.option}
+        return entry | {name: value for name, value in others.items() if value is not None}
 
 
 class ServiceError(Exception):

@@ -5,8 +5,24 @@
         - InvalidUpload      a file that cannot be used, with row and column, or byte
 """
 
+from typing import NamedTuple
+
 from service.core.errors import FieldError, InvalidRequest
 from sysid.core.errors import join_pointer
+
+
+class Advice(NamedTuple):
+    """What to do: the text, the option of the reader that helps, the text after it."""
+
+    before: str
+    option: str = ""
+    after: str = ""
+
+    def __str__(self) -> str:
+        return "".join(self)
+
+
+GIVE_PERIOD = Advice("give the sampling period with ", "sample_time", ".")
 
 
 class InvalidUpload(InvalidRequest, ValueError):
@@ -22,6 +38,8 @@ class InvalidUpload(InvalidRequest, ValueError):
         Name of the column of a CSV file.
     byte : int or None
         Position in an MCAP file, from 0.
+    advice : Advice or None
+        End of the detail: what to do by an option, which each border names in its own way.
     """
 
     kind, title = "invalid-upload", "The file cannot be used"
@@ -29,16 +47,25 @@ class InvalidUpload(InvalidRequest, ValueError):
     def __init__(
         self,
         what: str,
+        advice: Advice | None = None,
         *,
         row: int | None = None,
         column: str | None = None,
         byte: int | None = None,
     ) -> None:
-        detail = _format_place(row, column, byte) + what
-        super().__init__((FieldError(_build_pointer(row, column, byte), detail),))
+        detail = _format_place(row, column, byte) + what + str(advice or "")
+        option = None if advice is None else advice.option or None
+        super().__init__((FieldError(_build_pointer(row, column, byte), detail, option=option),))
         self.detail = detail
         self.args = (detail,)
-        self.what, self.row, self.column, self.byte = what, row, column, byte
+        self.what, self.advice = what, advice
+        self.row, self.column, self.byte = row, column, byte
+
+
+def build_period_error(period: object) -> InvalidUpload:
+    """Return the error of a sampling period that is none."""
+    text = f" is {period!r}; need a positive number of seconds"
+    return InvalidUpload("", Advice("", "sample_time", text))
 
 
 def _format_place(row: int | None, column: str | None, byte: int | None) -> str:

@@ -6,7 +6,7 @@ from numbers import Real
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
-from service.formats.errors import InvalidUpload
+from service.formats.errors import InvalidUpload, build_period_error
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from sysid.data.records import Recording
@@ -79,7 +79,7 @@ def read_with_notes(
     if not isinstance(source, str | os.PathLike):
         raise InvalidUpload(f"found {source!r}; need the path of a file, or its content as bytes")
     if sample_time is not None and not isinstance(sample_time, Real):
-        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
+        raise build_period_error(sample_time)
     if isinstance(segments, str):
         raise InvalidUpload(f"segments is {segments!r}; need a list of columns: [{segments!r}]")
     path, limits = Path(source), DEFAULT_LIMITS if limits is None else limits

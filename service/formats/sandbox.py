@@ -16,7 +16,7 @@ from typing import Any
 
 from service.core import temporary_files
 from service.core.errors import Unavailable
-from service.formats.errors import InvalidUpload
+from service.formats.errors import Advice, InvalidUpload
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
@@ -110,7 +110,7 @@ def _parse_answer(
     try:
         answer = json.loads(child.stdout)
         if "error" in answer:
-            raise InvalidUpload(**answer["error"])
+            raise _build_error(**answer["error"])
         if answer.get("is_disk_full"):
             raise Unavailable(temporary_files.FULL_DISK_MESSAGE)
         return tuple(answer["notes"])
@@ -124,6 +124,10 @@ def _parse_answer(
         raise InvalidUpload(
             f"the file crashes its reader (exit code {child.returncode}: {reason[:200]})"
         ) from None
+
+
+def _build_error(what: str, advice: Sequence[str] | None = None, **place: Any) -> InvalidUpload:
+    return InvalidUpload(what, None if advice is None else Advice(*advice), **place)
 
 
 def _build_timeout_error(limits: UploadLimits) -> InvalidUpload:

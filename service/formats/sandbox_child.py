@@ -108,7 +108,8 @@ def _check_finite_values(recording: Recording) -> list[str]:
 
 
 def _describe_invalid_upload(error: InvalidUpload) -> dict[str, Any]:
-    return {"what": error.what, "row": error.row, "column": error.column, "byte": error.byte}
+    place = {"row": error.row, "column": error.column, "byte": error.byte}
+    return {"what": error.what, "advice": error.advice, **place}
 
 
 def _describe_memory_limit(limits: UploadLimits) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.core.text import unescape_formula
 from service.formats.cells import FLAGS, MISSING, classify_cell
-from service.formats.errors import InvalidUpload
+from service.formats.errors import Advice, InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.table_layout import (
     MAX_FOOTER_ROWS,
@@ -251,8 +251,8 @@ def _parse_field(
         value = nan if word in MISSING else FLAGS[word] if word in FLAGS else convert(text)
     except ValueError:
         raise InvalidUpload(
-            f"found {shorten_text(text)}, which is not a number"
-            f"{_suggest_cause(text, column, convert)}",
+            f"found {shorten_text(text)}, which is not a number; ",
+            _suggest_cause(text, column, convert),
             row=row,
             column=column.name,
         ) from None
@@ -294,15 +294,19 @@ def shorten_text(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], float]) -> str:
+def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], float]) -> Advice:
     if classify_cell(text) == "number" and ("." in text or "," in text):
         others = "commas" if convert is _parse_decimal_comma else "points"
-        return f"; decimal points and commas are mixed: other numbers of the file have {others}"
+        return Advice(
+            f"decimal points and commas are mixed: other numbers of the file have {others}"
+        )
     if "," in text and "." in text:
-        return "; decimal points and commas are mixed: write numbers without thousands separators"
+        return Advice(
+            "decimal points and commas are mixed: write numbers without thousands separators"
+        )
     if column.role == "time":
-        return "; times are in seconds, or are date stamps in all rows"
-    return (
-        "; leave the field empty if the value is missing; if the column is a label, name it in "
-        "segments"
+        return Advice("times are in seconds, or are date stamps in all rows")
+    return Advice(
+        "leave the field empty if the value is missing; if the column is a label, name it in ",
+        "segments",
     )

@@ -15,7 +15,7 @@ from typing import Final, Literal, NamedTuple, TypeVar
 
 from service.core.text import unescape_formula
 from service.formats.cells import begins_like_number, classify_cell, classify_column
-from service.formats.errors import InvalidUpload
+from service.formats.errors import GIVE_PERIOD, Advice, InvalidUpload, build_period_error
 from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import suggest_name
 from sysid.data.table_rules import (
@@ -533,13 +533,13 @@ def _assign_time(
         has_period=sample_time is not None,
     )
     if sample_time is not None and not 0 < sample_time < float("inf"):
-        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
+        raise build_period_error(sample_time)
     if time is None:
         if sample_time is None:
             names = ", ".join(column.name for column in columns if column.name)
             raise InvalidUpload(
-                f"there is no time column; found {names}. Name one of them t (in seconds), or give "
-                "the sampling period with sample_time.",
+                f"there is no time column; found {names}. Name one of them t (in seconds), or ",
+                GIVE_PERIOD,
                 row=row,
             )
         return list(columns)
@@ -547,7 +547,8 @@ def _assign_time(
     name, unit = column.name, find_time_unit(column.name, column.unit)
     if sample_time is not None and column.kind not in STAMP_KINDS:
         raise InvalidUpload(
-            "the file has this time column, and sample_time is given too; remove one of them",
+            "the file has this time column. Remove it, or ",
+            Advice("leave out ", "sample_time"),
             row=row,
             column=name,
         )

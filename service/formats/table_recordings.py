@@ -7,7 +7,7 @@ from math import floor, log10
 import numpy as np
 
 from service.formats.cells import begins_like_number, classify_cell
-from service.formats.errors import InvalidUpload
+from service.formats.errors import GIVE_PERIOD, Advice, InvalidUpload
 from service.formats.table_columns import (
     ColumnValues,
     Table,
@@ -224,8 +224,8 @@ def _build_segments(
     if starts.size > 1 and 2 * singles > starts.size:
         raise InvalidUpload(
             f"the labels {', '.join(labels)} divide {times.size} rows into {starts.size} segments, "
-            f"of which {singles} have one sample. A label stays the same during a measurement; "
-            "leave columns of times and signals out of segments."
+            f"of which {singles} have one sample. A label stays the same during a measurement; ",
+            Advice("leave columns of times and signals out of ", "segments", "."),
         )
     values = {label: _parse_labels(table.find_values(label)) for label in labels}
     segment_labels: list[SegmentLabels] = [
@@ -264,14 +264,16 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     wrong = np.flatnonzero(stays)
     if wrong.size == 0:
         return
-    advice = "For repeated measurements, name their label columns with segments."
+    hint = "For repeated measurements, "
+    advice = Advice("name their label columns with ", "segments", ".")
     if is_stamp:
-        advice = "If the stamps are too coarse, give the sampling period with sample_time."
+        hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
     raise InvalidUpload(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
-        f"row to row. {advice}",
+        f"row to row. {hint}",
+        advice,
         row=int(table.rows[wrong[0] + 1]),
         column=time.name,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.formats.cells import CLOCK_TIME, DATE_ONLY, MISSING, STAMP
-from service.formats.errors import InvalidUpload
+from service.formats.errors import GIVE_PERIOD, InvalidUpload
 from service.formats.table_columns import (
     ColumnValues,
     build_missing_time_error,
@@ -175,8 +175,8 @@ def _build_stamp_error(
     if text.lower() in MISSING:
         return build_missing_time_error(text, row, name)
     return InvalidUpload(
-        f"found {shorten_text(text)}; need {wanted}. Write all time stamps in one form, or give "
-        "the sampling period with sample_time.",
+        f"found {shorten_text(text)}; need {wanted}. Write all time stamps in one form, or ",
+        GIVE_PERIOD,
         row=row,
         column=name,
     )

@@ -227,7 +227,7 @@ def test_a_row_without_end_is_refused_before_it_fills_the_memory() -> None:
 
 
 def test_time_told_twice_or_wrongly_is_refused() -> None:
-    assert "remove one of them" in refused("t,u\n0,1\n", sample_time=0.1).detail
+    assert "Remove it, or leave out sample_time" in refused("t,u\n0,1\n", sample_time=0.1).detail
     assert "positive" in refused("u,y\n0,1\n", sample_time=0.0).detail
 
 
