@@ -41,7 +41,8 @@ from service.cli.common import (
     upload_origins,
     write_file,
 )
-from sysid.core.errors import suggest_name
+from service.core.errors import to_field_errors
+from sysid.core.errors import UnreadableFile, suggest_name
 from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
@@ -286,7 +287,6 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
 
 def read_recording(path: Path, reading: FileOptions) -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.errors import InvalidUpload
     from service.formats.limits import DEFAULT_LIMITS
     from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
@@ -299,8 +299,8 @@ def read_recording(path: Path, reading: FileOptions) -> "Recording":
             segments=reading.segments,
             limits=DEFAULT_LIMITS,
         )
-    except InvalidUpload as error:
-        fail(upload_origins(path).describe_faults(error.errors))
+    except UnreadableFile as error:
+        fail(upload_origins(path).describe_faults(to_field_errors(error)))
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

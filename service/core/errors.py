@@ -11,6 +11,7 @@
     - UnsatisfiableRange     416  a byte range outside the content
     - MisdirectedRequest     421  the Host header names another server
     - InvalidRequest         422  the body or a query value is invalid; lists every fault
+        - InvalidUpload           an uploaded file cannot be used
     - QuotaExceeded          429  the project has reached its limit of unfinished work
     - Unavailable            503  a component of the service is down
         - ServiceBusy             too many heavy requests
@@ -25,7 +26,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
+from sysid.core.errors import (
+    InvalidBounds,
+    InvalidModel,
+    InvalidSettings,
+    SysidError,
+    UnknownModel,
+    UnreadableFile,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +174,16 @@ class InvalidRequest(ServiceError):
         return cls((FieldError(pointer, detail),))
 
 
+class InvalidUpload(InvalidRequest):
+    """An uploaded file cannot be used."""
+
+    kind, title = "invalid-upload", "The file cannot be used"
+
+    def __init__(self, error: UnreadableFile) -> None:
+        super().__init__(to_field_errors(error))
+        self.detail = error.detail
+
+
 class QuotaExceeded(ServiceError):
     """The project has reached its limit of queued and running work."""
 
@@ -222,6 +240,9 @@ def to_field_errors(error: SysidError) -> list[FieldError]:
             return [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
         case InvalidSettings():
             return [FieldError(error.pointer, error.detail)]
+        case UnreadableFile():
+            option = error.advice and error.advice.option
+            return [FieldError(error.pointer, error.detail, option=option or None)]
         case InvalidBounds():
             return [FieldError(f"/parameters/{error.name}", str(error))]
         case UnknownModel():

@@ -50,11 +50,12 @@ class Page(Answer, Generic[Item]):
 
 
 class FaultOut(Answer):
-    """One fault of a request."""
+    """One fault of a request; the detail ends with advice about `option`, such as `segments`."""
 
     pointer: str
     detail: str
     column: int | None = None
+    option: str | None = None
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]

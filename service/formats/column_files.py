@@ -12,7 +12,6 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import ReadOptions
 from service.formats.table_columns import (
     ColumnValues,
@@ -28,6 +27,7 @@ from service.formats.table_layout import (
     classify_cells,
     read_headings,
 )
+from sysid.core.errors import UnreadableFile
 from sysid.core.types import IntArray
 from sysid.data.table_rules import CellKind, Heading, is_time_name
 
@@ -50,7 +50,7 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     except _DAMAGES as error:
         raise _build_damage_error("NumPy", error) from None
     if "" in arrays:
-        raise InvalidUpload(
+        raise UnreadableFile(
             "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y)"
         )
     return _build_array_table(arrays, options, notes)
@@ -83,7 +83,7 @@ def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     for name, value in arrays.items():
         if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction):
             what = "an object" if name == "None" else f"the object {name!r}"
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the MATLAB file holds {what}, such as iddata or timetable, which only MATLAB "
                 "can read. Save its arrays: y = z.y; u = z.u; Ts = z.Ts; save('file.mat', 'y', "
                 "'u', 'Ts', '-v7')"
@@ -101,7 +101,7 @@ def _open_structure(arrays: Mapping[str, Any], notes: list[str]) -> dict[str, An
         return plain
     if len(structures) != 1:
         names = ", ".join(arrays) or "nothing"
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the file holds {names}; need arrays such as t, u and y, or one structure with them"
         )
     ((name, fields),) = structures.items()
@@ -161,7 +161,7 @@ def _is_signal(array: NDArray[Any]) -> bool:
 def _find_length(signals: Mapping[str, NDArray[Any]]) -> int:
     """Find the number of samples: that of the times, or the most common one."""
     if not signals:
-        raise InvalidUpload("the file holds no arrays of samples; need t, u and y, for example")
+        raise UnreadableFile("the file holds no arrays of samples; need t, u and y, for example")
     for name, array in signals.items():
         if is_time_name(name):
             return int(max(array.shape))
@@ -193,7 +193,7 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
         rows = int(scan.select(pl.len()).collect().item())
         limits = options.limits
         if len(names) > limits.channels + len(options.segments) + 1 or rows > limits.messages:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the file has {len(names)} columns and {rows} rows; at most {limits.channels} "
                 f"signals and {limits.messages} rows are read"
             )
@@ -253,11 +253,11 @@ def build_column_table(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If there is no signal or no time, or a text is no number.
     """
     if not columns or not len(next(iter(columns.values()))):
-        raise InvalidUpload("the file holds no samples")
+        raise UnreadableFile("the file holds no samples")
     headings = [
         Heading(name, "s" if label in spans else unit, _classify_values(values, name))
         for (name, unit), (label, values) in zip(
@@ -305,7 +305,7 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
         raise build_missing_time_error(text, int(rows[wrong[0]]), column.name)
     infinite = np.flatnonzero(np.isinf(numbers))
     if column.role == "value" and infinite.size:
-        raise InvalidUpload(
+        raise UnreadableFile(
             "the value is infinite; values must be finite (NaN is a missing value)",
             row=int(rows[infinite[0]]),
             column=column.name,
@@ -313,8 +313,8 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
     return numbers
 
 
-def _build_damage_error(kind: str, error: Exception) -> InvalidUpload:
+def _build_damage_error(kind: str, error: Exception) -> UnreadableFile:
     reason = " ".join(str(error).split())
     if reason.startswith("Object arrays"):
         reason = "an array holds Python objects; write arrays of numbers"
-    return InvalidUpload(f"the {kind} file cannot be read: {reason[:120]}")
+    return UnreadableFile(f"the {kind} file cannot be read: {reason[:120]}")

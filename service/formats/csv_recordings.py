@@ -57,7 +57,7 @@ def read_csv(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file cannot be used. The error has the row of the file, from 1, and the column.
     """
     notes: list[str] = []

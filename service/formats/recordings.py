@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Sequence
-from numbers import Real
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
-from service.formats.errors import InvalidUpload, build_period_error
+import numpy as np
+
+from service.formats.advice import build_period_error
 from service.formats.file_kinds import detect_kind
-from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
 
@@ -18,7 +20,6 @@ def read_recording(
     *,
     sample_time: float | None = None,
     segments: Sequence[str] = (),
-    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -33,12 +34,11 @@ def read_recording(
         Sampling period in s, for a file without a time column.
     segments : sequence of str
         Columns of labels that divide the rows into segments, each measured on its own.
-    limits : UploadLimits
 
     Raises
     ------
-    InvalidUpload
-        If the file cannot be used; in one line, with the row and the column.
+    UnreadableFile
+        If the file cannot be used; in one line, with the name, the row and the column.
     FileNotFoundError
         If there is no such file.
 
@@ -51,9 +51,7 @@ def read_recording(
     >>> recording.names, recording.channel("flow").unit, recording.duration
     (('valve', 'flow'), 'l/min', 0.2)
     """
-    recording, notes = read_with_notes(
-        source, sample_time=sample_time, segments=segments, limits=limits
-    )
+    recording, notes = read_with_notes(source, sample_time=sample_time, segments=segments)
     tell_notes(notes)
     return recording
 
@@ -63,30 +61,37 @@ def read_with_notes(
     *,
     sample_time: float | None = None,
     segments: Sequence[str] = (),
-    limits: UploadLimits | None = None,
+    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
 
     Plain text is read by this process, every other file by a child with limits.
     """
+    if sample_time is not None and not isinstance(sample_time, int | float | np.number):
+        raise build_period_error(sample_time)
+    if isinstance(segments, str):
+        raise UnreadableFile(f"segments is {segments!r}; need a list of columns: [{segments!r}]")
+    options = ReadOptions(sample_time, tuple(segments), limits)
     if isinstance(source, bytes):
         with NamedTemporaryFile(prefix="lagid-") as file:
             file.write(source)
             file.flush()
-            return read_with_notes(
-                file.name, sample_time=sample_time, segments=segments, limits=limits
-            )
+            return _read_file(Path(file.name), options)
     if not isinstance(source, str | os.PathLike):
-        raise InvalidUpload(f"found {source!r}; need the path of a file, or its content as bytes")
-    if sample_time is not None and not isinstance(sample_time, Real):
-        raise build_period_error(sample_time)
-    if isinstance(segments, str):
-        raise InvalidUpload(f"segments is {segments!r}; need a list of columns: [{segments!r}]")
-    path, limits = Path(source), DEFAULT_LIMITS if limits is None else limits
+        raise UnreadableFile(f"found {source!r}; need the path of a file, or its content as bytes")
+    try:
+        return _read_file(Path(source), options)
+    except UnreadableFile as error:
+        error.name = str(source)
+        raise
+
+
+def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
     if path.is_dir():
-        raise InvalidUpload(f"{path} is a folder; need a file")
+        raise UnreadableFile("it is a folder; need a file")
     from service.formats.csv_recordings import is_plain_text, read_csv
 
+    sample_time, segments, limits = options.sample_time, options.segments, options.limits
     if detect_kind(path, path.suffix) == "csv" and is_plain_text(
         path, sample_time, segments, limits
     ):

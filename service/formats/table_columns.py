@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from service.core.text import unescape_formula
 from service.formats.cells import FLAGS, MISSING, classify_cell
-from service.formats.errors import Advice, InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.table_layout import (
     MAX_FOOTER_ROWS,
@@ -21,6 +20,7 @@ from service.formats.table_layout import (
     is_comment,
     split_blanks,
 )
+from sysid.core.errors import Advice, UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 
 BLOCK_ROWS = 50_000
@@ -68,7 +68,7 @@ def read_lines(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a row is ragged, a number is a text or infinite, or a time is missing; with row and
         column. Also if there are no rows, or more than `max_rows`.
     """
@@ -80,7 +80,7 @@ def read_lines(
         return read_rows(reader, layout, notes, max_rows)
     except csv.Error as error:
         row = layout.skipped + reader.line_num
-        raise InvalidUpload(f"this row cannot be read ({error})", row=row) from None
+        raise UnreadableFile(f"this row cannot be read ({error})", row=row) from None
 
 
 def read_rows(
@@ -95,13 +95,13 @@ def read_rows(
     for fields, numbers, skipped in _iterate_blocks(rows, layout, notes):
         comments += skipped
         if numbers.size and numbers[-1] > max_rows + layout.skipped:
-            raise InvalidUpload(f"the file has more than {max_rows} rows")
+            raise UnreadableFile(f"the file has more than {max_rows} rows")
         if fields:
             fit = _fit_rows(fields, layout, numbers)
             sign = sign or _find_decimal_sign(fit, layout)
             blocks.append((_parse_block(fit, layout, numbers, sign == ","), numbers))
     if not blocks:
-        raise InvalidUpload("there are no rows below the header")
+        raise UnreadableFile("there are no rows below the header")
     if comments:
         notes.append(f"comments in {comments} of the rows were skipped")
     if sign == ",":
@@ -202,7 +202,7 @@ def _pad_row(row: list[str], layout: TableLayout, number: int) -> list[str]:
     hint = ""
     if layout.separator == "," and len(row) > width:
         hint = "; if commas are decimal signs, separate the columns by semicolons"
-    raise InvalidUpload(
+    raise UnreadableFile(
         f"this row has {len(row)} fields, but the header has {width}{hint}", row=number
     )
 
@@ -250,14 +250,14 @@ def _parse_field(
     try:
         value = nan if word in MISSING else FLAGS[word] if word in FLAGS else convert(text)
     except ValueError:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"found {shorten_text(text)}, which is not a number; ",
             _suggest_cause(text, column, convert),
             row=row,
             column=column.name,
         ) from None
     if isinf(value):
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"found {shorten_text(text)}; values must be finite "
             "(an empty field is a missing value)",
             row=row,
@@ -268,9 +268,9 @@ def _parse_field(
     return value
 
 
-def build_missing_time_error(text: str, row: int, column: str) -> InvalidUpload:
+def build_missing_time_error(text: str, row: int, column: str) -> UnreadableFile:
     """Return the error of a row without its time."""
-    return InvalidUpload(
+    return UnreadableFile(
         f"the time is missing (found {shorten_text(text)}); every row needs a time",
         row=row,
         column=column,

@@ -14,10 +14,10 @@ from itertools import islice
 from typing import Final, Literal, NamedTuple, TypeVar
 
 from service.core.text import unescape_formula
+from service.formats.advice import GIVE_PERIOD, build_period_error
 from service.formats.cells import begins_like_number, classify_cell, classify_column
-from service.formats.errors import GIVE_PERIOD, Advice, InvalidUpload, build_period_error
 from service.formats.limits import DEFAULT_LIMITS
-from sysid.core.errors import suggest_name
+from sysid.core.errors import Advice, UnreadableFile, suggest_name
 from sysid.data.table_rules import (
     INDEX_NAMES,
     STAMP_KINDS,
@@ -129,7 +129,7 @@ def detect_layout(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If there is no usable header, if it has too many signals, or if the time is missing or given
         twice. Also if the text is empty.
     """
@@ -141,9 +141,9 @@ def detect_layout(
         if any(block.data for block in blocks):
             break
     if not first:
-        raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
+        raise UnreadableFile("the file is empty; need a header and rows, such as t,u,y")
     if not any(map(str.strip, first)):
-        raise InvalidUpload("the first rows are empty; need a header such as t,u,y", row=1)
+        raise UnreadableFile("the first rows are empty; need a header such as t,u,y", row=1)
     block = _choose_block(blocks, first)
     return _build_layout(block, segments, sample_time, max_channels), first
 
@@ -203,7 +203,7 @@ def _split_lines(lines: Sequence[str], separator: str, first: int) -> list[_Row]
             if cells > PEEK_CELLS:
                 break
     except csv.Error as error:
-        raise InvalidUpload(f"the first rows cannot be read ({error})") from None
+        raise UnreadableFile(f"the first rows cannot be read ({error})") from None
     return rows
 
 
@@ -221,7 +221,7 @@ def _join_units(fields: list[str]) -> list[str]:
 def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
     """Refuse a table that is too wide before its cells are looked at."""
     if rows and len(rows[0].fields) - labels - 1 > max_channels:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the header has {len(rows[0].fields)} columns; at most {max_channels} signals are "
             "read",
             row=rows[0].place + 1,
@@ -366,21 +366,21 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
         if len(names) == block.width and not all(map(_is_number, names)):
             return row, [], names
     if not block.data:
-        raise InvalidUpload("there are no rows below the header")
+        raise UnreadableFile("there are no rows below the header")
     first = block.data[0]
     if block.width == 1:
         raise _build_narrow_error(first.fields[0])
     raise _build_header_error(first.place + 1)
 
 
-def _build_header_error(row: int | None) -> InvalidUpload:
-    return InvalidUpload(
+def _build_header_error(row: int | None) -> UnreadableFile:
+    return UnreadableFile(
         "the first row holds numbers; need a header that names the columns, such as t,u,y", row=row
     )
 
 
-def _build_narrow_error(name: str) -> InvalidUpload:
-    return InvalidUpload(
+def _build_narrow_error(name: str) -> UnreadableFile:
+    return UnreadableFile(
         f"there is only one column ({name.strip()!r}); need a time column and a signal, separated "
         "by comma, semicolon, tab or blanks"
     )
@@ -464,7 +464,7 @@ def assign_roles(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a name is missing or occurs twice, a label column is missing, or there is no signal or no
         time. Also if the time is given twice.
     """
@@ -480,7 +480,7 @@ def assign_roles(
     names = [column.name for column in columns]
     for label in segments:
         if label not in names:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"there is no label column {label!r}{suggest_name(label, names)}", row=row
             )
     columns = _assign_time(columns, sample_time, row)
@@ -493,18 +493,18 @@ def assign_roles(
             raise build_nameless_error(number, row)
     signals = sum(column.role == "value" for column in columns)
     if signals == 0 and not any(column.role == "text" for column in columns):
-        raise InvalidUpload("there is no signal: every column is time or a label")
+        raise UnreadableFile("there is no signal: every column is time or a label")
     if signals > max_channels:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the header has {len(headings)} columns; at most {max_channels} signals are read",
             row=row,
         )
     return tuple(columns)
 
 
-def build_nameless_error(number: int, row: int | None = 1) -> InvalidUpload:
+def build_nameless_error(number: int, row: int | None = 1) -> UnreadableFile:
     """Return the error of a column of values without a name."""
-    return InvalidUpload(f"column {number} of the header has no name", row=row)
+    return UnreadableFile(f"column {number} of the header has no name", row=row)
 
 
 def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
@@ -513,7 +513,7 @@ def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
     seen: set[str] = set()
     for column in columns:
         if column.name in seen and column.name:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 "two columns have this name; names must differ", row=row, column=column.name
             )
         seen.add(column.name)
@@ -537,7 +537,7 @@ def _assign_time(
     if time is None:
         if sample_time is None:
             names = ", ".join(column.name for column in columns if column.name)
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"there is no time column; found {names}. Name one of them t (in seconds), or ",
                 GIVE_PERIOD,
                 row=row,
@@ -546,7 +546,7 @@ def _assign_time(
     column = columns[time]
     name, unit = column.name, find_time_unit(column.name, column.unit)
     if sample_time is not None and column.kind not in STAMP_KINDS:
-        raise InvalidUpload(
+        raise UnreadableFile(
             "the file has this time column. Remove it, or ",
             Advice("leave out ", "sample_time"),
             row=row,
@@ -555,7 +555,7 @@ def _assign_time(
     if column.kind in STAMP_KINDS:
         unit = ""
     elif find_unit_seconds(unit) is None:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
             row=row,
             column=name,

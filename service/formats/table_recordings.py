@@ -6,8 +6,8 @@ from math import floor, log10
 
 import numpy as np
 
+from service.formats.advice import GIVE_PERIOD
 from service.formats.cells import begins_like_number, classify_cell
-from service.formats.errors import GIVE_PERIOD, Advice, InvalidUpload
 from service.formats.table_columns import (
     ColumnValues,
     Table,
@@ -22,6 +22,7 @@ from service.formats.time_columns import (
     read_clock_times,
     read_stamp_times,
 )
+from sysid.core.errors import Advice, UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
 from sysid.data.table_rules import (
@@ -75,7 +76,7 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the columns cannot be used, with the row and the column.
     """
     table = _name_signals(table, notes)
@@ -101,7 +102,7 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
         _report_missing_values(column.name, numbers, table, notes)
         channels.append(Channel(column.name, times, numbers, column.unit or "1"))
     if not channels:
-        raise InvalidUpload("every value is missing; leave the column out", column=empty[0])
+        raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
     if empty:
         notes.append(f"columns without any value were left out: {', '.join(empty)}")
     return Recording(tuple(channels), spans, clock.started_at)
@@ -153,7 +154,7 @@ def _check_text(
         wrong = next((i for i, text in enumerate(texts) if begins_like_number(text)), None)
         place = place if wrong is None else wrong
         if wrong is not None or is_needed:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"found {shorten_text(texts[place])}{_explain_text(texts[place])}",
                 row=int(table.rows[place]),
                 column=column.name,
@@ -222,7 +223,7 @@ def _build_segments(
     sizes = np.diff(np.append(starts, times.size))
     singles = int(np.count_nonzero(sizes == 1))
     if starts.size > 1 and 2 * singles > starts.size:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the labels {', '.join(labels)} divide {times.size} rows into {starts.size} segments, "
             f"of which {singles} have one sample. A label stays the same during a measurement; ",
             Advice("leave columns of times and signals out of ", "segments", "."),
@@ -270,7 +271,7 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
-    raise InvalidUpload(
+    raise UnreadableFile(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
         f"row to row. {hint}",
         advice,

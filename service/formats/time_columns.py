@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.formats.advice import GIVE_PERIOD
 from service.formats.cells import CLOCK_TIME, DATE_ONLY, MISSING, STAMP
-from service.formats.errors import GIVE_PERIOD, InvalidUpload
 from service.formats.table_columns import (
     ColumnValues,
     build_missing_time_error,
     shorten_text,
 )
+from sysid.core.errors import UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import measure_sampling
 from sysid.data.table_rules import TimeAxis, count_from_first, format_moment
@@ -93,7 +94,7 @@ def parse_stamps(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a stamp is missing or has another form; with its row.
     """
     first = next((text for text in texts.tolist() if STAMP.fullmatch(text)), str(texts[0]))
@@ -170,11 +171,11 @@ def _rank_reading(stamps: NDArray[np.datetime64]) -> tuple[bool, int]:
 
 def _build_stamp_error(
     texts: NDArray[np.str_], place: int, rows: IntArray, name: str, wanted: str
-) -> InvalidUpload:
+) -> UnreadableFile:
     text, row = str(texts[place]), int(rows[place])
     if text.lower() in MISSING:
         return build_missing_time_error(text, row, name)
-    return InvalidUpload(
+    return UnreadableFile(
         f"found {shorten_text(text)}; need {wanted}. Write all time stamps in one form, or ",
         GIVE_PERIOD,
         row=row,

@@ -68,7 +68,16 @@ _EXACT_DECIMALS: Final = 6  # of s since 1970 in a number of 53 bits
 
 
 class ReadingNote(UserWarning):
-    """What was guessed or found while a file or a table was read."""
+    """What was guessed or found while a file or a table was read.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> with warnings.catch_warnings(action="ignore", category=ReadingNote):
+    ...     recording = Recording({"t [ms]": [0, 500], "u": [1, 2]})
+    >>> recording.duration
+    0.5
+    """
 
 
 def tell_notes(notes: Sequence[str]) -> None:

@@ -11,9 +11,9 @@ import typer
 
 from service.cli.identify import FileOptions, read_recording
 from service.formats import limits as format_limits
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.sandbox import read_untrusted
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
@@ -26,8 +26,8 @@ def saved(folder: Path, content: bytes) -> Path:
     return path
 
 
-def refused(path: Path, **options: object) -> InvalidUpload:
-    with pytest.raises(InvalidUpload) as caught:
+def refused(path: Path, **options: object) -> UnreadableFile:
+    with pytest.raises(UnreadableFile) as caught:
         read_untrusted(path, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from service.formats.csv_recordings import generate_csv, read_csv
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 
 
-def refused(content: str | bytes, **options: object) -> InvalidUpload:
+def refused(content: str | bytes, **options: object) -> UnreadableFile:
     data = content if isinstance(content, bytes) else content.encode()
-    with pytest.raises(InvalidUpload) as caught:
+    with pytest.raises(UnreadableFile) as caught:
         read_csv(data, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
@@ -157,7 +157,7 @@ def test_a_text_in_a_column_of_numbers_is_told_with_row_and_column() -> None:
     error = refused("t,u,y\n0,1,2\n1,2,oops\n")
     assert (error.row, error.column) == (3, "y")
     assert "'oops'" in error.detail
-    assert error.errors[0].pointer == "/rows/3/y"
+    assert error.pointer == "/rows/3/y"
 
 
 def test_blank_rows_count_where_a_fault_is_told() -> None:

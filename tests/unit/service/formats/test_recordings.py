@@ -1,6 +1,7 @@
 """Files as loggers, spreadsheets and other programs write them: all give the same experiment."""
 
 import doctest
+import pickle
 import re
 import struct
 import warnings
@@ -11,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import lagid
 from service.formats import recordings, table_columns
 from service.formats.csv_recordings import read_csv
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
 from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
 from service.formats.table_layout import PEEK_ROWS
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
 from tests.recorded_files import (
@@ -135,7 +137,7 @@ def test_encodings_are_recognised(encoding: str) -> None:
 
 def test_a_compressed_text_is_read() -> None:
     check_experiment(read_csv(compress(ROWS))[0])
-    with pytest.raises(InvalidUpload, match="damaged or cut off"):
+    with pytest.raises(UnreadableFile, match="damaged or cut off"):
         read_csv(compress(ROWS)[:-20])
 
 
@@ -241,14 +243,14 @@ def test_of_two_orders_of_day_and_month_the_one_is_taken_in_which_times_increase
 
 def test_stamps_that_are_too_coarse_or_mixed_are_refused_with_the_way_out() -> None:
     coarse = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S")).encode()
-    with pytest.raises(InvalidUpload, match="too coarse, give the sampling period with sample_t"):
+    with pytest.raises(UnreadableFile, match="too coarse, give the sampling period with sample_t"):
         read_csv(coarse)
     recording, notes = read_csv(coarse, sample_time=0.1)
     np.testing.assert_allclose(recording.channel("u").times, TIMES, atol=1e-12)
     assert recording.started_at == START
     assert "samples are 0.1 s apart; column 'Zeit' gives the start" in notes
     mixed = b"time,u\n2026-11-20 08:00:00,1\n20.11.2026 08:01,2\n"
-    with pytest.raises(InvalidUpload, match=r"row 3, column 'time': found '20\.11\.2026 08:01'"):
+    with pytest.raises(UnreadableFile, match=r"row 3, column 'time': found '20\.11\.2026 08:01'"):
         read_csv(mixed)
 
 
@@ -293,7 +295,7 @@ REFUSED = {
 def test_what_cannot_be_read_is_refused_with_what_to_do(
     tmp_path: Path, text: str, words: str
 ) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(words)) as caught:
+    with pytest.raises(UnreadableFile, match=re.escape(words)) as caught:
         read_bytes(tmp_path, text.encode())
     assert "\n" not in caught.value.detail
 
@@ -313,7 +315,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_do(
 def test_a_kind_that_is_recognised_is_named_in_its_refusal(
     tmp_path: Path, head: bytes, words: str
 ) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(words)):
+    with pytest.raises(UnreadableFile, match=re.escape(words)):
         read_bytes(tmp_path, head)
 
 
@@ -359,13 +361,13 @@ def test_words_below_the_data_are_found_wherever_blocks_end(
     "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
 )
 def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
-    with pytest.raises(InvalidUpload, match=r"^row 242"):
+    with pytest.raises(UnreadableFile, match=r"^row 242"):
         read_with_notes((ROWS + end).encode())
 
 
 def test_labels_that_divide_every_row_are_refused() -> None:
     text = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
-    with pytest.raises(InvalidUpload, match=f"into {N} segments, of which {N} have one sample"):
+    with pytest.raises(UnreadableFile, match=f"into {N} segments, of which {N} have one sample"):
         read_csv(text.encode(), segments=("Zeit",), sample_time=0.1)
 
 
@@ -408,7 +410,7 @@ def test_structures_of_matlab_are_opened_if_there_is_one(tmp_path: Path) -> None
     nested = write_mat({"data": {"run": {"t": TIMES, "u": INPUT, "y": OUTPUT}}})
     check_experiment(read_bytes(tmp_path, nested)[0])
     one = {"u": INPUT, "y": OUTPUT, "Ts": 0.1}
-    with pytest.raises(InvalidUpload, match="the file holds ze, zv; need arrays"):
+    with pytest.raises(UnreadableFile, match="the file holds ze, zv; need arrays"):
         read_bytes(tmp_path, write_mat({"ze": one, "zv": one}))
 
 
@@ -418,20 +420,20 @@ def test_matlab_4_is_recognised_without_a_suffix(tmp_path: Path) -> None:
 
 
 def test_objects_and_arrays_without_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidUpload, match="an array holds Python objects"):
+    with pytest.raises(UnreadableFile, match="an array holds Python objects"):
         read_bytes(tmp_path, write_npz(t=TIMES, u=np.array([{}] * N, dtype=object)))
     np.save(tmp_path / "a.npy", np.stack([TIMES, INPUT]))
-    with pytest.raises(InvalidUpload, match="one array without names"):
+    with pytest.raises(UnreadableFile, match="one array without names"):
         read_bytes(tmp_path, (tmp_path / "a.npy").read_bytes())
-    with pytest.raises(InvalidUpload, match="the MATLAB file cannot be read"):
+    with pytest.raises(UnreadableFile, match="the MATLAB file cannot be read"):
         read_bytes(tmp_path, b"MATLAB 5.0 MAT-file" + bytes(200))
 
 
 def test_an_array_that_is_infinite_or_without_a_time_is_refused(tmp_path: Path) -> None:
     broken = np.where(TIMES == 0.5, np.inf, OUTPUT)
-    with pytest.raises(InvalidUpload, match="row 6, column 'y': the value is infinite"):
+    with pytest.raises(UnreadableFile, match="row 6, column 'y': the value is infinite"):
         read_bytes(tmp_path, write_npz(t=TIMES, y=broken))
-    with pytest.raises(InvalidUpload, match="row 6, column 't': the time is missing"):
+    with pytest.raises(UnreadableFile, match="row 6, column 't': the time is missing"):
         read_bytes(tmp_path, write_npz(t=np.where(TIMES == 0.5, np.nan, TIMES), y=OUTPUT))
 
 
@@ -449,7 +451,7 @@ def test_parquet_keeps_units_stamps_and_zones(tmp_path: Path) -> None:
     zoned = [moment.replace(tzinfo=UTC) for moment in stamps]
     recording, _ = read_bytes(tmp_path, write_parquet(when=zoned, u=INPUT, y=OUTPUT))
     assert recording.started_at == START.replace(tzinfo=UTC)
-    with pytest.raises(InvalidUpload, match="the Parquet file cannot be read"):
+    with pytest.raises(UnreadableFile, match="the Parquet file cannot be read"):
         read_bytes(tmp_path, plain[: len(plain) // 2])
 
 
@@ -464,9 +466,9 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
     assert recording.channel("y").unit == "Pa"
     assert "column 1 (no name) counts rows and was left out" in notes
     faulty = [["t", "u"], [0.0, 1.0], [1.0, "x"]]
-    with pytest.raises(InvalidUpload, match="row 3, column 'u': found 'x'"):
+    with pytest.raises(UnreadableFile, match="row 3, column 'u': found 'x'"):
         read_bytes(tmp_path, write_sheet(faulty))
-    with pytest.raises(InvalidUpload, match="cannot be opened"):
+    with pytest.raises(UnreadableFile, match="cannot be opened"):
         read_bytes(tmp_path, write_experiment_sheet()[:700])
 
 
@@ -475,7 +477,7 @@ def test_an_open_document_and_an_old_excel_file_are_sheets_too(tmp_path: Path, w
     rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
     content = write([["t", "u", "y"], *rows])
     check_experiment(read_bytes(tmp_path, content)[0])
-    with pytest.raises(InvalidUpload, match="cannot be opened"):
+    with pytest.raises(UnreadableFile, match="cannot be opened"):
         read_bytes(tmp_path, content[: len(content) // 2])
 
 
@@ -503,8 +505,24 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told: str) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(told)):
+    with pytest.raises(UnreadableFile, match=re.escape(told)):
         read_recording(**{"source": ROWS.encode(), **arguments})
+
+
+def test_a_refusal_is_an_error_of_the_library_with_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "rig.csv"
+    path.write_text("t,u\n0,1\n1,5 V\n")
+    with pytest.raises(lagid.SysidError) as caught:
+        lagid.read_recording(path)
+    error = caught.value
+    assert isinstance(error, lagid.UnreadableFile)
+    assert (error.name, error.row, error.column) == (str(path), 3, "u")
+    assert str(error) == f"{path}: {error.detail}"
+    assert error.detail.startswith("row 3, column 'u': found '5 V'")
+    assert error.pointer == "/rows/3/u"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    with pytest.raises(lagid.UnreadableFile, match=r"^row 3"):
+        lagid.read_recording(path.read_bytes())
 
 
 def test_every_kind_comes_through_the_child_with_its_clock(tmp_path: Path) -> None:
@@ -562,7 +580,7 @@ def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_perio
     assert recording.names == ("T", "u")
     assert recording.channel("T").times.tolist() == [0.0, 0.5, 1.0]
     assert notes == ()
-    with pytest.raises(InvalidUpload, match=r"there is no time column; found T, u\."):
+    with pytest.raises(UnreadableFile, match=r"there is no time column; found T, u\."):
         read_rows(["T [°C],u", *rows[1:]])
     assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
 
@@ -605,7 +623,7 @@ def test_decimal_commas_may_come_late(
 
 def test_a_late_decimal_comma_is_a_fault_among_points() -> None:
     rows = ["t;y", "0;1.5", *(f"{k};20" for k in range(1, LATE)), f"{LATE};20,5"]
-    with pytest.raises(InvalidUpload, match=f"row {LATE + 2}.*other numbers of the file have poin"):
+    with pytest.raises(UnreadableFile, match=f"row {LATE + 2}.*other numbers of the file"):
         read_rows(rows)
 
 
