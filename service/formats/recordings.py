@@ -4,9 +4,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from service.core.temporary_files import make_temporary_prefix
 from service.formats.advice import build_period_error
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
@@ -15,11 +17,19 @@ from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
 
 
+@runtime_checkable
+class Readable(Protocol):
+    """An open file, or another object that can be read."""
+
+    def read(self) -> bytes | str:
+        """Return the content that is left."""
+
+
 def read_recording(
-    source: str | os.PathLike[str] | bytes,
+    source: str | os.PathLike[str] | bytes | Readable,
     *,
     sample_time: float | None = None,
-    segments: Sequence[str] = (),
+    segments: Sequence[str] | str = (),
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -28,12 +38,13 @@ def read_recording(
 
     Parameters
     ----------
-    source : path or bytes
-        A file's path, or its content.
+    source : path, bytes or open file
+        A file's path, its content, or an object that can be read.
     sample_time : float or None
         Sampling period in s, for a file without a time column.
     segments : sequence of str
-        Columns of labels that divide the rows into segments, each measured on its own.
+        Columns of labels that divide the rows into segments, each measured on its own. A text
+        is one column.
 
     Raises
     ------
@@ -57,10 +68,10 @@ def read_recording(
 
 
 def read_with_notes(
-    source: str | os.PathLike[str] | bytes,
+    source: str | os.PathLike[str] | bytes | Readable,
     *,
     sample_time: float | None = None,
-    segments: Sequence[str] = (),
+    segments: Sequence[str] | str = (),
     limits: UploadLimits = DEFAULT_LIMITS,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
@@ -69,16 +80,20 @@ def read_with_notes(
     """
     if sample_time is not None and not isinstance(sample_time, int | float | np.number):
         raise build_period_error(sample_time)
-    if isinstance(segments, str):
-        raise UnreadableFile(f"segments is {segments!r}; need a list of columns: [{segments!r}]")
-    options = ReadOptions(sample_time, tuple(segments), limits)
-    if isinstance(source, bytes):
-        with NamedTemporaryFile(prefix="lagid-") as file:
-            file.write(source)
+    labels = (segments,) if isinstance(segments, str) else tuple(segments)
+    options = ReadOptions(sample_time, labels, limits)
+    content = source.read() if isinstance(source, Readable) else source
+    if isinstance(content, str) and content is not source:
+        content = content.encode()
+    if isinstance(content, bytes):
+        with NamedTemporaryFile(prefix=make_temporary_prefix()) as file:
+            file.write(content)
             file.flush()
             return _read_file(Path(file.name), options)
     if not isinstance(source, str | os.PathLike):
-        raise UnreadableFile(f"found {source!r}; need the path of a file, or its content as bytes")
+        raise UnreadableFile(
+            f"found {source!r}; need the path of a file, its content as bytes, or an open file"
+        )
     try:
         return _read_file(Path(source), options)
     except UnreadableFile as error:

@@ -1,6 +1,7 @@
 """Files as loggers, spreadsheets and other programs write them: all give the same experiment."""
 
 import doctest
+import io
 import pickle
 import re
 import struct
@@ -501,12 +502,27 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
         ({"source": 3}, "found 3; need the path of a file"),
         ({"sample_time": "0.1 s"}, "sample_time is '0.1 s'; need a positive number"),
         ({"sample_time": -1}, "sample_time is -1; need a positive number"),
-        ({"segments": "run"}, "segments is 'run'; need a list of columns: ['run']"),
+        ({"segments": "run"}, "there is no label column 'run'"),
     ],
 )
 def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told: str) -> None:
     with pytest.raises(UnreadableFile, match=re.escape(told)):
         read_recording(**{"source": ROWS.encode(), **arguments})
+
+
+def test_one_label_column_may_be_a_text() -> None:
+    rows = b"run,t,u\na,0,1\na,1,2\nb,0,3\nb,1,4\n"
+    recording, _ = read_with_notes(rows, segments="run")
+    assert [segment.labels["run"] for segment in recording.segments] == ["a", "b"]
+
+
+def test_an_open_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "rig.csv"
+    path.write_text(ROWS)
+    with path.open() as text, path.open("rb") as binary:
+        for source in (text, binary, io.BytesIO(ROWS.encode()), io.StringIO(ROWS)):
+            check_experiment(read_recording(source))
+    check_experiment(read_recording(io.BytesIO(write_experiment_sheet())))
 
 
 def test_a_refusal_is_an_error_of_the_library_with_its_place(tmp_path: Path) -> None:
