@@ -61,7 +61,7 @@ class StoredRun:
         return cls(job, run, body, apply_result(load_stored_model(body["model"]), run.result))
 
     @property
-    def requested_model(self) -> Model:
+    def model_of_request(self) -> Model:
         """The model as requested, with all its candidate terms."""
         return load_stored_model(self.body["model"])
 
@@ -140,7 +140,7 @@ class StoredRun:
         from sysid.identification.resimulate import resimulate_run
 
         validation = self.body["validation"] or {}
-        model, others = self.requested_model, validation.get("datasets")
+        model, others = self.model_of_request, validation.get("datasets")
         channels = map_channels(model, self.body["channels"], self.body["hold"])
         datasets = DatasetRepository(session, self.job.project_id)
         noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))

@@ -240,7 +240,7 @@ def join_validation(
 
 def to_signal_trace(channel: Channel) -> SignalTrace:
     """Convert a channel with its history to a line of a figure."""
-    held, before = channel.resolved_hold == "zero", None
+    held, before = channel.effective_hold == "zero", None
     if channel.history is not None:  # including the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
         times, values = (np.append(history, samples[0]) for history, samples in pairs)
