@@ -19,7 +19,7 @@ import gc
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from service.client import (
@@ -99,23 +99,6 @@ _DISTRIBUTION = "lagid"
 _ALLOCATIONS_UNTIL_COLLECTION = 50_000
 """Containers made before the garbage collector looks for cycles; Python's default is 700."""
 
-_OTHER_MODULES = {
-    **dict.fromkeys(
-        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
-        "service.client",
-    ),
-    "read_recording": "service.formats.recordings",
-}
-"""Modules of the names that are not those of `sysid`."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_OTHER_MODULES.get(name, "sysid")), name)
-    globals()[name] = value
-    return value
-
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
@@ -165,3 +148,18 @@ if (_clash := _describe_clash()) is not None:
     if [Path(word).stem for word in sys.argv[:1]] == [__name__]:  # the command: no traceback
         sys.exit(f"lagid: {_clash}")
     raise ImportError(_clash)
+
+from sysid.core.lazy_names import load_on_first_use  # noqa: E402  # `sysid` is that of lagid
+
+_OTHER_MODULES = {
+    **dict.fromkeys(
+        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
+        "service.client",
+    ),
+    "read_recording": "service.formats.recordings",
+}
+"""Modules of the names that are not those of `sysid`."""
+
+__getattr__ = load_on_first_use(
+    __name__, {name: _OTHER_MODULES.get(name, "sysid") for name in __all__}
+)

@@ -63,7 +63,9 @@ def complete_model_name(incomplete: str) -> list[str]:
 ModelName = Annotated[
     str,
     typer.Option(
-        "--model", help="Name of a model, or a YAML file.", autocompletion=complete_model_name
+        "--model",
+        help="Built-in model (`lagid models` lists them), or the YAML file of your own.",
+        autocompletion=complete_model_name,
     ),
 ]
 DOCUMENT_HELP = "YAML or JSON file with the body of the request; - for standard input."
@@ -85,7 +87,8 @@ Key = Annotated[
     ),
 ]
 Segments = Annotated[
-    str | None, typer.Option(help="Label columns that divide the rows into segments: col,col.")
+    str | None,
+    typer.Option(help="Columns of labels that divide the rows into experiments: run,repeat."),
 ]
 SampleTime = Annotated[
     float | None, typer.Option(help="Sampling period in s, for a file without a time column.")

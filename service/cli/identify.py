@@ -101,10 +101,20 @@ def identify(
     model: ModelName,
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", help="path=value of the job body: algorithm.population=100."),
+        typer.Option(
+            "--set",
+            metavar="PATH=VALUE",
+            help="Change a bound or a setting: parameters.L.upper=2, parameters.K.fixed=1, seed=3. "
+            "May be repeated.",
+        ),
     ] = None,
     channels: Annotated[
-        str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
+        str | None,
+        typer.Option(
+            metavar="SIGNAL=CHANNEL,…",
+            help="Channel of each signal of the model: u=P1,y=P2. By default of the same name, "
+            "else in their order, inputs first.",
+        ),
     ] = None,
     validation: Annotated[
         Path | None,
@@ -140,7 +150,11 @@ def identify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Identify a model's parameters and time lags from a recording, in this process."""
+    """Identify a model's parameters and time lags from a recording, without a server.
+
+    Prints each estimate with its standard error, its unit and a status that says if the data
+    determine it.
+    """
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")

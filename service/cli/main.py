@@ -29,7 +29,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=show_examples("lagid demo", "lagid identify recording.csv --model fopdt"),
+    epilog=show_examples(
+        "lagid identify recording.csv --model fopdt", "lagid models", "lagid demo"
+    ),
 )
 
 
@@ -50,7 +52,9 @@ def describe_program(
 ) -> None:
     """Identification of nonlinear systems with unknown time delays.
 
-    Exit code 0: success, 1: the work failed, 2: wrong arguments. LAGID_URL names a server.
+    `identify` and `models` work alone. The commands on jobs and data need a server: start one with
+    `lagid serve`, or name one by LAGID_URL. Exit code 0: success, 1: the work failed, 2: wrong
+    arguments.
     """
 
 
@@ -79,7 +83,7 @@ def run_demo(
         typer.Option(min=0, max=65535, help="Port (default: LAGID_PORT, or any free one)."),
     ] = None,
 ) -> None:
-    """Run the paper's Example 1 through the whole service and print its Table 1."""
+    """Run one example through the whole service: Example 1 of the paper, with its Table 1."""
     from service.cli import demo
 
     demo.run_demo(data_dir, port, out)

@@ -29,7 +29,7 @@ from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
 
-app = typer.Typer(help="Built-in models and your own.", invoke_without_command=True)
+app = typer.Typer(help="List, show, check and add models.", invoke_without_command=True)
 
 ModelFile = Annotated[
     Path, typer.Argument(help="Model document, YAML or JSON; - for standard input.")

@@ -116,7 +116,7 @@ def reidentify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Re-identify a model for several values of a label: estimates, trend, predictions, flags.
+    """Identify one model on each recording of a batch: a trend over a label such as length.
 
     Each run starts at the reference, or at the result of its neighbour.
     """
@@ -239,7 +239,9 @@ def _drop_missing(**options: str | None) -> dict[str, str]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
+app = typer.Typer(
+    help="Runs that later batches are compared with: list, show, accept.", no_args_is_help=True
+)
 
 REFERENCE_ORIGINS = FieldOrigins(
     {"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"}

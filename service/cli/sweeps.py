@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-app = typer.Typer(help="Recipes: sweeps for one purpose.", no_args_is_help=True)
+app = typer.Typer(
+    help="Repeat an identification under noise: how far the estimates move.", no_args_is_help=True
+)
 
 MAX_SIGMA_VALUES = 100_000
 RELATIVE_KEY = "relative"

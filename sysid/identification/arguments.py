@@ -89,7 +89,7 @@ def check_kinds(values: Mapping[str, object]) -> None:
             raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
 
 
-_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+_KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
     "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
     "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
