@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import isfinite
 from numbers import Integral, Real
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import GeneticAlgorithm, Loss
@@ -11,7 +11,7 @@ from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns
 from sysid.models.model import Model
-from sysid.models.signals import assign_channels, assign_record
+from sysid.models.signals import Assignment, assign_channels, assign_record
 
 Data: TypeAlias = Record | Recording | Labelled
 """One recording: a record, a recording without roles, or a table of another library."""
@@ -19,10 +19,18 @@ Change: TypeAlias = Mapping[str, Any] | Sequence[float] | float
 """Change of a parameter: its fields, its two bounds, or its fixed value."""
 
 
+class ReadRecords(NamedTuple):
+    """Records of a model, notes about what was assumed, and the channel of each signal."""
+
+    records: tuple[Record, ...]
+    notes: tuple[str, ...]
+    channels: Mapping[str, str]
+
+
 def read_records(
     model: Model, data: Data | Sequence[Data], channels: Mapping[str, str] | None
-) -> tuple[tuple[Record, ...], tuple[str, ...]]:
-    """Read recordings as records of a model, with notes about what was assumed.
+) -> ReadRecords:
+    """Read recordings as records of a model.
 
     A recording of several segments gives one record for each.
 
@@ -36,15 +44,18 @@ def read_records(
     check_kinds({"channels": channels})
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
-    notes = dict.fromkeys(note for _, note in parts if note)
-    return tuple(record for record, _ in parts), tuple(notes)
+    notes = dict.fromkeys(assigned.note for _, assigned in parts if assigned.note)
+    by_signal = parts[0][1].by_signal if parts else {}
+    return ReadRecords(tuple(record for record, _ in parts), tuple(notes), by_signal)
 
 
 def _read_one(
     model: Model, data: Data, channels: Mapping[str, str] | None
-) -> Iterator[tuple[Record, str]]:
+) -> Iterator[tuple[Record, Assignment]]:
     if isinstance(data, Record):
-        yield assign_record(model, data, channels)
+        record, note = assign_record(model, data, channels)
+        pairs = zip((*record.inputs, *record.outputs), (*data.inputs, *data.outputs), strict=True)
+        yield record, Assignment({named.name: channel.name for named, channel in pairs}, note)
         return
     if isinstance(data, Recording):
         assigned = assign_channels(model, data.names, channels)
@@ -61,7 +72,7 @@ def _read_one(
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
     for record in recording.to_records(inputs, outputs):
-        yield record, assigned.note
+        yield record, assigned
 
 
 def _describe_wrong_data(data: object) -> str:

@@ -1,7 +1,7 @@
 """Result of an identification: estimates with their uncertainty, and the evidence."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -125,6 +125,8 @@ class FittedData:
     correlations : tuple of CorrelationFunction
         Correlation functions of the residuals that were tested.
     loss : {"squares", "soft-l1"}
+    channels : mapping of str to str
+        Channel of each signal in the first recording: model's name → channel's name.
     """
 
     model: Model
@@ -133,6 +135,7 @@ class FittedData:
     is_part: bool
     correlations: tuple[CorrelationFunction, ...]
     loss: LossKind = "squares"
+    channels: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -494,3 +494,15 @@ def test_a_wrong_argument_is_told_in_one_line(
 def test_a_wrong_argument_of_a_simulation_is_told(inputs, values, more, told: str) -> None:
     with pytest.raises((InvalidRecord, InvalidSettings), match=told):
         simulate("fopdt", inputs, values, **more)
+
+
+def test_a_result_simulates_the_table_that_it_was_identified_from(
+    found: Identification, frame: pd.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "found.json"
+    found.save(path)
+    for result in (found, Identification.load(path)):
+        simulated = simulate("fopdt", frame, result).channel("y")
+        assert simulated.values.size == N
+        one = simulate("fopdt", frame[["Heizung [%]"]].rename(columns={"Heizung [%]": "u"}), result)
+        np.testing.assert_array_equal(one.channel("y").values, simulated.values)

@@ -100,5 +100,5 @@ def test_a_channel_is_named_by_its_column_or_without_the_unit() -> None:
     table = pd.DataFrame({"t": TIMES, "u (V)": INPUT, "y": OUTPUT})
     model = resolve_model("fopdt")
     for name in ("u (V)", "u"):
-        ((record,), _) = read_records(model, table, {"u": name, "y": "y"})
+        (record,) = read_records(model, table, {"u": name, "y": "y"}).records
         assert record.inputs[0].unit == "V"

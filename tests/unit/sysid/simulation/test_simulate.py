@@ -42,6 +42,25 @@ def test_outputs_are_on_the_clock_of_the_inputs() -> None:
         assert found.channels[0].times[0] == first
 
 
+def test_inputs_are_named_as_in_identify() -> None:
+    values = {"c": 2.0, "L": 0.2, "b": 0.3}
+    expected = simulate(lag_element(), STEP, values).channels[0].values
+    table = {"t": TIMES, "heater [%]": STEP.values, "oven": 0 * TIMES}
+    for name in ("heater", "heater [%]"):
+        found = simulate(lag_element(), table, values, channels={"u": name, "y": "none"})
+        np.testing.assert_array_equal(found.channels[0].values, expected)
+    both = table | {"u": -STEP.values}
+    found = simulate(lag_element(), both, values, channels={"u": "heater"})
+    np.testing.assert_array_equal(found.channels[0].values, expected)
+    for channels, told in (
+        ({"u": "heatr"}, "/channels/u: there is no channel 'heatr'; did you mean 'heater'"),
+        ({"v": "heater"}, "/channels/v: the model has no signal 'v'"),
+        ("heater", "/channels: found the text 'heater'; need a mapping"),
+    ):
+        with pytest.raises(InvalidSettings, match=told):
+            simulate(lag_element(), table, values, channels=channels)
+
+
 def test_initial_values_can_be_given() -> None:
     model = differential({"x": "-x"}, "x", initial={"x": {"lower": 0, "upper": 1}})
     values = {"c": 0, "L": 0, "b": 0}
