@@ -1,6 +1,6 @@
 """Result of an identification: estimates with their uncertainty, and the evidence."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
@@ -255,7 +255,12 @@ class Identification:
         """Values of all parameters by name, as `simulate` takes them."""
         return {estimate.name: estimate.value for estimate in self.estimates}
 
-    def plot(self, *names: "FigureName", experiment: int = 0, theme: "Theme" = "light") -> Any:
+    def plot(
+        self,
+        *names: "FigureName | Sequence[FigureName]",
+        experiment: int = 0,
+        theme: "Theme" = "light",
+    ) -> Any:
         """Draw figures one below the other, as a figure of Plotly.
 
         Without names: measured against identified output with the residuals, their correlation
@@ -265,7 +270,7 @@ class Identification:
         ----------
         *names : {"response", "residuals", "correlation", "waterfall", "history", "convergence", \
 "posterior"}
-            The figures to draw.
+            The figures to draw, also as a list.
         experiment : int
             Which record, from 0, if there are several.
         theme : {"light", "dark"}
@@ -275,7 +280,7 @@ class Identification:
         MissingLibrary
             If Plotly is not installed.
         InvalidSettings
-            If there is no such figure or record.
+            If there is no such figure, record or theme, or a named figure has no data.
         """
         from sysid.identification.figures import plot_result
 

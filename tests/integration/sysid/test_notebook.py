@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import sys
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -506,3 +507,29 @@ def test_a_result_simulates_the_table_that_it_was_identified_from(
         assert simulated.values.size == N
         one = simulate("fopdt", frame[["Heizung [%]"]].rename(columns={"Heizung [%]": "u"}), result)
         np.testing.assert_array_equal(one.channel("y").values, simulated.values)
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "told"),
+    [
+        (("posterior",), {}, "/names: no posterior was sampled; call identify"),
+        (("respons",), {}, "/names: there is no figure 'respons'; did you mean 'response'"),
+        ((["response", 3],), {}, "/names: there is no figure 3"),
+        ((), {"theme": "drak"}, "/theme: found 'drak'; need one of light, dark"),
+        ((), {"experiment": "1"}, "/experiment: found '1'; need a whole number"),
+        ((), {"experiment": True}, "/experiment: found True; need a whole number"),
+    ],
+)
+def test_a_wrong_argument_of_plot_is_told(
+    found: Identification, names: tuple[Any, ...], options: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(InvalidSettings, match=re.escape(told)):
+        found.plot(*names, **options)
+
+
+def test_figures_may_be_a_list(found: Identification) -> None:
+    assert len(found.plot(["response", "waterfall"]).data) == len(
+        found.plot("response", "waterfall").data
+    )
+    with pytest.raises(InvalidSettings, match="no data for the figure 'response'"):
+        replace(found, data=None).plot("response")
