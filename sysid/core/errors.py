@@ -208,8 +208,10 @@ class NothingIdentifiable(SysidError, ValueError):
 class UnknownParameter(SysidError, KeyError):
     """A result has no parameter of that name."""
 
-    def __init__(self, name: str, valid: Iterable[str]) -> None:
-        self.message = f"there is no parameter {name!r}{suggest_name(name, valid)}"
+    def __init__(self, name: object, valid: Iterable[str]) -> None:
+        is_name = isinstance(name, str)
+        hint = suggest_name(name, valid) if is_name else f"; the names are {', '.join(valid)}"
+        self.message = f"there is no parameter {name!r}{hint}"
         super().__init__(self.message)
 
     def __str__(self) -> str:

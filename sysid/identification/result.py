@@ -1,6 +1,6 @@
 """Result of an identification: estimates with their uncertainty, and the evidence."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
@@ -234,11 +234,34 @@ class Identification:
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
-        raise UnknownParameter(str(name), [estimate.name for estimate in self.estimates])
+        raise UnknownParameter(name, list(self))
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the names of the parameters, so that ``"L" in found`` holds."""
         return (estimate.name for estimate in self.estimates)
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self.estimates)
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the parameters."""
+        return self._by_name().keys()
+
+    def values(self) -> ValuesView[Estimate]:
+        """Return the estimates."""
+        return self._by_name().values()
+
+    def items(self) -> ItemsView[str, Estimate]:
+        """Return the names of the parameters with their estimates."""
+        return self._by_name().items()
+
+    def get(self, name: str, default: Estimate | None = None) -> Estimate | None:
+        """Return the estimate of a parameter, or a default if there is none."""
+        return self._by_name().get(name, default)
+
+    def _by_name(self) -> dict[str, Estimate]:
+        return {estimate.name: estimate for estimate in self.estimates}
 
     def __repr__(self) -> str:
         from sysid.identification.summary import summarise_result

@@ -533,3 +533,18 @@ def test_figures_may_be_a_list(found: Identification) -> None:
     )
     with pytest.raises(InvalidSettings, match="no data for the figure 'response'"):
         replace(found, data=None).plot("response")
+
+
+def test_a_result_is_a_mapping_of_names_to_estimates(found: Identification) -> None:
+    names = [estimate.name for estimate in found.estimates]
+    assert len(found) == len(names)
+    assert list(found) == list(found.keys()) == names
+    assert list(found.values()) == list(found.estimates)
+    assert dict(found) == dict(found.items()) == {name: found[name] for name in names}
+    assert found.get("L") is found["L"]
+    assert found.get("M") is None
+    assert found.get("M", found["L"]) is found["L"]
+    with pytest.raises(UnknownParameter, match=r"there is no parameter 0; the names are K, T, L"):
+        found[0]  # type: ignore[index]
+    with pytest.raises(UnknownParameter, match="there is no parameter 'l'; known are K, L"):
+        found["l"]
