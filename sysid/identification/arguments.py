@@ -97,9 +97,23 @@ def check_kinds(values: Mapping[str, object]) -> None:
         is_left_out = value is None and name not in _NEEDED
         is_flag = isinstance(value, bool) and bool not in kinds
         if not is_left_out and (is_flag or not isinstance(value, kinds)):
-            raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
+            found = f"found {_describe_value(value)}; need {need}"
+            if name == "settings" and _is_signal(value):
+                found += ". To identify from two series, join them: Record(inputs, outputs)"
+            raise InvalidSettings(f"/{name}", found)
 
 
+def _describe_value(value: object) -> str:
+    """Describe a wrong value: as it is written if that is short, else by its kind."""
+    text = repr(value) if getattr(value, "shape", None) is None else ""
+    return text if 0 < len(text) <= _MAX_VALUE and "\n" not in text else describe_object(value)
+
+
+def _is_signal(value: object) -> bool:
+    return isinstance(value, Channel | list | tuple) or hasattr(value, "shape")
+
+
+_MAX_VALUE = 60
 _KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
     "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
