@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import IO, TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -23,6 +23,7 @@ from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import format_value
 from sysid.core.errors import join_pointer, split_pointer
+from sysid.core.files import open_replacement
 from sysid.core.text import DASH, plain_estimate
 
 if TYPE_CHECKING:
@@ -373,18 +374,35 @@ def read_model(name: str) -> Any:
 
 def write_file(path: Path, text: str) -> None:
     """Write a file that the user names; end the command if this fails."""
+    with replace_file(path) as stream:
+        stream.write(text.encode())
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file that takes the place of one that the user names, which stays whole till then.
+
+    End the command if it cannot be written.
+    """
     try:
-        path.write_text(text, encoding="utf-8")
+        with open_replacement(path) as stream:
+            yield stream
     except OSError as error:
         fail(f"{path} cannot be written: {error.strerror}")
 
 
-def protect_file(path: Path, force: bool, option: str = "--output") -> None:
+def protect_file(path: Path | None, force: bool, option: str = "--output") -> None:
     """Ask before a file is overwritten; end the command where nobody can answer.
 
-    `option` names another file.
+    This is done before the work, so that nothing is computed in vain. `option` names the file.
     """
-    if not force and path.exists():
+    if path is None:
+        return
+    if path.is_dir():
+        fail_usage(f"{option} {path}: this is a folder; name a file")
+    if not path.parent.is_dir():
+        fail_usage(f"{option} {path}: there is no folder {path.parent}")
+    if not force and path.is_file():
         ask_to_go_on(
             f"{path} exists. Overwrite it?",
             f"{path} exists, and nothing was written. Add --force, or name another by {option}",

@@ -162,6 +162,7 @@ def identify(
         changes.append("posterior=true")
     if report is not None:
         _check_report(report, force)
+    protect_file(output, force)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
@@ -191,10 +192,6 @@ def _check_report(path: Path, force: bool) -> None:
     missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
     if missing:
         fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
-    if path.is_dir():
-        fail_usage(f"--report {path}: this is a folder; name a file")
-    if not path.parent.is_dir():
-        fail_usage(f"--report {path}: there is no folder {path.parent}")
     protect_file(path, force, "--report")
 
 

@@ -12,6 +12,7 @@
     - NothingIdentifiable  no free parameter has an effect on the output
     - UnknownParameter     a result has no parameter of that name
     - UnreadableResult     a file of a result or of an identified model cannot be used
+    - UnwritableFile       a file cannot be written
     - MissingLibrary       a call needs a library that is not installed
 
 A message says what was wrong, what was read, and what would be right. Numerical kernels never
@@ -209,8 +210,9 @@ class UnknownParameter(SysidError, KeyError):
     """A result has no parameter of that name."""
 
     def __init__(self, name: object, valid: Iterable[str]) -> None:
-        is_name = isinstance(name, str)
-        hint = suggest_name(name, valid) if is_name else f"; the names are {', '.join(valid)}"
+        hint = f"; the names are {', '.join(valid)}"
+        if isinstance(name, str):
+            hint = suggest_name(name, valid)
         self.message = f"there is no parameter {name!r}{hint}"
         super().__init__(self.message)
 
@@ -219,10 +221,17 @@ class UnknownParameter(SysidError, KeyError):
 
 
 class UnreadableResult(SysidError, ValueError):
-    """A file of a result or of an identified model cannot be read or written."""
+    """A file of a result or of an identified model cannot be used."""
 
     def __init__(self, path: object, detail: str) -> None:
         super().__init__(f"{path}: {detail}")
+
+
+class UnwritableFile(SysidError):
+    """A file cannot be written; what was there before is whole."""
+
+    def __init__(self, path: object, detail: str) -> None:
+        super().__init__(f"{path}: it cannot be written: {detail}")
 
 
 class MissingLibrary(SysidError, ImportError):

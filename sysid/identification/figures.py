@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import inf
-from numbers import Integral
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -63,7 +62,7 @@ def plot_result(
         raise InvalidSettings(
             "/theme", f"found {theme!r}; need one of {', '.join(get_args(Theme))}"
         )
-    if isinstance(experiment, bool) or not isinstance(experiment, Integral):
+    if isinstance(experiment, bool) or not isinstance(experiment, int | np.integer):
         raise InvalidSettings("/experiment", f"found {experiment!r}; need a whole number, from 0")
     for name in wanted:
         if not draw_figures(found, [name], experiment):
@@ -86,7 +85,7 @@ def _iterate_names(names: Sequence[FigureName | Sequence[FigureName]]) -> Iterat
         if isinstance(name, list | tuple):
             yield from _iterate_names(name)
         elif name in FIGURES:
-            yield name  # type: ignore[misc]
+            yield name
         else:
             detail = f"there is no figure {name!r}{suggest_name(str(name), FIGURES)}"
             raise InvalidSettings("/names", detail)

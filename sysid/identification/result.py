@@ -326,7 +326,7 @@ class Identification:
 
         Raises
         ------
-        UnreadableResult
+        UnwritableFile
             If the file cannot be written.
         """
         from sysid.identification.saved_result import write_result

@@ -17,7 +17,14 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from sysid.core.errors import InvalidModel, InvalidRecord, UnreadableResult, join_pointer
+from sysid.core.errors import (
+    InvalidModel,
+    InvalidRecord,
+    UnreadableResult,
+    UnwritableFile,
+    join_pointer,
+)
+from sysid.core.files import write_whole
 from sysid.identification.result import Identification
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
@@ -34,15 +41,15 @@ def write_result(found: Identification, path: str | PathLike[str]) -> None:
 
     Raises
     ------
-    UnreadableResult
-        If the file cannot be written.
+    UnwritableFile
+        If the file cannot be written; what was there before is whole.
     """
     document = {"format": FORMAT, **_encode(found)}
     text = json.dumps(document, ensure_ascii=False, allow_nan=False) + "\n"
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        write_whole(Path(path), text)
     except OSError as error:
-        raise UnreadableResult(path, f"it cannot be written: {error.strerror}") from None
+        raise UnwritableFile(path, error.strerror or str(error)) from None
 
 
 def read_result(path: str | PathLike[str]) -> Identification:

@@ -143,12 +143,14 @@ def _read_inputs(inputs: Channels | Record | Recording) -> tuple[Channel, ...]:
     return to_channels([(inputs, "the inputs")])[0]
 
 
-def _split_names(channels: Mapping[str, str] | None) -> dict[str, str]:
+def _split_names(channels: object) -> dict[str, str]:
     """Return names of channels without the unit that a table has in them."""
-    if channels is not None and not isinstance(channels, Mapping):
+    if channels is None:
+        return {}
+    if not isinstance(channels, Mapping):
         detail = f"found {describe_object(channels)}; need a mapping of signals to channels"
         raise InvalidSettings("/channels", detail)
-    return {key: split_headings([str(name)])[0][0] for key, name in (channels or {}).items()}
+    return {key: split_headings([str(name)])[0][0] for key, name in channels.items()}
 
 
 def _find_measured(

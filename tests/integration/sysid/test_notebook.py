@@ -33,6 +33,7 @@ from sysid.core.errors import (
     MissingLibrary,
     UnknownParameter,
     UnreadableResult,
+    UnwritableFile,
 )
 from sysid.identification.figures import FIGURES, draw_figures, list_experiments
 from sysid.identification.result import InputHold
@@ -256,7 +257,7 @@ def test_another_file_is_told(tmp_path: Path, content: str | None, told: str) ->
 
 
 def test_a_place_that_cannot_be_written_is_told(found: Identification, tmp_path: Path) -> None:
-    with pytest.raises(UnreadableResult, match="cannot be written: No such file"):
+    with pytest.raises(UnwritableFile, match="cannot be written: No such file"):
         found.save(tmp_path / "absent" / "found.json")
 
 
@@ -551,3 +552,20 @@ def test_a_result_is_a_mapping_of_names_to_estimates(found: Identification) -> N
         found[0]  # type: ignore[index]
     with pytest.raises(UnknownParameter, match="there is no parameter 'l'; known are K, L"):
         found["l"]
+
+
+def test_a_failure_to_write_leaves_the_old_file_whole(
+    found: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "found.json"
+    found.save(path)
+    before = path.read_bytes()
+
+    def fill_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fill_disk)
+    with pytest.raises(UnwritableFile, match=r"found\.json: it cannot be written: No space left"):
+        found.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
