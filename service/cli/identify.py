@@ -166,13 +166,13 @@ def identify(
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
-    recording = read_recording(data, reading)
+    recording = read_input_file(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     records = _extract_records(recording, Path(name_file(data)), loaded, body)
     validation_records = []
     if validation is not None:
         validation_records = _extract_records(
-            read_recording(validation, reading), validation, loaded, body
+            read_input_file(validation, reading), validation, loaded, body
         )
     from sysid.core.jit import announce_compilation, read_clock
 
@@ -296,7 +296,7 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_recording(path: Path, reading: FileOptions) -> "Recording":
+def read_input_file(path: Path, reading: FileOptions) -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
     from service.formats.limits import DEFAULT_LIMITS
     from service.formats.recordings import read_with_notes

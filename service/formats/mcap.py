@@ -184,7 +184,7 @@ _TopicColumns = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
 McapSource = str | os.PathLike[str] | bytes | BinaryIO
 
 
-def read_recording(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
+def read_mcap(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
     """Read a recording from an MCAP file (path, content, or seekable stream).
 
     Raises
@@ -205,7 +205,7 @@ def read_fitted_outputs(
     UnreadableFile
         If the file is damaged or of another kind.
     """
-    recording = read_recording(source, limits)
+    recording = read_mcap(source, limits)
     fits = []
     for channel in recording.channels:
         prefix, _, signal = channel.name.rpartition("/")

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Protocol, runtime_checkable
@@ -10,7 +11,7 @@ import numpy as np
 
 from service.core.temporary_files import make_temporary_prefix
 from service.formats.advice import build_period_error
-from service.formats.file_kinds import detect_kind
+from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
 from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
@@ -104,13 +105,19 @@ def read_with_notes(
 def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
     if path.is_dir():
         raise UnreadableFile("it is a folder; need a file")
-    from service.formats.csv_recordings import is_plain_text, read_csv
+    from service.formats.csv_recordings import HoldsStamps, read_csv
 
     sample_time, segments, limits = options.sample_time, options.segments, options.limits
-    if detect_kind(path, path.suffix) == "csv" and is_plain_text(
-        path, sample_time, segments, limits
-    ):
-        return read_csv(path, sample_time=sample_time, segments=segments, limits=limits)
+    is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
+    if detect_kind(path, path.suffix) == "csv" and not is_packed:
+        with suppress(HoldsStamps):
+            return read_csv(
+                path,
+                sample_time=sample_time,
+                segments=segments,
+                limits=limits,
+                accepts_stamps=False,
+            )
     from service.formats.sandbox import read_untrusted
 
     upload = read_untrusted(

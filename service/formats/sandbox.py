@@ -18,7 +18,7 @@ from service.core import temporary_files
 from service.core.errors import Unavailable
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.core.errors import Advice, UnreadableFile
 from sysid.data.records import Recording
@@ -85,7 +85,7 @@ def read_untrusted(
             "limits": asdict(limits),
         }
         notes = _parse_answer(_run_child(task, limits, folder), limits)
-        return UploadedRecording(read_recording(clean, limits), notes, sha256)
+        return UploadedRecording(read_mcap(clean, limits), notes, sha256)
 
 
 def _run_child(

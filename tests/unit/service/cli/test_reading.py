@@ -8,14 +8,14 @@ import pytest
 import typer
 
 from service.cli.common import report_faults, upload_origins
-from service.cli.identify import FileOptions, read_recording
+from service.cli.identify import FileOptions, read_input_file
 from service.client.calls import build_upload, raise_for_problem
 from tests.recorded_files import TIMES, join_rows, write_parquet
 
 
 def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> str:
     with pytest.raises(typer.Exit):
-        read_recording(path, FileOptions(None, segments))
+        read_input_file(path, FileOptions(None, segments))
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert "Traceback" not in line
@@ -25,7 +25,7 @@ def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> st
 def test_guesses_are_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rig.txt"
     path.write_text("Device: rig\n\n" + join_rows("Zeit;u;y", ";"))
-    recording = read_recording(path, FileOptions(None, ()))
+    recording = read_input_file(path, FileOptions(None, ()))
     np.testing.assert_array_equal(recording.channel("u").times, TIMES)
     notes = capsys.readouterr().err.splitlines()
     assert "note: the header is in row 3; the lines before it were skipped" in notes

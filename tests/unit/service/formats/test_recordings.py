@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 import lagid
-from service.formats import recordings, table_columns
+from service.formats import csv_recordings, recordings, table_columns
 from service.formats.csv_recordings import read_csv
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
 from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
 from service.formats.table_layout import PEEK_ROWS
+from service.formats.text_files import open_text
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
@@ -523,6 +524,21 @@ def test_an_open_file_is_read(tmp_path: Path) -> None:
         for source in (text, binary, io.BytesIO(ROWS.encode()), io.StringIO(ROWS)):
             check_experiment(read_recording(source))
     check_experiment(read_recording(io.BytesIO(write_experiment_sheet())))
+
+
+def test_a_plain_text_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def count(*arguments: Any) -> Any:
+        opened.append(arguments)
+        return open_text(*arguments)
+
+    monkeypatch.setattr(csv_recordings, "open_text", count)
+    check_experiment(read_recording(ROWS.encode()))
+    assert len(opened) == 1
+    stamps = join_rows("t,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
+    check_experiment(read_with_notes(stamps.encode())[0])  # by a child, after one look
+    assert len(opened) == 2
 
 
 def test_a_refusal_is_an_error_of_the_library_with_its_place(tmp_path: Path) -> None:
