@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         NotFinite,
         ProblemError,
         ServerUnreachable,
+        WaitTimeout,
     )
     from service.formats.recordings import read_recording
     from sysid import (
@@ -78,6 +79,7 @@ __all__ = [
     "ServerUnreachable",
     "Stop",
     "SysidError",
+    "WaitTimeout",
     "catalogue",
     "export_model",
     "identify",
@@ -93,7 +95,10 @@ _DISTRIBUTION = "lagid"
 
 _OTHER_MODULES = {
     **dict.fromkeys(
-        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
+        (
+            *("AsyncClient", "Client", "ClientError"),
+            *("NotFinite", "ProblemError", "ServerUnreachable", "WaitTimeout"),
+        ),
         "service.client",
     ),
     "read_recording": "service.formats.recordings",
