@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         NotFinite,
         ProblemError,
         ServerUnreachable,
+        WaitTimeout,
     )
     from service.formats.recordings import read_recording
     from sysid import (
@@ -83,6 +84,7 @@ __all__ = [
     "Stop",
     "SysidError",
     "UnreadableFile",
+    "WaitTimeout",
     "catalogue",
     "export_model",
     "identify",
@@ -153,7 +155,10 @@ from sysid.core.lazy_names import load_on_first_use  # noqa: E402  # `sysid` is 
 
 _OTHER_MODULES = {
     **dict.fromkeys(
-        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
+        (
+            *("AsyncClient", "Client", "ClientError"),
+            *("NotFinite", "ProblemError", "ServerUnreachable", "WaitTimeout"),
+        ),
         "service.client",
     ),
     "read_recording": "service.formats.recordings",
