@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
+from inspect import currentframe
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -24,6 +25,7 @@ CellKind: TypeAlias = Literal["empty", "number", "flag", "stamp", "date", "clock
 """
 STAMP_KINDS: Final = ("stamp", "date", "clock")
 
+_OUR_PACKAGES: Final = ("sysid", "service", "lagid")
 _TIME_NAMES: Final = ("t", "time")
 _DATE_WORDS: Final = frozenset(("date", "datum"))
 _TIME_WORDS: Final = frozenset(
@@ -81,9 +83,12 @@ class ReadingNote(UserWarning):
 
 
 def tell_notes(notes: Sequence[str]) -> None:
-    """Tell each note as a warning of the code that called the reader."""
+    """Tell each note as a warning of the code outside lagid that reads."""
+    level, frame = 1, currentframe()
+    while frame is not None and frame.f_globals["__name__"].partition(".")[0] in _OUR_PACKAGES:
+        level, frame = level + 1, frame.f_back
     for note in notes:
-        warnings.warn(note, ReadingNote, stacklevel=3)
+        warnings.warn(note, ReadingNote, stacklevel=level)
 
 
 class Heading(NamedTuple):

@@ -21,7 +21,9 @@ def read(source: Callable[[], Recording]) -> tuple[Recording, list[str]]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         recording = source()
-    return recording, [str(one.message) for one in caught if one.category is ReadingNote]
+    notes = [one for one in caught if one.category is ReadingNote]
+    assert {one.filename for one in notes} <= {__file__}  # the place where the user reads
+    return recording, [str(one.message) for one in notes]
 
 
 def assert_same(table: pd.DataFrame) -> Recording:
