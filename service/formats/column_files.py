@@ -29,7 +29,7 @@ from service.formats.table_layout import (
 )
 from sysid.core.errors import UnreadableFile
 from sysid.core.types import IntArray
-from sysid.data.table_rules import CellKind, Heading, is_time_name
+from sysid.data.table_rules import CellKind, Heading, is_temperature_name, is_time_name
 
 if TYPE_CHECKING:
     import polars as pl
@@ -127,7 +127,8 @@ def _open_simulink(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
     columns, left_out = _collect_columns(arrays)
     sample_time = options.sample_time
-    if sample_time is None and not any(is_time_name(name) for name in columns):
+    times = [name for name in columns if is_time_name(name) and not is_temperature_name(name)]
+    if sample_time is None and not times:
         sample_time = _find_period(arrays, notes)
     if left_out:
         notes.append(f"{', '.join(left_out)} hold no samples of a signal and were left out")

@@ -615,6 +615,10 @@ def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_perio
     with pytest.raises(UnreadableFile, match=r"there is no time column; found T, u\."):
         read_rows(["T [°C],u", *rows[1:]])
     assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
+    arrays = write_npz(T=20 + TIMES, u=INPUT, Ts=0.5)
+    recording, _ = read_with_notes(arrays)
+    assert recording.names == ("T", "u")
+    assert recording.sampling.period == 0.5
 
 
 def test_a_zone_belongs_to_its_column() -> None:
