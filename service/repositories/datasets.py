@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from service.repositories.lineage import LineageRepository, Relation
 from service.storage.columns import Document, utc_now
 from service.storage.errors import RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, make_page, new_id
 from service.storage.tables import DEFAULT_PROJECT, Dataset
 
@@ -47,8 +48,8 @@ class StoredDataset:
 class DatasetRepository:
     """The datasets of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def add(
         self, new: NewDataset, *, parents: Iterable[str] = (), relation: Relation = "derived"

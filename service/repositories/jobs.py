@@ -12,8 +12,9 @@ from service.core.states import OPEN_STATES, JobState
 from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
-from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
+from service.storage.tables import IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -41,8 +42,8 @@ class Submission:
 class JobRepository:
     """The jobs of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def submit(self, new: NewJob, *, key: str | None = None, request_hash: str = "") -> Submission:
         """Queue a job; with a `key` that was used before, return the earlier job.

@@ -10,8 +10,9 @@ from sqlalchemy.orm import Session
 
 from service.storage.columns import Document, to_json, utc_now
 from service.storage.errors import RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, make_page, new_id
-from service.storage.tables import DEFAULT_PROJECT, ModelVersion
+from service.storage.tables import ModelVersion
 
 _MAX_TRIES = 20
 
@@ -27,8 +28,8 @@ class AddedModel:
 class ModelRepository:
     """The models of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def add(self, name: str, document: Document) -> AddedModel:
         """Store a document as the next version of `name`, unless it equals the latest version."""
