@@ -6,8 +6,10 @@ from importlib.metadata import version
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from service.api import (
+    access,
     datasets,
     events,
     health,
@@ -19,6 +21,7 @@ from service.api import (
     references,
     runs,
 )
+from service.api.access_check import AccessCheck
 from service.api.dependencies import Parts
 from service.api.html import PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
@@ -52,6 +55,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(chosen.proxy_addresses))
+    app.add_middleware(AccessCheck, settings=chosen)  # it sees the address of the peer itself
     app.add_middleware(OriginCheck, settings=chosen)
     app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
@@ -65,6 +70,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         events.router,
         runs.comparison_router,
         runs.router,
+        access.router,
         pages.router,
     ):
         app.include_router(router)
@@ -79,7 +85,7 @@ def open_parts(settings: Settings) -> Parts:
     Misconfigured
         If the data folder is not writable.
     """
-    return Parts(settings, *open_storage(settings))
+    return Parts.build(settings, *open_storage(settings))
 
 
 def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]

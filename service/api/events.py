@@ -7,12 +7,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header
 from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
 from service.api.dependencies import Parts, PartsDep
 from service.api.event_feed import EventBatch
 from service.core.errors import InvalidRequest
 from service.core.text_checks import MANY, parse_digits
+from service.repositories.jobs import JobRepository
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -51,10 +53,17 @@ async def stream_events(
 ) -> Response:
     """Stream events as they happen: state, progress, log, end. Continues after `Last-Event-ID`."""
     last = _parse_event_id(last_event_id)
+    await run_in_threadpool(_check_job, parts, job_id)
     batch = await parts.feed.read_after(job_id, last)
     if batch.is_over and not batch.text:
         return Response(status_code=204)  # an EventSource then does not reconnect
     return EventStreamResponse(_stream_events(parts, job_id, last), parts.feed.watch_job(job_id))
+
+
+def _check_job(parts: Parts, job_id: str) -> None:
+    """Check that the caller may see a job: the feed serves those of all projects."""
+    with parts.database.read_session() as session:
+        JobRepository(session).get_state(job_id)
 
 
 async def _stream_events(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:

@@ -9,6 +9,8 @@ from typing import Any
 
 from fastapi import FastAPI
 
+from service.access.scopes import find_needed_scope
+from service.api.access_check import COOKIE
 from service.api.problems import PROBLEM_TYPE
 from service.core import errors
 from service.core.errors import ServiceError
@@ -20,6 +22,22 @@ _SAFE_METHODS = ("get", "head", "options")
 _FASTAPI_SCHEMAS = ("HTTPValidationError", "ValidationError")
 _PROBLEM_SCHEMA = "ProblemOut"
 _BINARY_TYPE = "application/x-mcap"
+
+
+SECURITY_SCHEMES: dict[str, Any] = {
+    "key": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "An API key, `lagid_…`. Nothing is needed where the service has keys off.",
+    },
+    "session": {
+        "type": "apiKey",
+        "in": "cookie",
+        "name": COOKIE,
+        "description": "The session of a browser that signed in at `/sign-in`.",
+    },
+}
+"""How a request shows who sends it; one of them is enough."""
 
 
 class ProblemOut(Answer):
@@ -53,10 +71,6 @@ def _gives_file(_method: str, operation: Operation) -> bool:
     return any(_BINARY_TYPE in response.get("content", {}) for response in _answers(operation))
 
 
-def _creates_job(_method: str, operation: Operation) -> bool:
-    return "202" in operation["responses"]
-
-
 def _has_input(method: str, operation: Operation) -> bool:
     return _has_body(method, operation) or bool(operation.get("parameters"))
 
@@ -71,8 +85,18 @@ def _answers(operation: Operation) -> list[Mapping[str, Any]]:
     return list(operation["responses"].values())
 
 
+def _needs_key(_method: str, operation: Operation) -> bool:
+    return bool(operation["security"])
+
+
+def _adds_rows(_method: str, operation: Operation) -> bool:
+    return not {"201", "202"}.isdisjoint(operation["responses"])
+
+
 RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
+    (errors.Unauthorized, _needs_key),
     (errors.ForeignOrigin, _is_unsafe),
+    (errors.OutOfScope, _needs_key),
     (errors.NotFound, _names_resource),
     (errors.StalledRequest, _has_file),
     (errors.Conflict, _names_resource),
@@ -82,7 +106,7 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.UnsatisfiableRange, _gives_file),
     (errors.MisdirectedRequest, _is_any),
     (errors.InvalidRequest, _has_input),
-    (errors.QuotaExceeded, _creates_job),
+    (errors.QuotaExceeded, _adds_rows),
     (errors.Unavailable, _is_any),
 )
 """Each error, and which operations may answer with it."""
@@ -96,8 +120,11 @@ class DocumentedApp(FastAPI):
         if self.openapi_schema is None:
             document = super().openapi()
             _add_problem_schema(document["components"]["schemas"])
-            for methods in document["paths"].values():
+            document["components"]["securitySchemes"] = SECURITY_SCHEMES
+            for path, methods in document["paths"].items():
                 for method, operation in methods.items():
+                    needs_key = find_needed_scope(method.upper(), path) is not None
+                    operation["security"] = [{name: []} for name in SECURITY_SCHEMES if needs_key]
                     _add_errors(method, operation)
         assert self.openapi_schema is not None
         return self.openapi_schema
@@ -112,11 +139,14 @@ def _add_problem_schema(schemas: dict[str, Any]) -> None:
 
 def _add_errors(method: str, operation: dict[str, Any]) -> None:
     reference = {"$ref": f"#/components/schemas/{_PROBLEM_SCHEMA}"}
+    titles: dict[str, list[str]] = {}
     for error, applies in RULES:
-        code = str(error.status)
-        operation["responses"].pop(code, None)  # FastAPI's own 422 has another form
         if applies(method, operation):
-            operation["responses"][code] = {
-                "description": error.title,
-                "content": {PROBLEM_TYPE: {"schema": reference}},
-            }
+            titles.setdefault(str(error.status), []).append(error.title)
+    for error, _ in RULES:
+        operation["responses"].pop(str(error.status), None)  # FastAPI's 422 has another form
+    for code, reasons in titles.items():
+        operation["responses"][code] = {
+            "description": "; ".join(reasons),
+            "content": {PROBLEM_TYPE: {"schema": reference}},
+        }

@@ -9,6 +9,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
+from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
@@ -144,6 +145,7 @@ class JobRepository:
             job.state, job.finished_at = JobState.CANCELLED, utc_now()
             end_open_runs(self._session, job_id, JobState.CANCELLED, None)
             EventRepository(self._session).append_state(job)
+        record_action(self._session, "job.cancel", job_id, self._project_id)
         self._session.flush()
         return job
 
@@ -168,6 +170,7 @@ class JobRepository:
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
         self._session.execute(delete(StoredSummary).where(StoredSummary.job_id == job_id))
+        record_action(self._session, "job.resume", job_id, self._project_id)
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job
@@ -178,6 +181,7 @@ class JobRepository:
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
         job.deleted_at = utc_now()
+        record_action(self._session, "job.delete", job_id, self._project_id)
         self._session.flush()
 
     def _filter_project(self) -> tuple[Any, ...]:
@@ -208,6 +212,7 @@ class JobRepository:
         )
         self._session.add(job)
         self._session.flush()
+        record_action(self._session, "job.submit", job.id, self._project_id)
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job

@@ -8,6 +8,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.repositories.audit import record_action
 from service.storage.columns import Document, to_json, utc_now
 from service.storage.errors import RowNotFound
 from service.storage.sessions import find_project
@@ -68,7 +69,9 @@ class ModelRepository:
 
     def delete(self, reference: str) -> None:
         """Hide one version of a model; jobs with this version keep its document."""
-        self.get(reference).deleted_at = utc_now()
+        model = self.get(reference)
+        model.deleted_at = utc_now()
+        record_action(self._session, "model.delete", model.id, self._project_id)
         self._session.flush()
 
     def _filter_project(self) -> tuple[Any, ...]:
@@ -105,4 +108,5 @@ class ModelRepository:
         )
         self._session.add(model)
         self._session.flush()
+        record_action(self._session, "model.add", model.id, self._project_id)
         return model

@@ -7,6 +7,7 @@ from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.repositories.audit import record_action
 from service.storage.columns import Document
 from service.storage.errors import RowConflict, RowNotFound
 from service.storage.sessions import find_project
@@ -61,6 +62,7 @@ class ReferenceRepository:
                     self._session.flush()
             except IntegrityError:
                 continue
+            record_action(self._session, "reference.accept", run_id, self._project_id)
             return new
         raise RowConflict(f"reference {name!r} is being accepted by others; try again")
 
