@@ -31,7 +31,7 @@ class Guarded:
 
     def parts_for(self, project: str) -> Parts:
         """The parts as a request of a project has them."""
-        return self.parts.owned_by(SessionOwner(project, "test"))
+        return self.parts.open_for(SessionOwner(project, "test"))
 
     def add_project(self, name: str, **limits: int) -> str:
         with self.parts.database.write_session() as session:

@@ -137,7 +137,7 @@ def sign_in(database: Database, token: str, lifetime: timedelta) -> tuple[str, d
         key = _check_token(session, token)
     secret, ends_at = make_secret(), datetime.now(UTC) + lifetime
     owner = SessionOwner(key.project_id, key.id)
-    with database.owned_by(owner).write_session() as session:
+    with database.open_for(owner).write_session() as session:
         end = min(filter(None, (ends_at, key.expires_at)))
         add_web_session(session, key, hash_secret(secret), end)
     _note_use(database, key)
@@ -151,7 +151,7 @@ def sign_out(database: Database, cookie: str) -> None:
         key = find_session_key(session, digest)
     if key is not None:
         owner = SessionOwner(key.project_id, key.id)
-        with database.owned_by(owner).write_session() as session:
+        with database.open_for(owner).write_session() as session:
             end_web_session(session, digest)
 
 

@@ -52,9 +52,9 @@ class Parts:
             settings, database, store, stopping, asyncio.Semaphore(settings.max_uploads), feed
         )
 
-    def owned_by(self, owner: SessionOwner) -> "Parts":
+    def open_for(self, owner: SessionOwner) -> "Parts":
         """Return the same parts for requests of an owner."""
-        return replace(self, database=self.database.owned_by(owner))
+        return replace(self, database=self.database.open_for(owner))
 
 
 def get_caller(request: Request) -> Caller:
@@ -69,7 +69,7 @@ CallerDep = Annotated[Caller, Depends(get_caller)]
 def get_parts(request: Request, caller: CallerDep) -> Parts:
     """Return the parts of this process for the caller."""
     parts: Parts = request.app.state.parts
-    return parts.owned_by(caller.to_owner(request.state.request_id))
+    return parts.open_for(caller.to_owner(request.state.request_id))
 
 
 PartsDep = Annotated[Parts, Depends(get_parts)]

@@ -28,7 +28,8 @@ SECURITY_SCHEMES: dict[str, Any] = {
     "key": {
         "type": "http",
         "scheme": "bearer",
-        "description": "An API key, `lagid_…`. Nothing is needed where the service has keys off.",
+        "description": "An API key, `lagid_…`, with the scope that the operation names. Nothing is "
+        "needed where the service has keys off.",
     },
     "session": {
         "type": "apiKey",
@@ -89,8 +90,9 @@ def _needs_key(_method: str, operation: Operation) -> bool:
     return bool(operation["security"])
 
 
-def _adds_rows(_method: str, operation: Operation) -> bool:
-    return not {"201", "202"}.isdisjoint(operation["responses"])
+def _adds_rows(method: str, operation: Operation) -> bool:
+    is_writing = {"key": ["write"]} in operation["security"]
+    return is_writing and (_has_body(method, operation) or "202" in operation["responses"])
 
 
 RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
@@ -123,8 +125,10 @@ class DocumentedApp(FastAPI):
             document["components"]["securitySchemes"] = SECURITY_SCHEMES
             for path, methods in document["paths"].items():
                 for method, operation in methods.items():
-                    needs_key = find_needed_scope(method.upper(), path) is not None
-                    operation["security"] = [{name: []} for name in SECURITY_SCHEMES if needs_key]
+                    scope = find_needed_scope(method.upper(), path)
+                    operation["security"] = (
+                        [{name: [scope]} for name in SECURITY_SCHEMES] if scope else []
+                    )
                     _add_errors(method, operation)
         assert self.openapi_schema is not None
         return self.openapi_schema

@@ -58,7 +58,7 @@ def _open_projects(data_dir: Any) -> Iterator["Database"]:
     settings.prepare_data_folder()
     with open_database(settings) as database:
         migrate.upgrade_database(database)
-        yield database.owned_by(SessionOwner(actor=ACTOR))
+        yield database.open_for(SessionOwner(actor=ACTOR))
 
 
 @key_app.command(

@@ -116,7 +116,7 @@ def end_web_session(session: Session, digest: str) -> None:
 
 def list_project_names(session: Session) -> dict[str, str]:
     """List the name of each project."""
-    return dict(session.execute(select(Project.id, Project.name)).tuples().all())
+    return dict(session.execute(select(Project.id, Project.name)).all())
 
 
 def _is_valid() -> tuple[ColumnElement[bool], ...]:

@@ -83,7 +83,7 @@ class Database:
         """Whether the database is SQLite (else PostgreSQL)."""
         return self.engine.dialect.name == "sqlite"
 
-    def owned_by(self, owner: SessionOwner) -> "Database":
+    def open_for(self, owner: SessionOwner) -> "Database":
         """Return the same database for sessions of an owner; both share their connections."""
         owned = copy.copy(self)
         owned._info = {_DATABASE_KEY: owned, _OWNER_KEY: owner}

@@ -175,7 +175,7 @@ def test_a_trend_and_the_best_run_are_read_within_a_project(shared):
 
 
 def test_sessions_of_an_owner_see_and_write_its_project_alone(shared):
-    mine, theirs = (shared.owned_by(SessionOwner(project)) for project in PROJECTS)
+    mine, theirs = (shared.open_for(SessionOwner(project)) for project in PROJECTS)
     with theirs.write_session() as session:
         dataset = DatasetRepository(session).add(new_dataset()).dataset.id
         job = JobRepository(session).submit(NewJob(name="tube", spec={"model": "tube"})).job.id

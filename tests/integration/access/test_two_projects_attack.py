@@ -11,9 +11,11 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import select
 
+from service.access.scopes import find_needed_scope
 from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
+from service.repositories.audit import list_actions
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, AuditEntry, Base, Project
 from sysid.identification.figures import FigureName
 from sysid.models.catalogue.load import copy_catalogue_document
@@ -137,18 +139,17 @@ def _list_bodies(path: str, victim: Side) -> list[dict[str, Any]]:
         ],
         "/v1/datasets/{dataset_id}:derive": [{"steps": [{"trim": {"stop": 10}}]}],
         "/v1/runs/{run_id}:simulate": [
-            {"inputs": {"u": {"kind": "step"}}, "samples": 200, "sample_time": 0.1}
+            {"inputs": {"u": {"kind": "step"}}, "samples": 200, "sample_time": 0.1, "store": True}
         ],
         "/v1/runs/{run_id}:validate": [{"dataset": victim.dataset}],
         "/v1/runs/{run_id}:profile": [{"points": 3}],
         "/v1/runs:compare": [{"runs": victim.ids["run_id"]}],
         "/v1/references/{name:path}": [{"run": victim.run}],
+        "/v1/models": [{**copy_catalogue_document("fopdt"), "name": f"of-{len(victim.mark)}"}],
         "/v1/models:check": [{"name": victim.model}],
     }
     if path == "/v1/datasets":
-        return [{"content": b"no recording", "headers": CSV}]
-    if path == "/v1/models":
-        return [{"content": b"{}", "headers": JSON}]
+        return [{"content": recording(n=60 + len(victim.mark)), "headers": CSV}]
     return [{"content": json.dumps(body), "headers": JSON} for body in bodies.get(path, [])]
 
 
@@ -204,11 +205,15 @@ def test_the_same_requests_are_answered_to_who_owns_what_they_name(
 ) -> None:
     """Else the attack would be refused for another reason."""
     side = sides[1]
-    marked = 0
+    marked, done, recorded = 0, set(), set()
     for method, route, path, arguments in _list_requests(guarded, side):
-        if "content" in arguments and b"no recording" != arguments["content"] != b"{}":
+        if "content" in arguments:
+            before = _count_actions(guarded, side)
             answer = guarded.ask(method, path, side.key, **dict(arguments))
             assert answer.is_success or "name" in route.path, (method, path, arguments, answer.text)
+            if find_needed_scope(method, path) != "read":
+                done.add(route.path)
+                recorded |= {route.path} if _count_actions(guarded, side) > before else set()
         if method in ("GET", "HEAD") and any(f"{{{name}}}" in route.path for name in IDS):
             answer = guarded.ask(method, path, side.key, **dict(arguments))
             allowed = (200, 204, 404) if "figures" in path else (200, 204)
@@ -216,6 +221,8 @@ def test_the_same_requests_are_answered_to_who_owns_what_they_name(
             assert answer.status_code in allowed, (method, path, answer.text[:300])
             marked += side.mark in answer.text
     assert marked > 10
+    assert done == recorded  # each kind of change is in the audit log
+    assert len(done) > 7
     for path in ("/v1/jobs", "/v1/datasets", "/v1/models", "/", "/datasets"):
         assert side.mark in guarded.ask("GET", path, side.key).text
 
@@ -249,6 +256,11 @@ def test_equal_bytes_keys_and_runs_of_two_projects_stay_apart(
     for side in sides:
         result = guarded.ask("GET", f"/v1/runs/{side.run}", side.key).json()
         assert "reused_from" not in result or result["reused_from"] is None
+
+
+def _count_actions(guarded: Guarded, side: Side) -> int:
+    with guarded.parts.database.read_session() as session:
+        return len(list_actions(session, side.project, limit=1000).items)
 
 
 def _read_rows(guarded: Guarded, project: str) -> dict[str, list[Any]]:
