@@ -174,7 +174,7 @@ def _check_cookie(session: Session, cookie: str | None) -> ApiKey:
         what = "the request has no API key" if cookie is None else "the session has ended"
         raise Unauthorized(
             f"{what}. Send the header `Authorization: Bearer lagid_…` (commands: --key or "
-            "LAGID_KEY), or sign in at /sign-in"
+            "LAGID_API_KEY), or sign in at /sign-in"
         )
     return key
 

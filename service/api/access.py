@@ -120,7 +120,11 @@ def add_key(
     days: Annotated[str, Form(max_length=10)] = "",
 ) -> Response:
     """Create a key, and show it once."""
-    created = keys.create_key(session, caller.project_id, name, scope, _read_days(days))
+    try:
+        created = keys.create_key(session, caller.project_id, name, scope, _read_days(days))
+    except InvalidRequest as error:
+        fault = error.detail.removeprefix("/")
+        return HtmlPage(keys_page(session, caller.project_id, fault=fault), error.status)
     return HtmlPage(keys_page(session, caller.project_id, created), 201)
 
 

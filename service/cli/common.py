@@ -65,7 +65,7 @@ Key = Annotated[
     str | None,
     typer.Option(
         "--key",
-        envvar="LAGID_KEY",
+        envvar=["LAGID_API_KEY", "LAGID_KEY"],
         help="API key.",
         show_default=False,
         rich_help_panel=SERVER_PANEL,

@@ -17,7 +17,9 @@ def sign_in_page(target: str, fault: str = "") -> str:
     return render_template("sign_in.html", target=target, fault=fault)
 
 
-def keys_page(session: Session, project_id: str, created: CreatedKey | None = None) -> str:
+def keys_page(
+    session: Session, project_id: str, created: CreatedKey | None = None, fault: str = ""
+) -> str:
     """Render the keys of a project; a new one is shown with its text, this once."""
     now = datetime.now(UTC)
     rows = [
@@ -26,5 +28,5 @@ def keys_page(session: Session, project_id: str, created: CreatedKey | None = No
     ]
     project = ProjectRepository(session).get(project_id)
     return render_template(
-        "keys.html", keys=rows, project=project.name, scopes=SCOPES, created=created
+        "keys.html", keys=rows, project=project.name, scopes=SCOPES, created=created, fault=fault
     )
