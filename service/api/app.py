@@ -23,7 +23,7 @@ from service.api import (
 )
 from service.api.access_check import AccessCheck
 from service.api.dependencies import Parts
-from service.api.html import PROTECTIVE_HEADERS
+from service.api.html import PRIVATE_HEADERS, PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
 from service.api.openapi import DocumentedApp
 from service.core.settings import Settings
@@ -55,6 +55,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    if chosen.auth_mode != "off":
+        app.add_middleware(ResponseHeaders, headers=PRIVATE_HEADERS)
     app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(chosen.proxy_addresses))
     app.add_middleware(AccessCheck, settings=chosen)  # it sees the address of the peer itself
     app.add_middleware(OriginCheck, settings=chosen)

@@ -110,6 +110,13 @@ def test_a_body_without_a_key_is_not_read(guarded: Guarded) -> None:
     refused(answer, 401, "unauthorized")
 
 
+def test_no_cache_gives_an_answer_to_another_caller(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    answer = guarded.ask("GET", "/v1/jobs", token)
+    assert answer.headers["cache-control"] == "private, no-cache"
+    assert guarded.ask("GET", "/", token, headers=PAGE).headers["cache-control"] == "no-store"
+
+
 def test_access_says_who_asks(guarded: Guarded) -> None:
     project = guarded.add_project("asking", max_open_jobs=3)
     token = guarded.add_key(project, "write")
@@ -252,7 +259,8 @@ def test_keys_are_made_shown_once_and_revoked_on_their_page(guarded: Guarded) ->
     for form in ({"name": " "}, {"name": "a", "days": "0"}, {"name": "a", "days": "x"}):
         answer = guarded.ask("POST", "/keys", admin, data=form)
         assert answer.status_code == 422
-        assert 'role="alert"' in answer.text and "found" in answer.text
+        assert 'role="alert"' in answer.text
+        assert "found" in answer.text
     refused(guarded.ask("POST", "/keys", admin, data={"name": "a", "scope": "all"}), 422, "invalid")
 
 

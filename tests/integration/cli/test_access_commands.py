@@ -9,7 +9,8 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from tests.commands import check_refusal, run_lagid
-from tests.rest import settings_of
+from tests.rest import recording, settings_of
+from tests.serving import serve_in_thread
 
 
 @pytest.fixture
@@ -62,6 +63,22 @@ def test_limits_are_set_and_removed(folder: Path) -> None:
     assert (listed["max_open_runs"], listed["stored_bytes"]) == (7, 0)
     text = run_lagid("project", "limit", "default", "--max-open-runs", "none", "--data-dir", folder)
     assert "max open runs none" in text.stdout
+
+
+def test_commands_send_the_key_of_the_environment(folder: Path) -> None:
+    key = read_json(folder, "key", "create", "a", "--scope", "write")["key"]
+    record = folder / "steps.csv"
+    record.write_bytes(recording())
+    with serve_in_thread(create_app(settings_of(folder, auth="keys"))) as url:
+        line = check_refusal(run_lagid("jobs", LAGID_URL=url))
+        assert "LAGID_API_KEY" in line
+        known = {"LAGID_URL": url, "LAGID_API_KEY": key}
+        assert run_lagid("dataset", "add", record, **known).code == 0
+        body = folder / "job.yaml"
+        body.write_text("model: fopdt\ndatasets: [steps]\n")
+        assert run_lagid("submit", body, **known).code == 0
+        assert "fopdt" in run_lagid("jobs", "--url", url, "--key", key).stdout
+        assert "is unknown" in check_refusal(run_lagid("jobs", "--key", "lagid_1_2", LAGID_URL=url))
 
 
 def test_the_audit_log_is_listed(folder: Path) -> None:
