@@ -35,7 +35,11 @@ class Guarded:
 
     def add_project(self, name: str, **limits: int) -> str:
         with self.parts.database.write_session() as session:
-            return ProjectRepository(session).add(name, limits).id
+            repository = ProjectRepository(session)
+            project = repository.add(name).id
+            if limits:
+                repository.change_limits(project, limits)
+            return project
 
     def add_key(
         self, project: str = DEFAULT_PROJECT, scope: Scope = "admin", days: int | None = None

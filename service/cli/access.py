@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from service.storage.tables import Project as ProjectRow
 
 DEFAULT_PROJECT_NAME = "default"
+MAX_NAME_CHARACTERS = 100
 ACTOR = "command line"
 NO_LIMIT = "none"
 """What removes a limit."""
@@ -155,28 +156,21 @@ def revoke_key(
 
 @project_app.command(
     "create",
-    epilog=show_examples(
-        "lagid project create tubes", "lagid project create students --max-open-jobs 5"
-    ),
+    epilog=show_examples("lagid project create tubes"),
 )
 def create_project(
     name: Annotated[str, typer.Argument(help="Name of the project.")],
-    max_open_jobs: LimitText = None,
-    max_open_runs: LimitText = None,
-    max_stored_bytes: LimitText = None,
-    max_daily_evaluations: LimitText = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Create a project; its keys see nothing of others."""
-    limits = _read_limits(max_open_jobs, max_open_runs, max_stored_bytes, max_daily_evaluations)
-    if not name.strip() or not name.isprintable() or len(name) > 100:
-        fail_usage(f"{name!r:.120} is no name; need 1 to 100 printable characters")
+    if not name.strip() or not name.isprintable() or len(name) > MAX_NAME_CHARACTERS:
+        fail_usage(f"{name!r:.120} is no name; need 1 to {MAX_NAME_CHARACTERS} characters")
     with _open_projects(data_dir) as database:
         from service.repositories.projects import ProjectRepository
 
         with database.write_session() as session:
-            project = ProjectRepository(session).add(name.strip(), limits)
+            project = ProjectRepository(session).add(name.strip())
         _print_project(project, as_json)
 
 

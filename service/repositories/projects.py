@@ -57,8 +57,8 @@ class ProjectRepository:
     def __init__(self, session: Session) -> None:
         self._session = session
 
-    def add(self, name: str, limits: Mapping[str, int | None]) -> Project:
-        """Create a project.
+    def add(self, name: str) -> Project:
+        """Create a project without limits of its own.
 
         Raises
         ------
@@ -67,7 +67,7 @@ class ProjectRepository:
         """
         if self._session.scalar(select(Project.id).where(Project.name == name)) is not None:
             raise RowConflict(f"there is a project {name!r} already; choose another name")
-        project = Project(id=new_id("proj"), name=name, **limits)
+        project = Project(id=new_id("proj"), name=name)
         self._session.add(project)
         self._session.flush()
         record_action(self._session, "project.create", project.id, project.id)

@@ -10,6 +10,7 @@ from sqlalchemy import update
 
 from service.access.tokens import hash_secret, parse_token
 from service.api.access_check import COOKIE
+from service.repositories.keys import note_use
 from service.storage.tables import ApiKey, WebSession
 from tests.database import record_statements
 from tests.guarded import Guarded, guard
@@ -140,6 +141,18 @@ def test_the_last_use_of_a_key_is_written_once_a_minute(guarded: Guarded) -> Non
     assert [count_writes() for _ in range(3)] == [1, 0, 0]
     change_key(guarded, token, last_used_at=datetime.now(UTC) - timedelta(seconds=61))
     assert [count_writes() for _ in range(2)] == [1, 0]
+
+
+def test_requests_at_once_write_the_use_of_a_key_once(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    uses = []
+    for _ in range(2):  # both have read that the key was never used
+        with guarded.parts.database.write_session() as session:
+            note_use(session, key_id(token))
+        with guarded.parts.database.read_session() as session:
+            uses.append(session.get_one(ApiKey, key_id(token)).last_used_at)
+    assert uses[0] is not None
+    assert uses[0] == uses[1]
 
 
 def test_only_digests_are_stored_and_nothing_is_logged(
@@ -295,7 +308,11 @@ def test_nothing_is_recorded_of_what_was_refused(guarded: Guarded) -> None:
     answer = guarded.ask("POST", "/v1/datasets", token, content=recording(n=30), headers=CSV)
     refused(answer, 429, "quota")
     actions = guarded.ask("GET", "/v1/audit", token).json()["items"]
-    assert {entry["action"] for entry in actions} == {"key.create", "project.create"}
+    assert {entry["action"] for entry in actions} == {
+        "key.create",
+        "project.create",
+        "project.limit",
+    }
     assert guarded.ask("GET", "/v1/datasets", token).json()["items"] == []
 
 

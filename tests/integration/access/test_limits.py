@@ -28,7 +28,8 @@ def limited(database: Database) -> Database:
     """The database for a project that may store 25 bytes and make 100 evaluations a day."""
     limits = {"max_stored_bytes": 25, "max_daily_evaluations": 100, "max_open_jobs": 3}
     with database.write_session() as session:
-        project = ProjectRepository(session).add("limited", limits)
+        project = ProjectRepository(session).add("limited")
+        ProjectRepository(session).change_limits("limited", limits)
     return database.open_for(SessionOwner(project.id))
 
 
@@ -135,4 +136,4 @@ def test_a_project_is_found_by_name_or_identifier_and_names_are_unique(limited: 
         with pytest.raises(RowNotFound, match="'absent'"):
             repository.get("absent")
         with pytest.raises(RowConflict, match="'limited' already"):
-            repository.add("limited", {})
+            repository.add("limited")
