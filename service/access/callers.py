@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from service.access.scopes import SCOPES, Scope, include_scopes
 from service.access.tokens import hash_secret, is_secret, make_secret, parse_token
 from service.core.errors import OutOfScope, Unauthorized
-from service.core.settings import Settings
+from service.core.settings import Settings, is_loopback
 from service.repositories.keys import (
     USE_INTERVAL,
     add_web_session,
@@ -96,7 +96,8 @@ class Caller:
 
 
 LOOPBACK = Caller(DEFAULT_PROJECT, "loopback", SCOPES)
-"""Everybody who reaches a service without keys."""
+ANYBODY = Caller(DEFAULT_PROJECT, "anybody", SCOPES)
+"""Who reaches a service without keys: from this machine, or from others."""
 NOBODY = Caller("", "nobody", ())
 """Who needs no key: sees the rows of no project."""
 
@@ -110,7 +111,7 @@ def find_caller(database: Database, settings: Settings, credentials: Credentials
         If the request shows no valid key, session or user.
     """
     if settings.auth_mode == "off":
-        return LOOPBACK
+        return LOOPBACK if is_loopback(settings.host) else ANYBODY
     with database.read_session() as session:
         if credentials.token is not None:
             key = _check_token(session, credentials.token)

@@ -37,7 +37,8 @@ class SessionOwner:
     ----------
     project_id : str
     actor : str
-        Identifier of an API key, ``user:NAME`` from a proxy, ``loopback``, or a part of lagid.
+        Identifier of an API key, or ``user:NAME`` from a proxy. Without keys ``loopback``, or
+        ``anybody`` on an open host. Else a part of lagid.
     request_id : str or None
         Identifier of the request that the session serves.
     """

@@ -80,3 +80,9 @@ def test_on_loopback_nothing_is_asked(tmp_path: Path) -> None:
         assert (answer["actor"], answer["project"]) == ("loopback", "proj_default")
         assert "Sign out" not in client.get("/").text
         assert client.get("/v1/audit").json()["items"] == []
+
+
+def test_an_open_host_without_keys_does_not_call_its_callers_loopback(tmp_path: Path) -> None:
+    settings = settings_of(tmp_path, host="0.0.0.0", allow_open_host=True)
+    with TestClient(create_app(settings)) as client:
+        assert client.get("/v1/access").json()["actor"] == "anybody"
