@@ -43,6 +43,8 @@ class AccessCheck:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
+        # The middleware inside replaces it by the address that a proxy names.
+        request.state.peer = request.client.host if request.client else ""
         try:
             caller = await self._admit(request)
         except (ServiceError, StorageError, SQLAlchemyError) as error:
@@ -77,6 +79,21 @@ class AccessCheck:
         return answer_error(request, error)
 
 
+def is_still_admitted(request: Request, parts: Parts) -> bool:
+    """Return whether the sender of a request that takes long would still be admitted.
+
+    A database that is away says nothing about it.
+    """
+    settings = parts.settings
+    try:
+        find_caller(parts.database, settings, read_credentials(request, settings))
+    except Unauthorized:
+        return False
+    except SQLAlchemyError:
+        pass
+    return True
+
+
 def read_credentials(request: Request, settings: Settings) -> Credentials:
     """Read what a request shows of its sender.
 
@@ -97,7 +114,7 @@ def read_credentials(request: Request, settings: Settings) -> Credentials:
         token,
         cookie_parser(request.headers.get("cookie", "")).get(COOKIE),
         tuple(request.headers.getlist(settings.proxy_header)),
-        request.client.host if request.client else "",
+        request.state.peer,
     )
 
 

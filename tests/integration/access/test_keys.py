@@ -2,6 +2,7 @@
 
 import logging
 import re
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -9,12 +10,14 @@ import pytest
 from sqlalchemy import update
 
 from service.access.tokens import hash_secret, parse_token
+from service.api import events
 from service.api.access_check import COOKIE
 from service.repositories.keys import note_use
 from service.storage.tables import ApiKey, WebSession
 from tests.database import record_statements
 from tests.guarded import Guarded, guard
 from tests.rest import CSV, recording, refused
+from tests.stored import submit
 
 PAGE = {"Accept": "text/html"}
 MODEL = {"name": "tank"}
@@ -224,6 +227,23 @@ def test_a_session_ends_with_its_key_and_its_time(guarded: Guarded) -> None:
         session.execute(update(WebSession).values(expires_at=datetime.now(UTC)))
     for cookie in cookies:
         refused(guarded.ask("GET", "/v1/jobs", headers=cookie), 401, "unauthorized")
+
+
+def test_an_open_event_stream_ends_after_its_key(
+    guarded: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.05)
+    token, parts = guarded.add_key(), guarded.parts
+    job = submit(parts.database)
+    with ThreadPoolExecutor(1) as pool:
+        stream = pool.submit(guarded.ask, "GET", f"/v1/jobs/{job}/events", token)
+        with pytest.raises(TimeoutError):
+            stream.result(timeout=0.5)
+        change_key(guarded, token, revoked_at=datetime.now(UTC))
+        answer = stream.result(timeout=60)
+    assert answer.status_code == 200
+    assert "still here" in answer.text
+    refused(guarded.ask("GET", f"/v1/jobs/{job}/events", token), 401, "unauthorized")
 
 
 def test_a_wrong_key_at_the_form_is_told_there(guarded: Guarded) -> None:
