@@ -39,7 +39,7 @@ from sysid.identification.minima import (
     Fit,
     FoundMinima,
     collect_minima,
-    compute_distance,
+    find_nearest,
     continue_from_archive,
     is_same_place,
     scan_by_projection,
@@ -330,7 +330,7 @@ class _EstimateSearch:
             replace(fit, theta=order_exchangeable(problem, fit.theta, groups)) for fit in self._fits
         ]
         minima = collect_minima(problem, fits, self.analysis.linear_model)
-        own = min(minima, key=lambda one: compute_distance(problem, one.values, self.theta))
+        own = find_nearest(problem, minima, self.theta)
         equal = own.rms * (1.0 + SAME_OPTIMUM)  # anywhere on a group's surface, or a mirror image
         agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)

@@ -125,7 +125,7 @@ def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
 
 def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
     """Whiten basis and values, (n, r + 1), and compute ln det R."""
-    from scipy.linalg import cholesky_banded, solve_banded
+    from scipy.linalg.lapack import dgbsv, dpbtrf  # without the checks of `scipy.linalg`
 
     a, w = _to_pole_and_share(place)
     carried = a**series.gaps
@@ -133,10 +133,15 @@ def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArr
     band[0, 1:] = (1.0 - w) * (1.0 - carried**2) + w * (1.0 + carried**2)
     band[1, :-1] = -w * carried
     band[1, -1] = 0.0
-    root = cholesky_banded(band, lower=True)
+    root, fault = dpbtrf(band, lower=1)
+    if fault:
+        raise np.linalg.LinAlgError("the covariance of the differences is not positive definite")
     columns = np.column_stack([series.basis, series.values])
     columns[1:] -= carried[:, None] * columns[:-1]
-    return solve_banded((1, 0), root, columns), 2.0 * float(np.sum(np.log(root[0])))
+    matrix = np.zeros((3, series.values.size))  # one more row, for the factors
+    matrix[1:] = root
+    _, _, whitened, _ = dgbsv(1, 0, matrix, columns, overwrite_ab=1)
+    return np.asarray(whitened), 2.0 * float(np.sum(np.log(root[0])))
 
 
 def _compute_innovations(
