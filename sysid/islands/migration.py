@@ -8,7 +8,6 @@ import numpy as np
 from sysid.core.jit import jit_compile
 from sysid.core.settings import Migration
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.kernels.borrowing import borrow
 from sysid.islands.packed import (
     EvolutionLog,
     PackedIslands,
@@ -18,6 +17,7 @@ from sysid.islands.packed import (
     unpack_islands,
 )
 from sysid.islands.topology import list_edges
+from sysid.kernels.borrowing import borrow
 from sysid.search.evolution import reset_evidence, write_improvement
 from sysid.search.island import Island
 from sysid.search.operators import decode, encode, sort_population

@@ -11,8 +11,8 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray
-from sysid.kernels.borrowing import borrow
 from sysid.kernels.abi import NARROW_LANES
+from sysid.kernels.borrowing import borrow
 from sysid.kernels.calls import call_kernel
 from sysid.kernels.layout import HEAD_FIELDS
 
