@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, expit
 
+from sysid.core.jit import jit_compile
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
@@ -125,23 +126,32 @@ def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
 
 def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
     """Whiten basis and values, (n, r + 1), and compute ln det R."""
-    from scipy.linalg.lapack import dgbsv, dpbtrf  # without the checks of `scipy.linalg`
-
     a, w = _to_pole_and_share(place)
-    carried = a**series.gaps
-    band = np.ones((2, series.values.size))
-    band[0, 1:] = (1.0 - w) * (1.0 - carried**2) + w * (1.0 + carried**2)
-    band[1, :-1] = -w * carried
-    band[1, -1] = 0.0
-    root, fault = dpbtrf(band, lower=1)
-    if fault:
-        raise np.linalg.LinAlgError("the covariance of the differences is not positive definite")
     columns = np.column_stack([series.basis, series.values])
-    columns[1:] -= carried[:, None] * columns[:-1]
-    matrix = np.zeros((3, series.values.size))  # one more row, for the factors
-    matrix[1:] = root
-    _, _, whitened, _ = dgbsv(1, 0, matrix, columns, overwrite_ab=1)
-    return np.asarray(whitened), 2.0 * float(np.sum(np.log(root[0])))
+    return columns, _whiten_in_place(a**series.gaps, w, columns)
+
+
+@jit_compile
+def _whiten_in_place(carried: FloatArray, w: float, columns: FloatArray) -> float:
+    """Whiten columns (n, c) by the Cholesky factor of the differences; return ln det R.
+
+    `carried` (n - 1,) is the share of a sample's noise that the next one has, w that of white
+    noise. Not finite if R is not positive definite.
+    """
+    n, count = columns.shape
+    deviation, log_determinant = 1.0, 0.0  # of the first sample
+    for i in range(n - 1, 0, -1):
+        for c in range(count):
+            columns[i, c] -= carried[i - 1] * columns[i - 1, c]
+    for i in range(1, n):
+        share = carried[i - 1]
+        below = -w * share / deviation
+        variance = (1.0 - w) * (1.0 - share**2) + w * (1.0 + share**2) - below**2
+        deviation = np.sqrt(variance)
+        log_determinant += np.log(deviation)
+        for c in range(count):
+            columns[i, c] = (columns[i, c] - below * columns[i - 1, c]) / deviation
+    return 2.0 * log_determinant
 
 
 def _compute_innovations(
