@@ -249,7 +249,8 @@ def _warn_vague_group(group: IdentifiableCombination) -> str:
 
 def find_delay_parameters(problem: Problem) -> set[str]:
     """Find the names of the parameters that time lags depend on."""
-    return problem.share("delay parameters", lambda: _collect_delay_parameters(problem))
+    names = problem.share("delay parameters", lambda: _collect_delay_parameters(problem))
+    return names & set(problem.free_names)
 
 
 def _collect_delay_parameters(problem: Problem) -> set[str]:
@@ -261,7 +262,7 @@ def _collect_delay_parameters(problem: Problem) -> set[str]:
     for past_value in past_values:
         if past_value.delay is not None:
             names |= collect_parameter_names(past_value.delay)
-    return names & set(problem.free_names)
+    return names
 
 
 def _warn_correlations(
