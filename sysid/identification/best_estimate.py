@@ -452,9 +452,7 @@ class _EstimateSearch:
             reached, evaluations=end.evaluations + evaluations, is_cut_short=end.is_cut_short
         )
 
-    def _analyse(
-        self, theta: FloatArray, *whitening: Whitening, exchanges: ExchangeGroups
-    ) -> None:
+    def _analyse(self, theta: FloatArray, *whitening: Whitening, exchanges: ExchangeGroups) -> None:
         analysis = analyse_estimate(self.problem, theta, self._budget.count_left(), *whitening)
         self.analysis = replace(analysis, exchanges=exchanges) if exchanges else analysis
         self._budget.spend(self.analysis.evaluations)

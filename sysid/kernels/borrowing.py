@@ -8,6 +8,7 @@ arguments until it returns, so they need no counts inside.
 from typing import Any
 
 from numba.core import cgutils, types
+from numba.core.types.containers import BaseTuple
 from numba.extending import intrinsic
 
 
@@ -30,7 +31,7 @@ def _drop_counts(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         array.meminfo = cgutils.get_null_value(array.meminfo.type)
         array.parent = cgutils.get_null_value(array.parent.type)
         return array._getvalue()
-    if isinstance(kind, types.BaseTuple):
+    if isinstance(kind, BaseTuple):
         parts = cgutils.unpack_tuple(builder, value, len(kind))
         dropped = [
             _drop_counts(context, builder, part_kind, part)

@@ -128,7 +128,8 @@ def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArr
     """Whiten basis and values, (n, r + 1), and compute ln det R."""
     a, w = _to_pole_and_share(place)
     columns = np.column_stack([series.basis, series.values])
-    return columns, _whiten_in_place(a**series.gaps, w, columns)
+    carried = np.asarray(a**series.gaps, dtype=np.float64)
+    return columns, _whiten_in_place(carried, w, columns)
 
 
 @jit_compile
