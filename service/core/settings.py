@@ -1,10 +1,10 @@
 """Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
 
 import stat
-from ipaddress import ip_address
+from ipaddress import IPv4Network, IPv6Network, ip_address, ip_network
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -32,6 +32,10 @@ def _strip_slash(value: Any) -> Any:
     return value.rstrip("/") if isinstance(value, str) else value
 
 
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)]
+AuthMode = Literal["off", "keys", "proxy"]
+
+
 class Settings(BaseSettings):
     """Storage, address and limits of the service.
 
@@ -47,10 +51,22 @@ class Settings(BaseSettings):
         Workers of the local Ray; None: all cores.
     worker_memory_mb : int or None
         Memory of a worker for its runs, in MiB; None: its share of 80 % of the machine.
-    require_keys : bool or None
-        None: API keys are off on loopback and required elsewhere.
+    auth : str or None
+        ``off``: everybody who reaches the service may do everything. ``keys``: each request needs
+        an API key. ``proxy``: a key, or a user whom an authenticating proxy names. None: off on
+        loopback, keys elsewhere.
     allow_open_host : bool
-        Serve other hosts although this version has no API keys yet.
+        Serve other hosts without API keys.
+    proxy_header : str
+        Header in which an authenticating proxy names the user, for ``auth=proxy``.
+    proxy_addresses : tuple of str
+        Addresses or networks of proxies. Headers of other peers are not believed.
+    proxy_project : str
+        Project of the users whom the proxy names.
+    proxy_admins : tuple of str
+        Users of the proxy with the scope admin.
+    session_hours : float
+        How long a browser stays signed in.
     allowed_hosts : tuple of str
         More names by which requests may address the service, such as that of a reverse proxy.
     root_path : str
@@ -85,9 +101,14 @@ class Settings(BaseSettings):
     worker_memory_mb: int | None = Field(default=None, ge=256)
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
-    require_keys: bool | None = None
+    auth: AuthMode | None = None
     allow_open_host: bool = False
-    allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
+    proxy_header: str = Field(default="X-Forwarded-User", pattern=r"^[A-Za-z0-9-]+$")
+    proxy_addresses: Names = ("127.0.0.1", "::1")
+    proxy_project: str = "proj_default"
+    proxy_admins: Names = ()
+    session_hours: float = Field(default=12.0, gt=0, le=8760)
+    allowed_hosts: Names = ()
     root_path: Annotated[
         str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
     ] = ""
@@ -113,6 +134,25 @@ class Settings(BaseSettings):
         if path == (url or "") or not path or path.startswith(("/", ":memory:", "file:")):
             return url
         return f"sqlite:///{Path(path).absolute()}"
+
+    @field_validator("proxy_addresses")
+    @classmethod
+    def _check_addresses(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
+        for address in addresses:
+            ip_network(address, strict=False)
+        return addresses
+
+    @property
+    def auth_mode(self) -> AuthMode:
+        """Who may use the service: everybody, or whoever has a key or is named by a proxy."""
+        if self.auth is not None:
+            return self.auth
+        return "off" if is_loopback(self.host) or self.allow_open_host else "keys"
+
+    @property
+    def proxy_networks(self) -> tuple[IPv4Network | IPv6Network, ...]:
+        """Networks of the proxies whose headers are believed."""
+        return tuple(ip_network(address, strict=False) for address in self.proxy_addresses)
 
     @property
     def database_location(self) -> str:
@@ -177,20 +217,18 @@ class Settings(BaseSettings):
         return None
 
     def check_exposure(self) -> None:
-        """Refuse to serve other hosts without API keys.
+        """Refuse to serve other hosts without API keys, unless that is said twice.
 
         Raises
         ------
         Misconfigured
-            If the host is not loopback, or keys are required: this version has no API keys.
+            If the host is not loopback, keys are off, and `allow_open_host` is not set.
         """
-        if self.require_keys:
-            raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
-        if not is_loopback(self.host) and not self.allow_open_host:
+        if self.auth_mode == "off" and not is_loopback(self.host) and not self.allow_open_host:
             raise Misconfigured(
-                f"host {self.host} can be reached from other machines, and this version has no "
-                "API keys yet. Serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if an "
-                "authenticating reverse proxy is in front of it."
+                f"host {self.host} can be reached from other machines, and LAGID_AUTH=off asks "
+                "for no API keys. Set LAGID_AUTH=keys, or LAGID_ALLOW_OPEN_HOST=true if others "
+                "may do everything."
             )
 
 
