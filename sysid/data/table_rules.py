@@ -85,10 +85,14 @@ class ReadingNote(UserWarning):
 def tell_notes(notes: Sequence[str]) -> None:
     """Tell each note as a warning of the code outside lagid that reads."""
     level, frame = 1, currentframe()
-    while frame is not None and frame.f_globals["__name__"].partition(".")[0] in _OUR_PACKAGES:
+    while frame is not None and _is_ours(frame.f_globals.get("__name__")):
         level, frame = level + 1, frame.f_back
     for note in notes:
         warnings.warn(note, ReadingNote, stacklevel=level)
+
+
+def _is_ours(module: object) -> bool:
+    return str(module).partition(".")[0] in _OUR_PACKAGES
 
 
 class Heading(NamedTuple):
