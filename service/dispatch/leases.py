@@ -16,7 +16,7 @@ from service.core.processes import describe_process
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
 from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
-from service.queue.leases import Claim, Lease, LeaseQueue
+from service.queue.leases import Claim, Lease, LeaseQueue, SizeRule
 from service.queue.notifications import QueueStatus, read_queue_status
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import Document
@@ -31,7 +31,7 @@ RETRY_SECONDS = 0.5
 
 
 class HeldLeases:
-    """Jobs that this dispatcher may write for.
+    """Parcels of jobs that this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length. It also reaps
     expired leases of any dispatcher. A lease that was not renewed `is_lost`. A forgotten lease is
@@ -60,6 +60,7 @@ class HeldLeases:
         self._clock, self._stopwatch = clock, stopwatch
         self._held: dict[Lease, float] = {}  # when each was renewed
         self._has_asked = False  # a claim was sent and not answered
+        self.n_alive = 1
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -80,17 +81,33 @@ class HeldLeases:
             DispatcherRepository(session, self._clock).add_dispatcher(self.owner, details)
         reap_jobs(self._database, self._clock)
 
-    def claim_job(self, admission: Admission | None = None) -> Claim | None:
-        """Claim the next job that `admission` lets in, if one waits."""
+    def claim_job(
+        self,
+        admission: Admission | None = None,
+        *,
+        only: str | None = None,
+        choose_size: SizeRule | None = None,
+    ) -> Claim | None:
+        """Claim a parcel of the next job that `admission` lets in, if one waits.
+
+        Jobs of which a parcel is held are left out, unless one is the `only` one that counts.
+        """
         begun = self._stopwatch()
         claim, had_asked = None, self._has_asked
         self._has_asked = True  # a claim may succeed even if its answer is lost
         with self._database.write_session() as session:
             queue = LeaseQueue(session, self._clock)
             if had_asked:
-                claim = queue.recover_claim(self.owner, self._list_held_jobs())
+                claim = queue.recover_claim(self.owner, self.list_held())
             if claim is None:
-                claim = queue.claim_job(self.owner, self._length, admission)
+                claim = queue.claim_job(
+                    self.owner,
+                    self._length,
+                    admission,
+                    held=self._list_held_jobs(),
+                    only=only,
+                    choose_size=choose_size,
+                )
         self._has_asked = False
         if claim is not None:
             with self._lock:
@@ -100,11 +117,15 @@ class HeldLeases:
     def check_queue(self, admission: Admission | None = None) -> QueueStatus:
         """Check whether an admissible job waits, and which held jobs are to be cancelled."""
         with self._database.read_session() as session:
-            return read_queue_status(session, self.owner, admission)
+            return read_queue_status(session, self.owner, admission, self._list_held_jobs())
+
+    def list_held(self) -> tuple[Lease, ...]:
+        """List the leases that are not known to be lost."""
+        with self._lock:
+            return tuple(self._held)
 
     def _list_held_jobs(self) -> list[str]:
-        with self._lock:
-            return [lease.job_id for lease in self._held]
+        return sorted({lease.job_id for lease in self.list_held()})
 
     def is_lost(self, lease: Lease) -> bool:
         """Test whether the lease is known to be another's, or was forgotten."""
@@ -123,15 +144,14 @@ class HeldLeases:
             self._held.pop(lease, None)
 
     def release_all(self, *, lost: bool = False) -> None:
-        """Release every job, so that another dispatcher can claim it at once.
+        """Release every parcel, so that another dispatcher can claim it at once.
 
         Parameters
         ----------
         lost : bool
             Whether this counts as a lost lease.
         """
-        with self._lock:
-            held = tuple(self._held)
+        held = self.list_held()
         worked = lost and retry_transient(self._has_worked)
         for lease in held:
             try:
@@ -162,12 +182,11 @@ class HeldLeases:
     def renew_leases(self) -> None:
         """Send one heartbeat: renew the held leases, and reap expired ones."""
         begun = self._stopwatch()
-        with self._lock:
-            before = tuple(self._held)
+        before = self.list_held()
         with self._database.write_session(self._heartbeat_seconds) as session:
             DispatcherRepository(session, self._clock).record_heartbeat(self.owner)
-            held = LeaseQueue(session, self._clock).renew_leases(before, self._length)
-        renewed = {claim.lease for claim in held}
+            renewed = LeaseQueue(session, self._clock).renew_leases(before, self._length)
+            self.n_alive = max(1, len(DispatcherRepository(session, self._clock).list_alive()))
         with self._lock:
             for lease in before:
                 if lease not in renewed:

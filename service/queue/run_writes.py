@@ -1,4 +1,4 @@
-"""Writes of the dispatcher to runs. Every write holds the lease of the job; most are in bulk."""
+"""Writes of the dispatcher to runs. Every write holds the lease of a parcel; most are in bulk."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
 from service.queue.clocks import Clock
-from service.queue.leases import FinalState, Lease, LeaseQueue, choose_smaller_rms
+from service.queue.leases import FinalState, Lease, LeaseQueue, LockedParcel, choose_smaller_rms
 from service.queue.packed_results import (
     COPY_END,
     COPY_HEAD,
@@ -87,31 +87,49 @@ class RunOutcome:
 
 
 class RunWriter:
-    """Writes to the runs of one leased job, in one writing session.
+    """Writes to the runs of one leased parcel, in one writing session.
 
-    The first method that is called locks the row of the job, or raises `LeaseLost` if the lease is
-    not held. Nobody else can change the row until the session ends.
+    The first method that is called locks the row of the parcel, or raises `LeaseLost` if the lease
+    is not held. Nobody else can change the row until the session ends. The row of the job is
+    changed last, because the dispatchers of its other parcels change it too.
     """
 
     def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
         self._session, self._lease, self._clock = session, lease, clock
         self._queue = LeaseQueue(session, clock)
-        self._held: Job | None = None
+        self._held: LockedParcel | None = None
 
-    def create_runs(self, cells: Iterable[NewRun]) -> None:
-        """Create the runs of the job; existing runs stay, so a second call is harmless."""
-        insert_runs(self._session, self._lock_job(), cells)
+    def create_runs(self, cells: Iterable[NewRun]) -> list[WaitingRun]:
+        """Create runs of the parcel; existing runs stay, so a second call is harmless.
 
-    def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[WaitingRun]:
-        """List unfinished runs with a `number` above `after`, in order."""
-        self._lock_job()
-        pending = self._select_open().where(Run.number > after)
+        Return them as they wait; if some exist already, only `list_pending` tells what waits.
+        """
+        return insert_runs(self._session, self._lock_parcel().job, cells)
+
+    def count_runs(self, numbers: range) -> int:
+        """Count the runs of these numbers that exist, in any state."""
+        self._lock_parcel()
+        of_job = Run.job_id == self._lease.job_id
+        query = select(func.count()).where(
+            of_job, Run.number >= numbers.start, Run.number < numbers.stop
+        )
+        return self._session.scalar(query) or 0
+
+    def list_pending(
+        self, limit: int = CHUNK_ROWS, after: int = -1, before: int | None = None
+    ) -> list[WaitingRun]:
+        """List unfinished runs of the parcel with a `number` above `after`, in order."""
+        parcel = self._lock_parcel().parcel
+        stop = parcel.stop if before is None else min(before, parcel.stop)
+        pending = self._select_open().where(
+            Run.number > max(after, parcel.first - 1), Run.number < stop
+        )
         rows = self._session.execute(pending.order_by(Run.number).limit(limit))
         return list(map(WaitingRun._make, rows))
 
     def list_unfinished(self, numbers: Sequence[int]) -> list[WaitingRun]:
         """List the unfinished runs of these numbers, in their order."""
-        self._lock_job()
+        self._lock_parcel()
         runs: list[WaitingRun] = []
         for chunk in split_chunks(numbers):
             rows = self._session.execute(self._select_open().where(Run.number.in_(chunk)))
@@ -124,7 +142,7 @@ class RunWriter:
 
     def start_runs(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
-        self._lock_job()
+        self._lock_parcel()
         for chunk in split_chunks(run_ids):
             statement = (
                 update(Run)
@@ -139,7 +157,7 @@ class RunWriter:
 
     def write_kills(self, kills: Mapping[str, int]) -> None:
         """Write how often in a row a worker died in each of these runs."""
-        self._lock_job()
+        self._lock_parcel()
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
             update_by_id(self._session, Run, rows)
@@ -154,7 +172,7 @@ class RunWriter:
 
         A run that has ended already keeps its result. Return the identifiers of the written runs.
         """
-        self._lock_job()
+        self._lock_parcel()
         open_ids = self._find_open_ids([outcome.run_id for outcome in outcomes])
         fresh = [outcome for outcome in outcomes if outcome.run_id in open_ids]
         self._insert_history(history, migrants)
@@ -166,9 +184,9 @@ class RunWriter:
             Run,
             (_build_outcome_values(outcome, now, attempt) for outcome in fresh),
         )
-        self._update_counts(fresh)
         for chunk in split_chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
+        self._update_counts(fresh)
         return tuple(outcome.run_id for outcome in fresh)
 
     def record_results(
@@ -181,7 +199,7 @@ class RunWriter:
         lost_signals : collection of str
             Objects that could not be stored. Their runs have no signals.
         """
-        self._lock_job()
+        self._lock_parcel()
         if not packs:
             return
         if self._session.get_bind().dialect.name == "sqlite":
@@ -194,14 +212,14 @@ class RunWriter:
             self._session.execute(
                 update(Run).where(lost).values(signals), execution_options=RETURNING_OPTIONS
             )
-        rms = [pack.best_rms for pack in packs if pack.best_rms is not None]
-        self._add_to_counts(n_ended, 0, min(rms, default=None))
         is_open = Run.state.in_(OPEN_STATES)
         ended = select(Run.id).where(Run.id == Checkpoint.run_id, ~is_open)
         self._session.execute(
             delete(Checkpoint).where(Checkpoint.job_id == self._lease.job_id, ended.exists()),
             execution_options={"synchronize_session": False},
         )
+        rms = [pack.best_rms for pack in packs if pack.best_rms is not None]
+        self._add_to_counts(n_ended, 0, min(rms, default=None))
 
     def _record_in_sqlite(self, packs: Sequence[PackedResults]) -> int:
         """Hand the rows to SQLite, and return how many runs were open."""
@@ -251,12 +269,12 @@ class RunWriter:
         A run that continues from a checkpoint computes the same points again, bit for bit. They
         count once.
         """
-        self._lock_job()
+        self._lock_parcel()
         self._insert_history(history, migrants)
 
     def save_checkpoints(self, states: Iterable[tuple[str, int, bytes]]) -> None:
         """Replace the checkpoints of runs, passed as (run, evaluations, state)."""
-        self._lock_job()
+        self._lock_parcel()
         now = self._clock()
         rows = (
             {
@@ -272,16 +290,22 @@ class RunWriter:
         upsert(self._session, Checkpoint, rows)
 
     def read_checkpoints(self) -> dict[str, bytes]:
-        """Read the checkpoints of the unfinished runs of the job, by run."""
-        self._lock_job()
-        query = select(Checkpoint.run_id, Checkpoint.state).where(
-            Checkpoint.job_id == self._lease.job_id
+        """Read the checkpoints of the unfinished runs of the parcel, by run."""
+        parcel = self._lock_parcel().parcel
+        query = (
+            select(Checkpoint.run_id, Checkpoint.state)
+            .join(Run, Run.id == Checkpoint.run_id)
+            .where(
+                Checkpoint.job_id == self._lease.job_id,
+                Run.number >= parcel.first,
+                Run.number < parcel.stop,
+            )
         )
         return dict(self._session.execute(query).all())
 
-    def _lock_job(self) -> Job:
+    def _lock_parcel(self) -> LockedParcel:
         if self._held is None:
-            self._held = self._queue.lock_job(self._lease)
+            self._held = self._queue.lock_lease(self._lease)
         return self._held
 
     def _filter_runs(self, run_ids: Collection[str]) -> Any:
@@ -312,7 +336,9 @@ class RunWriter:
         }
         if best_rms is not None:
             values["best_rms"] = choose_smaller_rms(best_rms)
-        changed = update(Job).where(*self._lease.fence()).values(values)
+        self._lock_parcel().parcel.n_ended += n_ended
+        self._session.flush()
+        changed = update(Job).where(Job.id == self._lease.job_id).values(values)
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
 
 
@@ -357,9 +383,9 @@ def _build_temporary_table(layout: RowLayout) -> str:
     )
 
 
-def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
+def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[WaitingRun]:
     """Create the queued runs of a job in bulk; existing runs stay unchanged."""
-    now = utc_now()
+    now, waiting = utc_now(), list[WaitingRun]()
     for chunk in split_chunks(cells):
         rows = [
             {
@@ -373,6 +399,8 @@ def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
             for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
         ]
         insert_missing(session, Run, rows)
+        waiting += [WaitingRun(row["id"], row["number"], row["cell"], 0) for row in rows]
+    return waiting
 
 
 def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:

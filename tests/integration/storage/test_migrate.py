@@ -223,10 +223,10 @@ def test_a_further_revision_carries_the_rows_over_and_back(database, revisions):
     migrate.upgrade_database(database)
     assert copies(database) == ["default"]
     undone = migrate.list_undone_migrations(database, "base")
-    assert [name for name, _ in undone] == ["next", HEAD, "0001"]
+    assert [name for name, _ in undone] == ["next", HEAD, "0002", "0001"]
     assert [name for name, _ in migrate.list_undone_migrations(database, HEAD)] == ["next"]
     with pytest.raises(
-        UnknownRevision, match=f"Earlier ones, the latest first: {HEAD}, 0001, base"
+        UnknownRevision, match=f"Earlier ones, the latest first: {HEAD}, 0002, 0001, base"
     ):
         migrate.list_undone_migrations(database, "next")
     migrate.downgrade_database(database, HEAD)
