@@ -337,9 +337,10 @@ class RunRecorder:
             if job.n_reused:
                 text = f"{job.n_reused} of {job.n_runs} runs were taken over from earlier runs"
                 queue.append_event(self.lease, "log", {"message": text})
-            has_failed = job.n_failed == job.n_runs
-            state = JobState.FAILED if has_failed else JobState.SUCCEEDED
-            queue.finish_job(self.lease, state, complaint)
+            if job.n_failed == job.n_runs:
+                queue.finish_job(self.lease, JobState.FAILED, complaint)
+            else:
+                queue.finish_job(self.lease, JobState.SUCCEEDED, complaint)
 
         self._write_now(last=end)
 

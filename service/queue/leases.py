@@ -241,7 +241,7 @@ class LeaseQueue:
             .returning(Parcel.job_id, Parcel.attempt, Parcel.lease_owner)
         )
         rows = self._session.execute(renewed, execution_options=RETURNING_OPTIONS)
-        return frozenset(Lease(*row) for row in rows)
+        return frozenset(Lease(job, attempt, str(owner)) for job, attempt, owner in rows)
 
     def lock_lease(self, lease: Lease) -> LockedParcel:
         """Lock the parcel of a lease against every other writer, until the transaction ends.

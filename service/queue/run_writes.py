@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, delete, func, select, update
+from sqlalchemy import Connection, Select, delete, event, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
@@ -243,14 +243,18 @@ class RunWriter:
     def _record_in_postgres(self, packs: Sequence[PackedResults]) -> int:
         """Copy the rows into temporary tables, and from there to their places."""
         self._session.flush()
-        driver: Any = self._session.connection().connection.driver_connection
+        connection = self._session.connection()
+        driver: Any = connection.connection.driver_connection
         n_ended = 0
         with driver.cursor() as cursor:
+            if not connection.info.get(_HAS_TABLES):
+                for layout in LAYOUTS:
+                    cursor.execute(_build_temporary_table(layout))
+                _remember_tables(self._session, connection)
             # Each row is looked up by its key, whatever the planner knows of these tables.
             for method in ("hashjoin", "mergejoin", "seqscan"):
                 cursor.execute(f"SET LOCAL enable_{method} = off")
             for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
-                cursor.execute(_build_temporary_table(layout))
                 with cursor.copy(f"COPY packed_{layout.table} FROM STDIN (FORMAT BINARY)") as copy:
                     copy.write(b"".join((COPY_HEAD, *blocks, COPY_END)))
                 if layout is RESULT_ROWS:
@@ -376,11 +380,27 @@ def _build_postgres_insert(layout: RowLayout) -> str:
 
 
 def _build_temporary_table(layout: RowLayout) -> str:
+    """Return the statements that create a table for this session, as it is not yet there.
+
+    Its values are not compressed, because they are copied at once.
+    """
+    table = f"packed_{layout.table}"
     columns = ", ".join(f"{name} {kind}" for name, kind in layout.columns.items())
+    large = [name for name, kind in layout.columns.items() if kind in ("jsonb", "bytea")]
+    storage = ", ".join(f"ALTER COLUMN {name} SET STORAGE EXTERNAL" for name in large)
     return (
-        f"CREATE TEMPORARY TABLE IF NOT EXISTS packed_{layout.table} ({columns}) "
-        "ON COMMIT DELETE ROWS"
+        f"CREATE TEMPORARY TABLE IF NOT EXISTS {table} ({columns}) ON COMMIT DELETE ROWS; "
+        f"ALTER TABLE {table} {storage}"
     )
+
+
+_HAS_TABLES = "lagid_has_packed_tables"
+
+
+def _remember_tables(session: Session, connection: Connection) -> None:
+    """Note that this connection has its temporary tables, once they are committed."""
+    info = connection.info
+    event.listen(session, "after_commit", lambda _: info.update({_HAS_TABLES: True}), once=True)
 
 
 def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[WaitingRun]:
