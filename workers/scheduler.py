@@ -57,6 +57,12 @@ class Scheduler(Generic[Key]):
         """Whether every core has a pack."""
         return self._n_in_flight >= self._executor.slots
 
+    def count_wanted_cores(self) -> int | None:
+        """Count the cores that have work; None if runs wait, so that there is work for any."""
+        if any(work.n_waiting for work in self._jobs.values()):
+            return None
+        return self._n_in_flight
+
     def add_job(
         self,
         job: Key,

@@ -1,4 +1,4 @@
-"""Parcels: dispatchers lease ranges of a job's runs, and tell whether they want cores.
+"""Parcels: dispatchers lease ranges of a job's runs, and tell how many cores they want.
 
 Each open job becomes one parcel, under its lease if it has one. On the way back a job with several
 parcels waits, and its runs after the first one that was never created are deleted, with what
@@ -74,7 +74,7 @@ def upgrade() -> None:
     _create_indexes(INDEXES)
     op.add_column(
         "dispatchers",
-        sa.Column("wants_cores", sa.Boolean(), nullable=False, server_default=sa.false()),
+        sa.Column("wanted_cores", sa.Integer(), nullable=False, server_default="0"),
     )
 
     if op.get_bind().dialect.name == "postgresql":
@@ -99,7 +99,7 @@ def downgrade() -> None:
     if op.get_bind().dialect.name == "postgresql":
         for table, column in LARGE_VALUES:
             op.execute(f"ALTER TABLE {table} ALTER COLUMN {column} SET STORAGE EXTENDED")
-    op.drop_column("dispatchers", "wants_cores")
+    op.drop_column("dispatchers", "wanted_cores")
     for name, table, _, _ in INDEXES:
         op.drop_index(name, table)
     op.add_column("jobs", sa.Column("lease_owner", sa.String(), nullable=True))

@@ -26,6 +26,7 @@ from service.dispatch.overlap import Overlap
 from service.dispatch.recorder import JobSpeed, RunRecorder
 from service.dispatch.supervisor import RESTART_EXIT_CODE, SUPERVISED_VARIABLE
 from service.queue.admission import Admission
+from service.queue.dispatchers import CLUSTER_KEY
 from service.queue.leases import Claim, Lease
 from service.queue.notifications import open_notifier
 from service.storage import migrate
@@ -33,6 +34,7 @@ from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
+from workers.core_sharing import SharedCluster, divide_cores
 from workers.errors import ClusterLost, WorkersError
 from workers.local_ray import LocalRay
 from workers.protocol import Executor
@@ -68,10 +70,11 @@ class Dispatcher:
         *,
         project_cores: int | None = None,
         keeps_signals: bool = False,
+        cluster: SharedCluster | None = None,
     ) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._executor = database, store, executor
-        self._keeps_signals = keeps_signals
+        self._keeps_signals, self._cluster = keeps_signals, cluster
         self._woken = threading.Event()
         self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
@@ -96,7 +99,10 @@ class Dispatcher:
         ClusterLost
             If the workers are lost. The jobs were released as lost.
         """
-        self._leases.start_heartbeat({"cpus": self._executor.slots, "pid": os.getpid()})
+        details: dict[str, object] = {"cpus": self._executor.slots, "pid": os.getpid()}
+        if self._cluster is not None:
+            details[CLUSTER_KEY] = self._cluster.identity
+        self._leases.start_heartbeat(details)
         _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
         self._listener.start()
         try:
@@ -117,6 +123,7 @@ class Dispatcher:
             self._woken.clear()
             self._checked_at = time.monotonic()
             self._check_queue()
+        self._share_cores()
         has_time = self._recorders and not self._is_filling
         for lease in self._scheduler.run_step(STEP_SECONDS if has_time else 0.0):
             self._end_runs(lease)
@@ -129,6 +136,17 @@ class Dispatcher:
                 recorder.write_due()
             except LeaseLost as error:
                 self._drop_lost_parcel(recorder, error)
+
+    def _share_cores(self) -> None:
+        """Take the part of a shared cluster that this dispatcher has, by what others told."""
+        if self._cluster is None:
+            return
+        n_cores, owner = self._cluster.n_cores, self._leases.owner
+        wanted = self._scheduler.count_wanted_cores()
+        self._leases.wanted_cores = n_cores if wanted is None else wanted
+        # What the others do not want is free for this one, whatever it wants now.
+        shares = divide_cores(n_cores, {**self._leases.cores_of_others, owner: n_cores})
+        self._cluster.limit_slots(shares[owner])
 
     def _check_queue(self) -> None:
         admission = self._build_admission()
@@ -352,6 +370,7 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
             leases,
             project_cores=settings.project_cores,
             keeps_signals=settings.keep_signals,
+            cluster=None if executor.identity is None else executor,
         )
         _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()

@@ -15,7 +15,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.processes import describe_process
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
-from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
+from service.queue.dispatchers import (
+    CLUSTER_KEY,
+    LEASE_SECONDS_KEY,
+    DispatcherRepository,
+    count_wanted_cores,
+)
 from service.queue.leases import Claim, Lease, LeaseQueue, SizeRule
 from service.queue.notifications import QueueStatus, read_queue_status
 from service.queue.orphaned_jobs import reap_jobs
@@ -37,6 +42,10 @@ class HeldLeases:
     expired leases of any dispatcher. A lease that was not renewed `is_lost`. A forgotten lease is
     no longer renewed, and expires. While a heartbeat waits for the database, the state of a late
     lease is unknown. Nothing should be written under it, but it may still be held.
+
+    The same heartbeat tells for how many cores this dispatcher has work (`wanted_cores`), and reads
+    `n_alive`, the number of living dispatchers, and `cores_of_others`, the cores wanted by those
+    that have joined the same cluster.
 
     Parameters
     ----------
@@ -61,6 +70,9 @@ class HeldLeases:
         self._held: dict[Lease, float] = {}  # when each was renewed
         self._has_asked = False  # a claim was sent and not answered
         self.n_alive = 1
+        self.wanted_cores = 0
+        self.cores_of_others: dict[str, int] = {}
+        self._cluster: str | None = None
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -68,17 +80,20 @@ class HeldLeases:
 
     def start_heartbeat(self, details: dict[str, object]) -> None:
         """Register the dispatcher and start the heartbeat."""
-        description = {
+        description: Document = {
             LEASE_SECONDS_KEY: self._length.total_seconds(),
             **describe_process(),
             **details,
         }
+        self._cluster = description.get(CLUSTER_KEY)
         retry_transient(partial(self._announce_dispatcher, description))
         self._thread.start()
 
     def _announce_dispatcher(self, details: Document) -> None:
         with self._database.write_session() as session:
-            DispatcherRepository(session, self._clock).add_dispatcher(self.owner, details)
+            dispatchers = DispatcherRepository(session, self._clock)
+            dispatchers.add_dispatcher(self.owner, details)
+            self._look_at_others(dispatchers)
         reap_jobs(self._database, self._clock)
 
     def claim_job(
@@ -184,9 +199,10 @@ class HeldLeases:
         begun = self._stopwatch()
         before = self.list_held()
         with self._database.write_session(self._heartbeat_seconds) as session:
-            DispatcherRepository(session, self._clock).record_heartbeat(self.owner)
+            dispatchers = DispatcherRepository(session, self._clock)
+            dispatchers.record_heartbeat(self.owner, self.wanted_cores)
             renewed = LeaseQueue(session, self._clock).renew_leases(before, self._length)
-            self.n_alive = max(1, len(DispatcherRepository(session, self._clock).list_alive()))
+            self._look_at_others(dispatchers)
         with self._lock:
             for lease in before:
                 if lease not in renewed:
@@ -194,6 +210,11 @@ class HeldLeases:
                 elif lease in self._held:
                     self._held[lease] = begun
         reap_jobs(self._database, self._clock, busy_seconds=self._heartbeat_seconds)
+
+    def _look_at_others(self, dispatchers: DispatcherRepository) -> None:
+        alive = [one for one in dispatchers.list_alive() if one.owner != self.owner]
+        self.n_alive = 1 + len(alive)
+        self.cores_of_others = count_wanted_cores(alive, self._cluster)
 
     @property
     def _heartbeat_seconds(self) -> float:

@@ -383,7 +383,7 @@ class IdempotencyKey(Base):
 
 
 class DispatcherHeartbeat(Base):
-    """Heartbeat of a dispatcher: whether it is alive, and whether it has work for its cores.
+    """Heartbeat of a dispatcher: whether it is alive, and for how many cores it has work.
 
     `details` tells its process and its Ray cluster (`service.dispatch.leases`).
     """
@@ -394,4 +394,4 @@ class DispatcherHeartbeat(Base):
     details: Mapped[Document]
     started_at: Mapped[datetime]
     seen_at: Mapped[datetime]
-    wants_cores: Mapped[bool] = mapped_column(default=False)
+    wanted_cores: Mapped[int] = mapped_column(default=0)
