@@ -53,6 +53,8 @@ from workers.protocol import (
 
 SIGMAS, METHODS = [0.01, 0.02, 0.03, 0.04, 0.05], ["simple", "improved"]
 RECORDED_RUNS = 40
+MAX_RUNS = 10_000_000
+"""Runs of a sweep at most: more than a service allows by default."""
 DatabaseKind = Literal["SQLite", "PostgreSQL"]
 
 
@@ -304,7 +306,7 @@ class Played:
     Attributes
     ----------
     rate : float
-        Runs a second of all dispatchers, from the submission to the end of the job.
+        Runs a second of all dispatchers, from the first claim to the end of the job.
     cpu, transactions, server, player : float
         In ms a run: CPU time of the dispatchers, time in their transactions, CPU time of
         PostgreSQL, and of those who play the workers.
@@ -377,7 +379,9 @@ class Stage:
         server = parts.enter_context(_open_postgres()) if kind == "PostgreSQL" else None
         url = None if server is None else server.get_uri()
         self._server = None if server is None else psutil.Process(server.get_pid())
-        self._settings = Settings(data_dir=folder, database_url=url)
+        self._settings = Settings(
+            data_dir=folder, database_url=url, max_runs_per_job=MAX_RUNS, max_open_runs=MAX_RUNS
+        )
         self._settings.prepare_data_folder()
         self._database = TimedDatabase(self._settings.resolved_database_url)
         parts.callback(self._database.dispose)
@@ -410,13 +414,23 @@ class Stage:
             other.close()
             pipes.append(pipe)
             processes.append(process)
+        try:
+            return self._measure_sweep(n_runs, part, pipes, [one.pid for one in processes])
+        finally:
+            for process in processes:
+                process.join(20.0)
+                process.kill()
+
+    def _measure_sweep(
+        self, n_runs: int, part: _Part, pipes: Sequence[Any], pids: Sequence[Any]
+    ) -> Played:
         assert all(pipe.recv() == "ready" for pipe in pipes)
-        players = [psutil.Process(process.pid).children()[-1] for process in processes]
+        players = [psutil.Process(pid).children()[-1] for pid in pids]
         server, played = self._measure_server(), _measure_processes(players)
+        self.last_job = self._submit(n_runs)
         wall = time.perf_counter()
         for pipe in pipes:
             pipe.send("begin")
-        self.last_job = self._submit(n_runs)
         while (state := self._read_state(self.last_job)) in OPEN_STATES:
             time.sleep(0.1)
         wall = time.perf_counter() - wall
@@ -425,13 +439,11 @@ class Stage:
         for pipe in pipes:
             pipe.send("stop")
         cpu, transactions, ended = map(list, zip(*(pipe.recv() for pipe in pipes), strict=True))
-        for process in processes:
-            process.join(20.0)
         each = 1e3 / n_runs
         return Played(
-            n_dispatchers,
-            part.slots * n_dispatchers,
-            seconds,
+            len(pipes),
+            part.slots * len(pipes),
+            part.seconds,
             n_runs / wall,
             sum(cpu) * each,
             sum(transactions) * each,

@@ -16,11 +16,12 @@ from service.queue.packed_results import (
     COPY_HEAD,
     LAYOUTS,
     RESULT_ROWS,
+    ColumnKind,
     PackedResults,
     RowLayout,
 )
 from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
-from service.storage.columns import Document, UtcDateTime, utc_now
+from service.storage.columns import Document, UtcDateTime, to_json, utc_now
 from service.storage.statements import (
     CHUNK_ROWS,
     RETURNING_OPTIONS,
@@ -346,6 +347,22 @@ class RunWriter:
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
 
 
+_CELL_COLUMNS: Mapping[str, ColumnKind] = {
+    "number": "integer",
+    "cell": "jsonb",
+    "labels": "jsonb",
+    "spec_hash": "text",
+    "method": "text",
+    "seed": "bigint",
+    "sigma": "double precision",
+}
+_INSERT_IN_POSTGRES = (
+    f"INSERT INTO runs (project_id, job_id, created_at, {', '.join(_RUN_DEFAULTS)}, "
+    f"id, {', '.join(_CELL_COLUMNS)}) "
+    f"SELECT {', '.join(['%s'] * (3 + len(_RUN_DEFAULTS)))}, * "
+    f"FROM unnest(%s::text[], {', '.join(f'%s::{kind}[]' for kind in _CELL_COLUMNS.values())}) "
+    "ON CONFLICT DO NOTHING"
+)
 _OPEN_LIST = ", ".join(repr(state.value) for state in OPEN_STATES)
 _RESULT_NAMES = [name for name in RESULT_ROWS.columns if name != "id"]
 _UPDATE_IN_SQLITE = (
@@ -405,22 +422,56 @@ def _remember_tables(session: Session, connection: Connection) -> None:
 
 def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[WaitingRun]:
     """Create the queued runs of a job in bulk; existing runs stay unchanged."""
-    now, waiting = utc_now(), list[WaitingRun]()
+    is_sqlite = session.get_bind().dialect.name == "sqlite"
+    insert, waiting = _insert_in_sqlite if is_sqlite else _insert_in_postgres, list[WaitingRun]()
     for chunk in split_chunks(cells):
-        rows = [
-            {
-                **_build_run_values(cell),
-                **_RUN_DEFAULTS,
-                "id": run_id,
-                "project_id": job.project_id,
-                "job_id": job.id,
-                "created_at": now,
-            }
-            for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
+        ids = new_ids("run", len(chunk))
+        insert(session, job, ids, chunk)
+        waiting += [
+            WaitingRun(run, cell.number, cell.cell, 0) for run, cell in zip(ids, chunk, strict=True)
         ]
-        insert_missing(session, Run, rows)
-        waiting += [WaitingRun(row["id"], row["number"], row["cell"], 0) for row in rows]
     return waiting
+
+
+def _insert_in_sqlite(
+    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+) -> None:
+    constants = {
+        **_RUN_DEFAULTS,
+        "project_id": job.project_id,
+        "job_id": job.id,
+        "created_at": utc_now(),
+    }
+    rows = (
+        {**_build_run_values(cell), **constants, "id": run}
+        for cell, run in zip(cells, ids, strict=True)
+    )
+    insert_missing(session, Run, rows)
+
+
+def _insert_in_postgres(
+    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+) -> None:
+    """Insert by one statement, which takes each column as an array."""
+    session.flush()
+    driver: Any = session.connection().connection.driver_connection
+    columns = [
+        [getattr(cell, name) for cell in cells] if kind != "jsonb" else _list_json(cells, name)
+        for name, kind in _CELL_COLUMNS.items()
+    ]
+    constants = [job.project_id, job.id, utc_now(), *_RUN_DEFAULTS.values()]
+    with driver.cursor() as cursor:
+        cursor.execute(_INSERT_IN_POSTGRES, [*constants, list(ids), *columns])
+
+
+def _list_json(cells: Sequence[NewRun], name: str) -> list[str]:
+    """Return one document of each cell as text; equal objects are written once."""
+    texts: dict[int, str] = {}
+    documents = [getattr(cell, name) for cell in cells]
+    for document in documents:
+        if id(document) not in texts:
+            texts[id(document)] = to_json(document)
+    return [texts[id(document)] for document in documents]
 
 
 def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
