@@ -375,10 +375,11 @@ _UPDATE_IN_POSTGRES = (
     f"UPDATE runs SET state = {JobState.SUCCEEDED.value!r}, attempt = %s, finished_at = %s, "
     "started_at = coalesce(started_at, %s), "
     + ", ".join(f"{name} = packed.{name}" for name in _RESULT_NAMES)
-    # The subquery is not merged into the join: it finds each row by its key.
-    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id FROM runs AS own "
-    "WHERE own.id = packed.id AND own.job_id = %s "
-    f"AND own.state IN ({_OPEN_LIST}) OFFSET 0) AS open WHERE runs.id = open.id"
+    # The subquery is not merged into the join. It finds each row by its key, and not by its job:
+    # an index of the job would be read as a whole for each run.
+    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id, job_id, state FROM runs AS own "
+    "WHERE own.id = packed.id OFFSET 0) AS found "
+    f"WHERE found.job_id = %s AND found.state IN ({_OPEN_LIST}) AND runs.id = found.id"
 )
 
 
