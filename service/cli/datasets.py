@@ -1,7 +1,7 @@
 """`lagid datasets` and `lagid dataset …`."""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
@@ -20,13 +20,13 @@ from service.cli.common import (
     SampleTime,
     Segments,
     Url,
+    check_file,
     connect_client,
     fail,
     fail_usage,
     fetch_listing,
     file_origins,
     name_file,
-    name_read_options,
     parse_number,
     parse_pairs,
     print_json,
@@ -40,6 +40,7 @@ from service.cli.common import (
     read_object,
     report_faults,
     show_examples,
+    upload_origins,
 )
 from service.client.calls import DEFAULT_URL
 from sysid.core.errors import suggest_name
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Add, show, download, simulate and derive recordings.", no_args_is_help=True)
 
-UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
 DATASET_ID = "ds_"
 
 
@@ -98,11 +98,9 @@ def add_dataset(
     quiet: Quiet = False,
 ) -> None:
     """Store a recording."""
-    if file != STANDARD_INPUT and not file.is_file():
-        fail(f"there is no file {file}")
+    check_file(file)
     source = read_file(file) if file == STANDARD_INPUT else file
-    origins = FieldOrigins(UPLOAD_OPTIONS, rest=name_file(file), rewrite=name_read_options)
-    with connect_client(url, key) as client, report_faults(origins):
+    with connect_client(url, key) as client, report_faults(upload_origins(file)):
         stored = client.add_dataset(source, name, segments=segments, sample_time=sample_time)
     _print_dataset(stored, as_json)
 
@@ -241,7 +239,7 @@ def derive_dataset(
     _print_dataset(stored, as_json)
 
 
-def _find_dataset(client: "Client", name: str) -> dict[str, Any]:
+def _find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
     """Find a dataset by its id or name; end the command if none or several have it."""
     if name.startswith(DATASET_ID):
         return client.dataset(name)
@@ -274,7 +272,7 @@ def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
     return FieldOrigins(options) if file is None else file_origins(file, options)
 
 
-def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
+def _print_dataset(stored: Mapping[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(stored)
         return
@@ -291,7 +289,7 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
         print_note(warning)
 
 
-def _format_channels(dataset: dict[str, Any]) -> str:
+def _format_channels(dataset: Mapping[str, Any]) -> str:
     return ", ".join(
         append_unit(channel["name"], channel["unit"]) for channel in dataset["channels"]
     )

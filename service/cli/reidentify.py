@@ -5,6 +5,7 @@ accepts reference runs by name.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,7 @@ from service.cli.common import (
     FieldOrigins,
     Key,
     Limit,
+    ModelName,
     Quiet,
     Url,
     apply_setting,
@@ -37,6 +39,7 @@ from service.cli.common import (
     report_faults,
     show_examples,
     split_names,
+    upload_origins,
     write_file,
 )
 from service.cli.tables import print_reuse_note, print_trend
@@ -57,7 +60,6 @@ Experiments = Annotated[
         "joined by a comma are fitted together.",
     ),
 ]
-Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")]
 Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
 Reference = Annotated[
     str | None,
@@ -97,7 +99,7 @@ TrendFile = Annotated[
 
 def reidentify(
     experiments: Experiments,
-    model: Model,
+    model: ModelName,
     label: Label,
     reference: Reference = None,
     parameters: Parameters = "",
@@ -115,7 +117,7 @@ def reidentify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Re-identify a model for several values of a label: estimates, trend, predictions, flags.
+    """Identify one model on each recording of a batch: a trend over a label such as length.
 
     Each run starts at the reference, or at the result of its neighbour.
     """
@@ -163,7 +165,7 @@ def _field_origins(experiments: list[str]) -> FieldOrigins:
 
 
 def _print_outcome(
-    client: "Client", job: dict[str, Any], output: Path | None, *, as_json: bool
+    client: "Client", job: Mapping[str, Any], output: Path | None, *, as_json: bool
 ) -> None:
     trend = client.trend(job["id"])
     if as_json:
@@ -201,7 +203,7 @@ def _choose_label_value(
 
 
 def _accept_run(
-    client: "Client", job: dict[str, Any], name: str, label: str, x: float, *, quiet: bool
+    client: "Client", job: Mapping[str, Any], name: str, label: str, x: float, *, quiet: bool
 ) -> None:
     """Accept a run of the batch as the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
@@ -216,10 +218,13 @@ def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> lis
     for source in (name for _, sources in batch for name in sources):
         if source in dataset_ids:
             continue
-        is_file = Path(source).is_file()
-        if not is_file and source.endswith(SUFFIXES):
+        path = Path(source)
+        if not path.is_file() and source.endswith(SUFFIXES):
             fail(f"there is no file {source}")
-        dataset_ids[source] = client.add_dataset(Path(source))["id"] if is_file else source
+        dataset_ids[source] = source
+        if path.is_file():
+            with report_faults(upload_origins(path)):
+                dataset_ids[source] = client.add_dataset(path)["id"]
     return [{"x": x, "datasets": [dataset_ids[name] for name in sources]} for x, sources in batch]
 
 
@@ -235,7 +240,9 @@ def _drop_missing(**options: str | None) -> dict[str, str]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
+app = typer.Typer(
+    help="Runs that later batches are compared with: list, show, accept.", no_args_is_help=True
+)
 
 REFERENCE_ORIGINS = FieldOrigins(
     {"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"}
@@ -309,12 +316,12 @@ def accept_reference(
     _print_accepted(reference)
 
 
-def _print_accepted(reference: dict[str, Any]) -> None:
+def _print_accepted(reference: Mapping[str, Any]) -> None:
     before = f" (before: {reference['history'][0]['run']})" if reference["history"] else ""
     out.print(f"{reference['name']}: {reference['run']}{before}", markup=False)
 
 
-def _format_estimates(estimates: dict[str, Any]) -> str:
+def _format_estimates(estimates: Mapping[str, Any]) -> str:
     return ", ".join(
         f"{name} = {format_estimate(estimate)}" for name, estimate in estimates.items()
     )

@@ -27,6 +27,11 @@ def _split_names(value: Any) -> Any:
     return [name.strip().lower() for name in value.split(",") if name.strip()]
 
 
+def _strip_slash(value: Any) -> Any:
+    """Strip the slash at the end of a path."""
+    return value.rstrip("/") if isinstance(value, str) else value
+
+
 class Settings(BaseSettings):
     """Storage, address and limits of the service.
 
@@ -48,6 +53,8 @@ class Settings(BaseSettings):
         Serve other hosts although this version has no API keys yet.
     allowed_hosts : tuple of str
         More names by which requests may address the service, such as that of a reverse proxy.
+    root_path : str
+        Path under which a reverse proxy publishes the service, such as ``/lagid``; empty: none.
     max_upload_bytes, max_body_bytes : int
         Longest recording, and longest body of any other request. Larger ones are answered by 413.
     max_uploads : int
@@ -81,6 +88,9 @@ class Settings(BaseSettings):
     require_keys: bool | None = None
     allow_open_host: bool = False
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
+    root_path: Annotated[
+        str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
+    ] = ""
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
     max_uploads: int = Field(default=4, ge=1)
@@ -105,7 +115,7 @@ class Settings(BaseSettings):
         return f"sqlite:///{Path(path).absolute()}"
 
     @property
-    def resolved_database_url(self) -> str:
+    def database_location(self) -> str:
         """SQLAlchemy address of the database."""
         return self.database_url or make_sqlite_url(self.data_dir / "lagid.db")
 
@@ -115,7 +125,7 @@ class Settings(BaseSettings):
         return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
 
     @property
-    def resolved_store_url(self) -> str:
+    def store_location(self) -> str:
         """Address of the object store."""
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
 
@@ -154,7 +164,7 @@ class Settings(BaseSettings):
         Modes of existing files are never changed: their owner may share them on purpose.
         """
         folder = self.data_dir.absolute()
-        database = Path(self.resolved_database_url.removeprefix("sqlite:///"))
+        database = Path(self.database_location.removeprefix("sqlite:///"))
         for path, closed in ((folder, 0o700), (database, 0o600)):
             if path is database and folder in database.parents:
                 continue  # the folder decides

@@ -43,7 +43,7 @@ def resolve_warm_start(session: Session, reference: str | None) -> str | None:
 
 
 def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
-    other = load_run(session, run.id).requested_model
+    other = load_run(session, run.id).model_of_request
     if have_same_equations(other, model):
         return ""
     return (
@@ -62,7 +62,7 @@ def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
         names = [name for name in names if name in estimates] or names[:1]
     missing = [name for name in names if name not in estimates]
     if missing:
-        other = load_run(session, run.id).requested_model
+        other = load_run(session, run.id).model_of_request
         return (
             f"run {run.id} of {other.name!r} has another model: "
             f"its parameters are {_join_names(estimates)}, "
@@ -71,7 +71,7 @@ def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
         )
     for parameter in model.parameters:
         unit = estimates[parameter.name]["unit"] if parameter.name in estimates else parameter.unit
-        if unit != parameter.unit:
+        if unit != parameter.unit and not parameter.has_unit_of_data:
             return (
                 f"run {run.id} has another model: {parameter.name} is in {unit} there, but in "
                 f"{parameter.unit} in {model.name!r}"

@@ -9,6 +9,7 @@ from urllib.parse import urlencode
 import yaml
 from sqlalchemy.orm import Session
 
+from service.core.root_path import to_address
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, noise_sweep_height
@@ -32,6 +33,7 @@ from service.pages.views import (
     to_job_view,
     to_run_view,
 )
+from service.queue.dispatchers import NO_DISPATCHER, DispatcherRepository
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
@@ -115,6 +117,7 @@ def job_page(
     return render_template(
         "job.html",
         job=view,
+        obstacle=_describe_obstacle(session, job),
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in page.items],
         run=load_full_run(session, stored) if stored else None,
         next_runs=_encode_query({"cell": cell, "cursor": page.next}) if page.next else "",
@@ -129,6 +132,13 @@ def job_page(
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
+
+
+def _describe_obstacle(session: Session, job: Job) -> str:
+    """Describe why a job cannot begin; empty if nothing is in its way but other jobs."""
+    if job.state is not JobState.QUEUED or DispatcherRepository(session).list_alive():
+        return ""
+    return f"This job waits: {NO_DISPATCHER}."
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:
@@ -292,7 +302,8 @@ def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]
 
 def _object_href(name: str) -> str:
     kind = name.partition("_")[0]
-    return {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/") + name
+    folder = {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/")
+    return to_address(folder + name)
 
 
 def _encode_query(values: dict[str, Any]) -> str:

@@ -286,7 +286,7 @@ def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
 
 def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
     inputs, values = Channel("u", T, STEPS), found.parameter_values
-    assert inputs.resolved_hold == "zero"
+    assert inputs.effective_hold == "zero"
     lines = replace(found, input_holds=(InputHold("u", "first", None),))
     answer = simulate("fopdt", inputs, lines).channel("y").values
     asked = replace_substeps(load_model("fopdt"), found.substeps)
@@ -453,6 +453,12 @@ ARGUMENTS = [
     ({"seed": "a"}, "/seed: found 'a'; need a whole number"),
     ({"seed": True}, "/seed: found True"),
     ({"skip": 0.5}, "/skip: found 0.5; need a number of samples"),
+    ({"skip": None}, "/skip: found None; need a number of samples"),
+    ({"seed": None}, "/seed: found None; need a whole number"),
+    ({"posterior": "no"}, "/posterior: found 'no'; need True or False"),
+    ({"progress": 1}, "/progress: found 1; need a function"),
+    ({"warm": {"K": "2"}}, "/warm/K: found '2'; need a finite number"),
+    ({"warm": {"LL": 2.0}}, "/warm/LL: there is no parameter 'LL'; did you mean 'L'?"),
     ({"weights": 3}, "/weights: found 3; need a mapping"),
     ({"warm": [1]}, r"/warm: found \[1\]; need a mapping"),
     ({"validation_fraction": "a"}, "/validation_fraction: found 'a'; need a number"),
