@@ -340,8 +340,8 @@ class _Part:
 
 def _play_part(part: _Part, pipe: Connection) -> None:
     """Run a dispatcher until it is told to stop; tell what it took. A process of its own."""
-    database = TimedDatabase(part.settings.resolved_database_url)
-    store = open_store(part.settings.resolved_store_url)
+    database = TimedDatabase(part.settings.database_location)
+    store = open_store(part.settings.store_location)
     cluster = SimulatedCluster(part.slots, part.recording, part.seconds)
     dispatcher = Dispatcher(database, store, cluster, HeldLeases(database, 30.0))
     pipe.send("ready")
