@@ -348,10 +348,10 @@ USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
     stream_events: ("ix_events_job_id_id",),
     summarise: (),
     collect_garbage: ("ix_runs_signals_sha256",),
-    poll_and_claim: ("ix_jobs_open", "ix_parcels_owned"),
+    poll_and_claim: ("ix_jobs_open",),
     write_runs: ("ix_runs_project_id_spec_hash",),
     end_large_job: ("ix_runs_job_id_best_rms", "ix_runs_job_id_state_number"),
-    lose_workers_cancel_and_resume: ("ix_parcels_owned", "ix_runs_job_id_state_number"),
+    lose_workers_cancel_and_resume: ("ix_runs_job_id_state_number",),
     reap: ("ix_jobs_open",),
 }
 """What is done often or under the write lock, and the indexes that it must use."""
