@@ -246,7 +246,10 @@ class RayExecutor:
     def limit_slots(self, n_cores: int) -> None:
         """Use that many cores at most: the part of this dispatcher in a shared cluster."""
         self._shared_slots = n_cores
-        self._use_slots()
+        slots = self._count_slots()
+        if slots != self.slots:
+            _log.info("%d of %d cores are used now, before %d", slots, self.n_cores, self.slots)
+            self.slots = slots
 
     def _count_cores(self) -> int:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
@@ -255,21 +258,18 @@ class RayExecutor:
         limits = (self.n_cores, self._most_slots, self._shared_slots)
         return max(1, min(limit for limit in limits if limit is not None))
 
-    def _use_slots(self) -> None:
-        slots = self._count_slots()
-        if slots != self.slots:
-            _log.info("%d of %d cores are used now, before %d", slots, self.n_cores, self.slots)
-            self.slots = slots
-
     def _watch_slot_count(self) -> None:
         """Count cores in a thread, as the call may hang; the scheduler reads `slots` each step."""
         while not self._closing.wait(SLOT_COUNT_SECONDS):
             try:
-                self.n_cores = self._count_cores()
+                n_cores = self._count_cores()
             except (self._ray.exceptions.RayError, RuntimeError, ConnectionError) as error:
                 _log.warning("the cores of the cluster could not be counted: %s", error)
                 continue
-            self._use_slots()
+            if n_cores != self.n_cores:
+                _log.info("the cluster has %d cores now, before %d", n_cores, self.n_cores)
+                self.n_cores = n_cores
+                self.slots = self._count_slots()
 
     def _remove_folder(self) -> None:
         if self._local is not None:
