@@ -12,12 +12,15 @@ from service.api.content import (
     MemoryContent,
     content_response,
 )
-from service.api.dependencies import MaxPoints, PartsDep, ReadSession
+from service.api.dependencies import MaxPoints, PartsDep, ReadSession, WriteSession
+from service.api.items import Cascade, IfMatch, delete, edit, set_etag
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
 from service.core.errors import NotFound
 from service.figures.profiles import plot_profiles as profile_figure
+from service.items.schemas import DeletedOut, EditIn
 from service.jobs.stored_run import load_run
+from service.repositories.runs import RunRepository
 from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
 from service.runs.schemas import (
     CompareIn,
@@ -40,9 +43,31 @@ router = APIRouter(prefix="/v1/runs", tags=["runs"], route_class=JsonRoute)
 
 
 @router.get("/{run_id}")
-def read_run(run_id: str, session: ReadSession) -> RunOut:
+def read_run(run_id: str, session: ReadSession, response: Response) -> RunOut:
     """Read one run: its state, and its result as soon as it exists."""
+    set_etag(response, RunRepository(session).get(run_id))
     return runs.get_run(session, run_id)
+
+
+@router.patch("/{run_id}")
+def edit_run(
+    run_id: str,
+    body: EditIn,
+    session: WriteSession,
+    response: Response,
+    if_match: IfMatch = None,
+) -> RunOut:
+    """Change note or tags of a run; with `If-Match` only if they are as they were read."""
+    edit(session, "run", run_id, body, if_match, response)
+    return runs.get_run(session, run_id)
+
+
+@router.delete("/{run_id}")
+def delete_run(
+    run_id: str, session: WriteSession, cascade: Cascade = False, if_match: IfMatch = None
+) -> DeletedOut:
+    """Delete a run of an ended job; 409 lists what was made from it."""
+    return delete(session, "run", run_id, cascade, if_match)
 
 
 @router.get("/{run_id}/history")

@@ -147,6 +147,8 @@ class DatasetOut(Answer):
     segments: list[dict[str, Any]]
     warnings: list[str]
     details: dict[str, Any]
+    note: str | None = None
+    tags: list[str] = Field(default=[])
     created_at: datetime
 
 
@@ -179,11 +181,23 @@ class LineageEdgeOut(Answer):
     relation: str
 
 
+class TombstoneOut(Answer):
+    """What is left of a deleted item."""
+
+    id: str
+    name: str
+    deleted_at: datetime | None
+
+
 class LineageOut(Answer):
-    """Everything that a dataset was made from, and everything made from it."""
+    """Everything that a dataset was made from, and everything made from it.
+
+    `deleted` lists the items of the edges that were deleted since.
+    """
 
     id: str
     edges: list[LineageEdgeOut]
+    deleted: list[TombstoneOut] = Field(default=[])
 
 
 MAX_SERIES_SAMPLES = 1_000_000

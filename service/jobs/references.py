@@ -5,16 +5,17 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
 from service.core.wire import Page
-from service.jobs.schemas import REFERENCE_PREFIX, RUN_PREFIX, ReferenceIn, ReferenceOut
+from service.items.reference_names import REFERENCE_PREFIX, check_reference_name
+from service.jobs.schemas import ReferenceIn, ReferenceOut
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
+from service.repositories.jobs import JobRepository
 from service.repositories.references import CurrentReference, ReferenceRepository
 from service.repositories.runs import RunRepository
+from service.repositories.search import NO_FILTER, ListFilter
 from service.storage.errors import RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
-
-MAX_NAME_CHARACTERS = 100
 
 
 def accept_reference(session: Session, name: str, body: ReferenceIn) -> ReferenceOut:
@@ -25,8 +26,10 @@ def accept_reference(session: Session, name: str, body: ReferenceIn) -> Referenc
     InvalidRequest
         If the name is invalid or stands for another model, or if there is no such successful run.
     """
-    _check_name(name)
+    check_reference_name(name, "{name}")
     run = _get_succeeded_run(session, body.run, "/run")
+    JobRepository(session).share_lock(run.job_id)
+    run = _get_succeeded_run(session, body.run, "/run")  # it is not deleted from now on
     _check_model(session, name, run)
     ReferenceRepository(session).accept_run(name, run.id, body.by, body.note)
     return get_reference(session, name)
@@ -45,9 +48,11 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
     )
 
 
-def list_references(session: Session, cursor: str | None, limit: int) -> Page[ReferenceOut]:
-    """List the references in use, by name."""
-    page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
+def list_references(
+    session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
+) -> Page[ReferenceOut]:
+    """List the references in use that meet a filter, by name."""
+    page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
     return Page(
         items=[_to_reference_out(reference, []) for reference in page.items], next=page.next
     )
@@ -73,23 +78,6 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
             "under this name first",
         ) from None
     return _get_succeeded_run(session, latest.run_id, pointer)
-
-
-def _check_name(name: str) -> None:
-    """Refuse names that look like a run's id or like parts of a path."""
-    if not 1 <= len(name) <= MAX_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        requirement = f"1 to {MAX_NAME_CHARACTERS} printable characters without outer blanks"
-    elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
-        requirement = (
-            f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"
-        )
-    elif "/" in name or not name.strip("."):
-        requirement = "one without '/', and not of dots only"
-    else:
-        return
-    raise InvalidRequest.from_fault(
-        "{name}", f"the name in the path is {name!r:.120}; need {requirement}"
-    )
 
 
 def _check_model(session: Session, name: str, run: Run) -> None:
@@ -134,6 +122,7 @@ def _to_reference_out(current: CurrentReference, before: list[AcceptedReference]
             **latest,
             "name": current.accepted.name,
             "job": current.job_id,
+            "tags": current.accepted.tags or [],
             "labels": current.labels,
             "estimates": current.estimates or {},
             "history": earlier,

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from service.core.states import StateName
 from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed
+from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
     MAX_BITS,
     MAX_EVALUATIONS,
@@ -173,7 +174,7 @@ class SweepIn(Body):
     axes: list[SweepAxisIn] = Field(default=[], max_length=16)
 
 
-PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX = "previous", "reference:", "run_"
+PREVIOUS = "previous"
 
 
 def _check_warm_start(value: str) -> str:
@@ -324,6 +325,16 @@ class JobOut(Answer):
     attempt: int = Field(description="number of starts, resumptions included")
     error: str | None = None
     model: str
+    note: str | None = None
+    tags: list[str] = Field(default=[])
+    version: str | None = Field(
+        default=None, description="version of the program that computed the job, or took it"
+    )
+    fingerprint: str | None = Field(
+        default=None,
+        description="digest of the kernels' program: equal ones give results equal bit for bit",
+    )
+    spec_hash: str | None = Field(default=None, description="digest of the request")
     priority: int
     progress: ProgressOut
     rms_unit: str | None = Field(
@@ -358,6 +369,7 @@ class ReferenceOut(Answer):
     by: str | None = None
     note: str | None = None
     at: datetime
+    tags: list[str] = Field(default=[])
     labels: dict[str, Any] = Field(default={})
     estimates: dict[str, dict[str, float | None]] = Field(default={})
     history: list[AcceptanceOut] = Field(

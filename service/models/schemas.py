@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from pydantic import Field
+
 from service.core.wire import Answer, FaultOut
 
 
@@ -16,6 +18,8 @@ class ModelOut(Answer):
     inputs: dict[str, str]
     outputs: dict[str, str]
     parameters: dict[str, dict[str, Any]]
+    note: str | None = None
+    tags: list[str] = Field(default=[])
     document: dict[str, Any] | None = None
 
 

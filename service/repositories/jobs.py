@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
 from service.repositories.events import EventRepository
+from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
 from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
@@ -21,13 +22,18 @@ QUEUE_CHANNEL = "lagid_queue"
 
 @dataclass(frozen=True, slots=True)
 class NewJob:
-    """A job to submit: `spec` is the validated body, `n_runs` counts the cells of its sweep."""
+    """A job to submit: `spec` is the validated body, `n_runs` counts the cells of its sweep.
+
+    `version` is that of the program that takes it, `spec_hash` the digest of the request.
+    """
 
     name: str
     spec: Document
     n_runs: int = 1
     priority: int = 0
     max_attempts: int = 3
+    version: str | None = None
+    spec_hash: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +105,19 @@ class JobRepository:
         return state
 
     def list_page(
-        self, *, cursor: str | None = None, limit: int = 50, states: Sequence[JobState] = ()
+        self,
+        *,
+        cursor: str | None = None,
+        limit: int = 50,
+        states: Sequence[JobState] = (),
+        chosen: ListFilter = NO_FILTER,
     ) -> RowPage[Job]:
-        """List jobs, latest first. The pages do not shift while new jobs arrive."""
+        """List the jobs that meet a filter, latest first.
+
+        The pages do not shift while new jobs arrive.
+        """
+        if chosen:
+            return self._search_page(chosen, states, cursor, limit)
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
@@ -115,6 +131,16 @@ class JobRepository:
             rows = sorted(found, key=lambda job: job.id, reverse=True)[: limit + 1]
         else:
             rows = self._session.scalars(query).all()
+        return make_page(rows, limit, (job.id for job in rows))
+
+    def _search_page(
+        self, chosen: ListFilter, states: Sequence[JobState], cursor: str | None, limit: int
+    ) -> RowPage[Job]:
+        ids = select_ids(Job, self._project_id, chosen, cursor=cursor, limit=limit)
+        if states:
+            ids = ids.where(Job.state.in_(states))
+        query = select(Job).where(Job.id.in_(list(self._session.scalars(ids))))
+        rows = sorted(self._session.scalars(query), key=lambda job: job.id, reverse=True)
         return make_page(rows, limit, (job.id for job in rows))
 
     def count_states(self) -> dict[JobState, int]:
@@ -157,7 +183,9 @@ class JobRepository:
                 f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
             )
         others = [state for state in JobState if state is not JobState.SUCCEEDED]
-        unsuccessful = update(Run).where(Run.job_id == job_id, Run.state.in_(others))
+        unsuccessful = update(Run).where(
+            Run.job_id == job_id, Run.state.in_(others), Run.deleted_at.is_(None)
+        )
         self._session.execute(
             unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
@@ -172,12 +200,32 @@ class JobRepository:
         return job
 
     def delete(self, job_id: str) -> None:
-        """Hide a finished job; objects of this job alone become garbage."""
+        """Hide a finished job; objects of this job alone become garbage.
+
+        Its runs are deleted later (`service.upkeep.purge`), because there may be many.
+
+        Raises
+        ------
+        RowConflict
+            If it is queued or running.
+        """
         job = self._lock_job(job_id)
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
+        # A key of the row is not changed, so only this lock makes those wait who use the job.
+        self._session.execute(select(Job.id).where(Job.id == job_id).with_for_update())
         job.deleted_at = utc_now()
+        self._session.execute(delete(IdempotencyKey).where(IdempotencyKey.job_id == job_id))
         self._session.flush()
+
+    def share_lock(self, job_id: str) -> None:
+        """Keep a job from being deleted until the session ends, for all who only use it."""
+        lock = select(Job.id).where(Job.id == job_id).with_for_update(read=True, key_share=True)
+        self._session.execute(lock)
+
+    def lock(self, job_id: str) -> Job:
+        """Return a job that nobody else can change until the session ends; else `RowNotFound`."""
+        return self._lock_job(job_id)
 
     def _filter_project(self) -> tuple[Any, ...]:
         return Job.project_id == self._project_id, Job.deleted_at.is_(None)
@@ -202,6 +250,8 @@ class JobRepository:
             n_runs=new.n_runs,
             priority=new.priority,
             max_attempts=new.max_attempts,
+            version=new.version,
+            spec_hash=new.spec_hash,
             state=JobState.QUEUED,
             attempt=0,
         )

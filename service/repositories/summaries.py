@@ -11,7 +11,7 @@ from sqlalchemy import String, Text, cast, select, type_coerce
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.repositories.runs import entry_equals, select_job_id
+from service.repositories.runs import entry_equals, filter_job
 from service.storage.columns import Document
 from service.storage.statements import upsert
 from service.storage.tables import DEFAULT_PROJECT, Job, Run, StoredSummary
@@ -101,7 +101,7 @@ def read_run_table(session: Session, job_id: str, project_id: str = DEFAULT_PROJ
             Run.valid,
             *(getattr(Run, name) for name in _FLOATS),
         )
-        .where(Run.job_id == select_job_id(job_id, project_id))
+        .where(*filter_job(job_id, project_id))
         .order_by(Run.number)
         .execution_options(yield_per=READ_ROWS)
     )
@@ -166,7 +166,7 @@ def find_quietest_run(
 ) -> Run | None:
     """Find the best valid run of a cell among those with the least noise; None without success."""
     query = select(Run).where(
-        Run.job_id == select_job_id(job_id, project_id),
+        *filter_job(job_id, project_id),
         Run.state == JobState.SUCCEEDED,
         Run.valid.is_(True),
         Run.best_rms.is_not(None),

@@ -41,6 +41,19 @@ class RunOut(Answer):
     reused_from: str | None = Field(
         default=None, description="the earlier run with the same specification"
     )
+    seed: int | None = None
+    spec_hash: str | None = Field(
+        default=None, description="digest of all that the result depends on"
+    )
+    version: str | None = Field(
+        default=None, description="version of the program that computed the result"
+    )
+    fingerprint: str | None = Field(
+        default=None,
+        description="digest of the kernels' program: equal ones give results equal bit for bit",
+    )
+    note: str | None = None
+    tags: list[str] = Field(default=[])
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None

@@ -24,6 +24,8 @@ OPEN_CONDITION = "state IN ('queued', 'running')"
 """Condition of the index of open jobs. SQLite uses the index only for queries with this text."""
 TOLD_CONDITION = "kind <> 'progress'"
 """Condition of the index of the events that a page lists."""
+DELETED_CONDITION = "deleted_at IS NOT NULL AND purged_at IS NULL"
+"""Condition of the index of the deleted jobs whose runs are still stored."""
 
 
 class Base(DeclarativeBase):
@@ -54,12 +56,16 @@ def _partial_index(name: str, condition: str, *columns: str, unique: bool = Fals
 
 
 class Project(Base):
-    """Owner of everything that a user creates."""
+    """Owner of everything that a user creates.
+
+    `keep_days` is how long its ended jobs are kept, in days. None: as the settings say.
+    """
 
     __tablename__ = "projects"
 
     id: Mapped[str] = mapped_column(primary_key=True)
     name: Mapped[str]
+    keep_days: Mapped[float | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
@@ -96,6 +102,7 @@ class Dataset(Base):
             "source_key",
             unique=True,
         ),
+        _partial_index("ix_datasets_named", "deleted_at IS NULL", "project_id", "id", "name"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -111,6 +118,8 @@ class Dataset(Base):
     sample_time: Mapped[float | None]
     channels: Mapped[list[Any]]
     details: Mapped[Document]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
 
@@ -139,6 +148,8 @@ class ModelVersion(Base):
     version: Mapped[int]
     document: Mapped[Document] = mapped_column(OrderedJsonType)
     document_hash: Mapped[str]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
 
@@ -152,6 +163,10 @@ class Job(Base):
     far. `n_reused` counts the runs taken over from other jobs. `n_done_at_claim` is `n_done` at the
     last claim, so that progress since then needs no look at the runs. `floors` is the document that
     `service.dispatch.cramer_rao` computes for a job with noise.
+
+    `version` and `fingerprint` are those of the program that last started the job; until then
+    `version` is that of the program that took it. `spec_hash` is the digest of its request.
+    `purged_at` is set once the runs of a deleted job are gone.
     """
 
     __tablename__ = "jobs"
@@ -178,6 +193,14 @@ class Job(Base):
             "cancel_requested",
             "id",
         ),
+        _partial_index("ix_jobs_named", "deleted_at IS NULL", "project_id", "id", "name"),
+        _partial_index(
+            "ix_jobs_ended",
+            "deleted_at IS NULL AND finished_at IS NOT NULL",
+            "project_id",
+            "finished_at",
+        ),
+        _partial_index("ix_jobs_deleted", DELETED_CONDITION, "deleted_at"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -203,10 +226,16 @@ class Job(Base):
     seconds_left: Mapped[float | None]
     error: Mapped[str | None]
     floors: Mapped[Document | None]
+    version: Mapped[str | None]
+    fingerprint: Mapped[str | None]
+    spec_hash: Mapped[str | None]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
+    purged_at: Mapped[datetime | None]
 
 
 class Run(Base):
@@ -217,7 +246,8 @@ class Run(Base):
     summaries over many runs. `rms_noise_free` is the RMS against the records before noise was
     added. `kills` counts how often in a row a worker died in this run alone without progress.
     `signals_sha256` names the object of its fitted signals. If several runs share an object, the
-    file of this run is `signals_size` bytes of it from `signals_start`.
+    file of this run is `signals_size` bytes of it from `signals_start`. A deleted run keeps its row
+    without results, so that the job does not compute it again.
     """
 
     __tablename__ = "runs"
@@ -258,9 +288,12 @@ class Run(Base):
     signals_start: Mapped[int | None] = mapped_column(LargeInteger)
     signals_size: Mapped[int | None] = mapped_column(LargeInteger)
     error: Mapped[str | None]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]
 
 
 class StoredSummary(Base):
@@ -347,7 +380,23 @@ class AcceptedReference(Base):
     run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"))
     accepted_by: Mapped[str | None]
     note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     accepted_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class SearchTerm(Base):
+    """A term under which lists find an item: a tag, a label, a model or a dataset.
+
+    `kind` is that of the item and of the term, such as ``job:tag``. A page of a list is then one
+    range of the primary key.
+    """
+
+    __tablename__ = "search_terms"
+
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
+    kind: Mapped[str] = mapped_column(primary_key=True)
+    value: Mapped[str] = mapped_column(primary_key=True)
+    item_id: Mapped[str] = mapped_column(primary_key=True, index=True)
 
 
 class IdempotencyKey(Base):
@@ -358,7 +407,7 @@ class IdempotencyKey(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
     key: Mapped[str] = mapped_column(primary_key=True)
     request_hash: Mapped[str]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), index=True)
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
