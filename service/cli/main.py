@@ -101,7 +101,7 @@ first.add(
     "lagid paper --only table1,figure15 --output table1.html",
 )
 data = _HelpPanel("Data and models")
-data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --limit 5 --json")
+data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --name tube --json")
 data.add_group("dataset", datasets.app)
 data.add_group("models", models.app)
 work = _HelpPanel("Jobs")
@@ -112,9 +112,15 @@ work.add(
     "lagid submit - --json < job.yaml",
 )
 work.add("watch", jobs.watch_job, "lagid watch job_1", "lagid watch job_1 --quiet --json")
-work.add("jobs", jobs.list_jobs, "lagid jobs", "lagid jobs --state running --state queued")
+work.add(
+    "jobs",
+    jobs.list_jobs,
+    "lagid jobs --state running",
+    "lagid jobs --tag night --since 2026-01-31",
+)
 work.add("cancel", jobs.cancel_job, "lagid cancel job_1")
 work.add("resume", jobs.resume_job, "lagid resume job_1")
+work.add_group("job", jobs.app)
 work.add_group("sweep", sweeps.app)
 work.add(
     "reidentify",

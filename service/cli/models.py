@@ -24,6 +24,7 @@ from service.cli.common import (
     report_faults,
     show_examples,
 )
+from service.cli.items import add_item_commands
 from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
@@ -159,3 +160,6 @@ def _list_builtin_models() -> list[dict[str, Any]]:
     from service.models.catalogue import list_catalogue
 
     return [model.model_dump(mode="json") for model in list_catalogue()]
+
+
+add_item_commands(app, "lagid models", "model", "mine", has_name=False)

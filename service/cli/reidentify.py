@@ -39,6 +39,7 @@ from service.cli.common import (
     split_names,
     write_file,
 )
+from service.cli.items import add_item_commands
 from service.cli.tables import print_reuse_note, print_trend
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
@@ -318,3 +319,6 @@ def _format_estimates(estimates: dict[str, Any]) -> str:
     return ", ".join(
         f"{name} = {format_estimate(estimate)}" for name, estimate in estimates.items()
     )
+
+
+add_item_commands(app, "lagid references", "reference", "tube", has_name=True)

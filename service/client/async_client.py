@@ -107,9 +107,9 @@ class AsyncClient:
         body = {"name": name, "steps": steps}
         return await self._fetch_document(calls.DERIVE(dataset, json=body))
 
-    async def datasets(self, limit: int | None = None) -> list[Document]:
-        """List datasets, newest first: all, or at most `limit`."""
-        return await self._fetch_list(calls.DATASETS(), limit)
+    async def datasets(self, limit: int | None = None, **filters: Any) -> list[Document]:
+        """List datasets, newest first: all, or at most `limit`; `name`, `tag` … are filters."""
+        return await self._fetch_list(calls.DATASETS(**filters), limit)
 
     async def dataset(self, name: str) -> Document:
         """Fetch one dataset by its id."""
@@ -134,10 +134,24 @@ class AsyncClient:
             async for piece in stream.aiter_bytes():
                 yield piece
 
+    async def edit_dataset(
+        self, dataset: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a dataset; `if_match` is the ETag that was read."""
+        return await self._fetch_document(
+            calls.build_edit(calls.EDIT_DATASET, dataset, changes, if_match)
+        )
+
+    async def delete_dataset(self, dataset: str, *, cascade: bool = False) -> Document:
+        """Delete a dataset; `cascade` adds what was made from it."""
+        return await self._fetch_document(
+            calls.build_deletion(calls.DELETE_DATASET, dataset, cascade)
+        )
+
     # ---- models
-    async def models(self, limit: int | None = None) -> list[Document]:
+    async def models(self, limit: int | None = None, **filters: Any) -> list[Document]:
         """List the built-in models and those of users: all, or at most `limit`."""
-        return await self._fetch_list(calls.MODELS(), limit)
+        return await self._fetch_list(calls.MODELS(**filters), limit)
 
     async def model(self, name: str) -> Document:
         """Fetch one model with its document."""
@@ -150,6 +164,18 @@ class AsyncClient:
     async def check_model(self, document: Mapping[str, Any]) -> Document:
         """Check a model document; every error has its column."""
         return await self._fetch_document(calls.CHECK_MODEL(json=document))
+
+    async def edit_model(
+        self, model: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change note or tags of a model; `if_match` is the ETag that was read."""
+        return await self._fetch_document(
+            calls.build_edit(calls.EDIT_MODEL, model, changes, if_match)
+        )
+
+    async def delete_model(self, model: str, *, cascade: bool = False) -> Document:
+        """Delete a model, all versions or ``name@version``; `cascade` adds what used it."""
+        return await self._fetch_document(calls.build_deletion(calls.DELETE_MODEL, model, cascade))
 
     # ---- jobs
     async def submit(
@@ -177,14 +203,24 @@ class AsyncClient:
         )
 
     async def jobs(
-        self, limit: int | None = None, state: Sequence[str] | None = None
+        self, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
     ) -> list[Document]:
-        """List jobs, newest first: all, at most `limit`, or those in some states."""
-        return await self._fetch_list(calls.JOBS(state=state), limit)
+        """List jobs, newest first: all, at most `limit`, or those that filters select."""
+        return await self._fetch_list(calls.JOBS(state=state, **filters), limit)
 
     async def job(self, name: str) -> Document:
         """Fetch one job with its state and progress."""
         return await self._fetch_document(calls.JOB(name))
+
+    async def edit_job(
+        self, job: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a job; `if_match` is the ETag that was read."""
+        return await self._fetch_document(calls.build_edit(calls.EDIT_JOB, job, changes, if_match))
+
+    async def delete_job(self, job: str, *, cascade: bool = False) -> Document:
+        """Delete a job that has ended; `cascade` adds what was made from it."""
+        return await self._fetch_document(calls.build_deletion(calls.DELETE_JOB, job, cascade))
 
     async def cancel(self, job: str) -> Document:
         """Cancel a job; its results so far stay."""
@@ -246,6 +282,16 @@ class AsyncClient:
         """Fetch the result of one run."""
         return await self._fetch_document(calls.RUN(name))
 
+    async def edit_run(
+        self, run: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change note or tags of a run; `if_match` is the ETag that was read."""
+        return await self._fetch_document(calls.build_edit(calls.EDIT_RUN, run, changes, if_match))
+
+    async def delete_run(self, run: str, *, cascade: bool = False) -> Document:
+        """Delete a run of a job that has ended; `cascade` adds what was made from it."""
+        return await self._fetch_document(calls.build_deletion(calls.DELETE_RUN, run, cascade))
+
     async def history(self, run: str) -> Document:
         """Fetch the improvements of each island's champion."""
         return await self._fetch_document(calls.HISTORY(run))
@@ -295,9 +341,9 @@ class AsyncClient:
         return await self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    async def references(self, limit: int | None = None) -> list[Document]:
+    async def references(self, limit: int | None = None, **filters: Any) -> list[Document]:
         """List the references in use, by name: all, or at most `limit`."""
-        return await self._fetch_list(calls.REFERENCES(), limit)
+        return await self._fetch_list(calls.REFERENCES(**filters), limit)
 
     async def reference(self, name: str) -> Document:
         """Fetch one reference with its history."""
@@ -309,6 +355,20 @@ class AsyncClient:
         """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
         return await self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
+
+    async def edit_reference(
+        self, reference: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a reference; `if_match` is the ETag that was read."""
+        return await self._fetch_document(
+            calls.build_edit(calls.EDIT_REFERENCE, reference, changes, if_match)
+        )
+
+    async def delete_reference(self, reference: str, *, cascade: bool = False) -> Document:
+        """Delete a reference with its history; `cascade` adds what was made from it."""
+        return await self._fetch_document(
+            calls.build_deletion(calls.DELETE_REFERENCE, reference, cascade)
+        )
 
 
 async def _read_blocks(path: Path) -> AsyncIterator[bytes]:

@@ -155,6 +155,8 @@ SIMULATE_DATASET = Endpoint("POST", "datasets:simulate")
 DERIVE = Endpoint("POST", "datasets/{}:derive")
 DATASETS = Endpoint("GET", "datasets")
 DATASET = Endpoint("GET", "datasets/{}")
+EDIT_DATASET = Endpoint("PATCH", "datasets/{}")
+DELETE_DATASET = Endpoint("DELETE", "datasets/{}")
 SIGNALS = Endpoint("GET", "datasets/{}/signals")
 LINEAGE = Endpoint("GET", "datasets/{}/lineage")
 CONTENT = Endpoint("GET", "datasets/{}/content")
@@ -162,6 +164,8 @@ CONTENT_CSV = Endpoint("GET", "datasets/{}/content.csv")
 
 MODELS = Endpoint("GET", "models")
 MODEL = Endpoint("GET", "models/{}")
+EDIT_MODEL = Endpoint("PATCH", "models/{}")
+DELETE_MODEL = Endpoint("DELETE", "models/{}")
 ADD_MODEL = Endpoint("POST", "models")
 CHECK_MODEL = Endpoint("POST", "models:check")
 
@@ -170,6 +174,8 @@ NOISE_SWEEP = Endpoint("POST", "recipes/noise-sweep")
 REIDENTIFY = Endpoint("POST", "recipes/reidentify")
 JOBS = Endpoint("GET", "jobs")
 JOB = Endpoint("GET", "jobs/{}")
+EDIT_JOB = Endpoint("PATCH", "jobs/{}")
+DELETE_JOB = Endpoint("DELETE", "jobs/{}")
 CANCEL = Endpoint("POST", "jobs/{}:cancel")
 RESUME = Endpoint("POST", "jobs/{}:resume")
 CLONE = Endpoint("POST", "jobs/{}:clone")
@@ -180,6 +186,8 @@ SUMMARY = Endpoint("GET", "jobs/{}/summary")
 TREND = Endpoint("GET", "jobs/{}/trend")
 
 RUN = Endpoint("GET", "runs/{}")
+EDIT_RUN = Endpoint("PATCH", "runs/{}")
+DELETE_RUN = Endpoint("DELETE", "runs/{}")
 HISTORY = Endpoint("GET", "runs/{}/history")
 RESPONSE = Endpoint("GET", "runs/{}/response")
 SIMULATE_RUN = Endpoint("POST", "runs/{}:simulate")
@@ -193,6 +201,21 @@ COMPARE = Endpoint("POST", "runs:compare")
 REFERENCES = Endpoint("GET", "references")
 REFERENCE = Endpoint("GET", "references/{}")
 ACCEPT_REFERENCE = Endpoint("PUT", "references/{}")
+EDIT_REFERENCE = Endpoint("PATCH", "references/{}")
+DELETE_REFERENCE = Endpoint("DELETE", "references/{}")
+
+
+def build_edit(
+    endpoint: Endpoint, name: str, changes: Mapping[str, Any], if_match: str | None
+) -> RestCall:
+    """Build a call that changes name, note or tags, by `if_match` only of that version."""
+    headers = {} if if_match is None else {"If-Match": if_match}
+    return replace(endpoint(name, json=changes), headers=headers)
+
+
+def build_deletion(endpoint: Endpoint, name: str, cascade: bool) -> RestCall:
+    """Build a call that deletes an item, by `cascade` with everything that was made from it."""
+    return endpoint(name, cascade=True) if cascade else endpoint(name)
 
 
 def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> RestCall:

@@ -123,9 +123,9 @@ class Client:
         body = {"name": name, "steps": steps}
         return self._fetch_document(calls.DERIVE(dataset, json=body))
 
-    def datasets(self, limit: int | None = None) -> list[Document]:
-        """List datasets, newest first: all, or at most `limit`."""
-        return self._fetch_list(calls.DATASETS(), limit)
+    def datasets(self, limit: int | None = None, **filters: Any) -> list[Document]:
+        """List datasets, newest first: all, or at most `limit`; `name`, `tag` … are filters."""
+        return self._fetch_list(calls.DATASETS(**filters), limit)
 
     def dataset(self, name: str) -> Document:
         """Fetch one dataset by its id."""
@@ -148,10 +148,22 @@ class Client:
         with closing(self.send(calls.build_download(dataset, format), stream=True)) as stream:
             yield from stream.iter_bytes()
 
+    def edit_dataset(
+        self, dataset: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a dataset; `if_match` is the ETag that was read."""
+        return self._fetch_document(
+            calls.build_edit(calls.EDIT_DATASET, dataset, changes, if_match)
+        )
+
+    def delete_dataset(self, dataset: str, *, cascade: bool = False) -> Document:
+        """Delete a dataset; `cascade` adds what was made from it."""
+        return self._fetch_document(calls.build_deletion(calls.DELETE_DATASET, dataset, cascade))
+
     # ---- models
-    def models(self, limit: int | None = None) -> list[Document]:
+    def models(self, limit: int | None = None, **filters: Any) -> list[Document]:
         """List the built-in models and those of users: all, or at most `limit`."""
-        return self._fetch_list(calls.MODELS(), limit)
+        return self._fetch_list(calls.MODELS(**filters), limit)
 
     def model(self, name: str) -> Document:
         """Fetch one model with its document."""
@@ -164,6 +176,16 @@ class Client:
     def check_model(self, document: Mapping[str, Any]) -> Document:
         """Check a model document; every error has its column."""
         return self._fetch_document(calls.CHECK_MODEL(json=document))
+
+    def edit_model(
+        self, model: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change note or tags of a model; `if_match` is the ETag that was read."""
+        return self._fetch_document(calls.build_edit(calls.EDIT_MODEL, model, changes, if_match))
+
+    def delete_model(self, model: str, *, cascade: bool = False) -> Document:
+        """Delete a model, all versions or ``name@version``; `cascade` adds what used it."""
+        return self._fetch_document(calls.build_deletion(calls.DELETE_MODEL, model, cascade))
 
     # ---- jobs
     def submit(self, job: Mapping[str, Any], *, idempotency_key: str | None = None) -> Document:
@@ -184,13 +206,25 @@ class Client:
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
         return self._fetch_document(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
 
-    def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
-        """List jobs, newest first: all, at most `limit`, or those in some states."""
-        return self._fetch_list(calls.JOBS(state=state), limit)
+    def jobs(
+        self, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
+    ) -> list[Document]:
+        """List jobs, newest first: all, at most `limit`, or those that filters select."""
+        return self._fetch_list(calls.JOBS(state=state, **filters), limit)
 
     def job(self, name: str) -> Document:
         """Fetch one job with its state and progress."""
         return self._fetch_document(calls.JOB(name))
+
+    def edit_job(
+        self, job: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a job; `if_match` is the ETag that was read."""
+        return self._fetch_document(calls.build_edit(calls.EDIT_JOB, job, changes, if_match))
+
+    def delete_job(self, job: str, *, cascade: bool = False) -> Document:
+        """Delete a job that has ended; `cascade` adds what was made from it."""
+        return self._fetch_document(calls.build_deletion(calls.DELETE_JOB, job, cascade))
 
     def cancel(self, job: str) -> Document:
         """Cancel a job; its results so far stay."""
@@ -248,6 +282,16 @@ class Client:
         """Fetch the result of one run."""
         return self._fetch_document(calls.RUN(name))
 
+    def edit_run(
+        self, run: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change note or tags of a run; `if_match` is the ETag that was read."""
+        return self._fetch_document(calls.build_edit(calls.EDIT_RUN, run, changes, if_match))
+
+    def delete_run(self, run: str, *, cascade: bool = False) -> Document:
+        """Delete a run of a job that has ended; `cascade` adds what was made from it."""
+        return self._fetch_document(calls.build_deletion(calls.DELETE_RUN, run, cascade))
+
     def history(self, run: str) -> Document:
         """Fetch the improvements of each island's champion."""
         return self._fetch_document(calls.HISTORY(run))
@@ -295,9 +339,9 @@ class Client:
         return self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    def references(self, limit: int | None = None) -> list[Document]:
+    def references(self, limit: int | None = None, **filters: Any) -> list[Document]:
         """List the references in use, by name: all, or at most `limit`."""
-        return self._fetch_list(calls.REFERENCES(), limit)
+        return self._fetch_list(calls.REFERENCES(**filters), limit)
 
     def reference(self, name: str) -> Document:
         """Fetch one reference with its history."""
@@ -309,3 +353,17 @@ class Client:
         """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
         return self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
+
+    def edit_reference(
+        self, reference: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> Document:
+        """Change name, note or tags of a reference; `if_match` is the ETag that was read."""
+        return self._fetch_document(
+            calls.build_edit(calls.EDIT_REFERENCE, reference, changes, if_match)
+        )
+
+    def delete_reference(self, reference: str, *, cascade: bool = False) -> Document:
+        """Delete a reference with its history; `cascade` adds what was made from it."""
+        return self._fetch_document(
+            calls.build_deletion(calls.DELETE_REFERENCE, reference, cascade)
+        )
