@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import datasets, jobs, models, runs, server, sweeps
+from service.cli import backup, datasets, jobs, models, runs, server, sweeps
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -143,6 +143,13 @@ upkeep.add(
     "serve", server.serve, "lagid serve", "lagid serve --port 8001 --data-dir measurements --cpus 4"
 )
 upkeep.add("dispatcher", server.run_dispatcher, "lagid dispatcher --cpus 8")
+upkeep.add("backup", backup.write_backup, "lagid backup lagid.zip")
+upkeep.add(
+    "restore",
+    backup.restore_backup,
+    "lagid restore lagid.zip --data-dir restored",
+    "lagid restore lagid.zip --force",
+)
 upkeep.add_group("db", server.database_app)
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
