@@ -44,12 +44,10 @@ def write_backup(
 def restore_backup(
     file: BackupFile,
     data_dir: DataDir = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace the rows of a database that is not empty.")
-    ] = False,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Restore a backup into an empty data folder, database and store; nothing may use them."""
+    """Restore a backup into an empty database and store; --force replaces all rows there are."""
     settings = load_settings(data_dir=data_dir)
     from service.storage.objects import open_store
     from service.upkeep import backup

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import backup, datasets, jobs, models, runs, server, sweeps
+from service.cli import backup, datasets, jobs, models, retention, runs, server, sweeps
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -150,7 +150,7 @@ upkeep.add(
     "lagid restore lagid.zip --data-dir restored",
     "lagid restore lagid.zip --force",
 )
-upkeep.add_group("db", server.database_app)
+upkeep.add_group("db", retention.app)
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
 
