@@ -7,7 +7,6 @@ from fastapi import APIRouter, Query, Request, Response
 from service.api.bodies import JsonRoute
 from service.api.content import (
     FILE_ANSWERS,
-    ByteRange,
     McapResponse,
     MemoryContent,
     content_response,
@@ -16,12 +15,10 @@ from service.api.dependencies import MaxPoints, PartsDep, ReadSession, WriteSess
 from service.api.items import Cascade, IfMatch, delete, edit, set_etag
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
-from service.core.errors import NotFound
 from service.figures.profiles import plot_profiles as profile_figure
 from service.items.schemas import DeletedOut, EditIn
-from service.jobs.stored_run import load_run
 from service.repositories.runs import RunRepository
-from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
+from service.runs import comparison, exports, fitted, free_run, profiles, residuals, run_file, runs
 from service.runs.schemas import (
     CompareIn,
     ComparisonOut,
@@ -140,18 +137,12 @@ def profile_run(
 def read_run_signals(
     run_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
-    """Download measured and simulated outputs and residuals as MCAP; ranges and ETags work."""
-    stored = load_run(session, run_id)
-    run, part = stored.run, None
-    if run.signals_sha256 is None:
-        fits = fitted.load_fitted_signals(session, parts.store, stored)
-        if fits is None:
-            raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
-        content = MemoryContent(fitted.write_signals_file(run_id, fits))
-        return content_response(request, content, content.sha256, f"{run_id}.mcap")
-    if run.signals_start is not None and run.signals_size is not None:
-        part = ByteRange(run.signals_start, run.signals_start + run.signals_size)
-    return content_response(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)
+    """Download the run as MCAP: inputs, measured and simulated outputs, residuals, and its origin.
+
+    Its topics are `/fit` and `/inputs`, those of every run. Ranges and ETags are honoured.
+    """
+    content = MemoryContent(run_file.load_run_file(session, parts.store, run_id))
+    return content_response(request, content, content.sha256, f"{run_id}.mcap")
 
 
 comparison_router = APIRouter(prefix="/v1", tags=["runs"], route_class=JsonRoute)

@@ -182,7 +182,9 @@ def add_recording(
     relation: Relation = "derived",
 ) -> StoredDataset:
     """Store a recording: first its object, then the row that refers to it."""
-    metadata = {"source": key, "parents": " ".join(parents), "name": name}
+    # The source of an upload is its file; that of others follows from parents and request.
+    file = (details.get("source") or {}).get("sha256", "") if kind == "upload" else ""
+    metadata = {"source": file, "source_key": key, "parents": " ".join(parents), "name": name}
     content = _store_file(store, recording, metadata)
     new = describe_recording(
         recording, name=name, kind=kind, key=key, details=details, content=content

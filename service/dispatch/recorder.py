@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate
 
+from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
+from service.dispatch.encoding import describe_program
 from service.dispatch.fitted_signals import store_signals
 from service.dispatch.results import to_history_points, to_migrant_points
 from service.queue.leases import Claim, JobProgress, LeaseQueue
@@ -23,6 +25,8 @@ from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
+from service.storage.statements import RETURNING_OPTIONS
+from service.storage.tables import Job
 from sysid.islands.state import RunState
 from workers.protocol import Encoder, RunFailure
 
@@ -109,6 +113,8 @@ class RunRecorder:
         self.is_stopped = False
         with database.write_session() as session:
             before = summarize_attempts(session, claim.lease, MAX_REASONS)
+            started = update(Job).where(*claim.lease.fence()).values(describe_program())
+            session.execute(started, execution_options=RETURNING_OPTIONS)
         self._reasons = list(before.failure_reasons)
         # Evaluations of runs that have not continued yet.
         self._checkpoint_evaluations = before.checkpoint_evaluations

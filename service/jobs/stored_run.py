@@ -136,24 +136,36 @@ class StoredRun:
             If a dataset is not there any more, or has no such channel.
         """
         # This imports the compiler.
-        from sysid.identification.fit_problems import prepare_records
         from sysid.identification.resimulate import resimulate_run
 
+        model, records = self.requested_model, self.read_fit_records(session, store)
+        substeps = self.result.get("substeps", model.solver.substeps)
+        estimates = [_to_estimate(document) for document in self.estimates]
+        settings = fit_settings_of(self.body)
+        return records, resimulate_run(model, records, settings, estimates, substeps)
+
+    def read_fit_records(self, session: Session, store: ObjectStore) -> "FitRecords":
+        """Read the records of the fit: for estimation with added noise, and for validation.
+
+        Raises
+        ------
+        SysidError, StorageError, ServiceError
+            If a dataset is not there any more, or has no such channel.
+        """
+        # This imports the compiler.
+        from sysid.identification.fit_problems import prepare_records
+
         validation = self.body["validation"] or {}
-        model, others = self.requested_model, validation.get("datasets")
-        channels = map_channels(model, self.body["channels"], self.body["hold"])
+        others = validation.get("datasets")
+        channels = map_channels(self.requested_model, self.body["channels"], self.body["hold"])
         datasets = DatasetRepository(session, self.job.project_id)
         noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
-        records = prepare_records(
+        return prepare_records(
             read_records(store, datasets.get_all(self.body["datasets"]), channels),
             None if others is None else read_records(store, datasets.get_all(others), channels),
             validation.get("fraction"),
             noise,
         )
-        substeps = self.result.get("substeps", model.solver.substeps)
-        estimates = [_to_estimate(document) for document in self.estimates]
-        settings = fit_settings_of(self.body)
-        return records, resimulate_run(model, records, settings, estimates, substeps)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""

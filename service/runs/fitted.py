@@ -1,8 +1,6 @@
 """Use case of a run's response: measured and simulated outputs, stored or computed again."""
 
-import io
 from collections import OrderedDict
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import groupby
 from threading import Lock
@@ -17,7 +15,6 @@ from service.formats.mcap import (
     FittedOutput,
     list_fitted_outputs,
     read_fitted_outputs,
-    write_fitted_outputs,
 )
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ExperimentOut, ResponseOut
@@ -52,13 +49,6 @@ def load_fitted_signals(
     return _computed_signals.get(run.id) or _computed_signals.put(
         run.id, _compute_signals(session, store, stored)
     )
-
-
-def write_signals_file(run: str, fits: Sequence[FittedOutput]) -> bytes:
-    """Write the signals of a run as the file that a worker would have stored."""
-    target = io.BytesIO()
-    write_fitted_outputs(run, fits, target)
-    return target.getvalue()
 
 
 @lru_cache(maxsize=_CACHE_SIZE)
