@@ -1,14 +1,16 @@
 """Parts that the routes of all stored items share: filters of lists, ETags, edits, deletions."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Query, Response
+from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
+from service.datasets.datasets import resolve_dataset
 from service.items.deletion import delete_item, describe_item
 from service.items.editing import edit_item
 from service.items.items import ItemRow, compute_etag
@@ -87,6 +89,65 @@ def read_job_filter(
 FilterDep = Annotated[ListFilter, Depends(read_filter)]
 DatasetFilterDep = Annotated[ListFilter, Depends(read_dataset_filter)]
 JobFilterDep = Annotated[ListFilter, Depends(read_job_filter)]
+
+
+FormText = Annotated[str, Query(max_length=200)]
+
+
+def read_dataset_form(
+    name: FormText = "",
+    tag: FormText = "",
+    label: FormText = "",
+    since: FormText = "",
+    until: FormText = "",
+) -> dict[str, str]:
+    """Read the filled fields of the form that filters recordings; a form sends empty ones too."""
+    fields = {"name": name, "tag": tag, "label": label, "since": since, "until": until}
+    return {field: text.strip() for field, text in fields.items() if text.strip()}
+
+
+def read_job_form(
+    fields: Annotated[dict[str, str], Depends(read_dataset_form)],
+    model: FormText = "",
+    dataset: FormText = "",
+) -> dict[str, str]:
+    """Read the filled fields of the form that filters jobs."""
+    more = {"model": model.strip(), "dataset": dataset.strip()}
+    return {**fields, **{field: text for field, text in more.items() if text}}
+
+
+JobFormDep = Annotated[dict[str, str], Depends(read_job_form)]
+DatasetFormDep = Annotated[dict[str, str], Depends(read_dataset_form)]
+_parse_moment = TypeAdapter(datetime).validate_python
+
+
+def parse_form(session: Session, form: Mapping[str, str]) -> ListFilter:
+    """Build the filter of a form.
+
+    Raises
+    ------
+    InvalidRequest
+        If a field makes no sense, or names no recording.
+    """
+    terms: list[Term] = [("tag", form["tag"])] if "tag" in form else []
+    terms += _list_labels([form["label"]] if "label" in form else None)
+    if "dataset" in form:
+        dataset = resolve_dataset(session, form["dataset"])
+        if isinstance(dataset, str):
+            raise InvalidRequest.from_fault("?dataset", dataset)
+        terms.append(("dataset", dataset.id))
+    if "model" in form:
+        terms.append(("model", form["model"]))
+    moments: dict[str, datetime] = {}
+    for field in ("since", "until"):
+        if field in form:
+            try:
+                moments[field] = _parse_moment(form[field])
+            except ValidationError:
+                raise InvalidRequest.from_fault(
+                    f"?{field}", f"found {form[field]!r:.80}; need a date, such as 2026-01-31"
+                ) from None
+    return _build_filter(terms, form.get("name"), moments.get("since"), moments.get("until"))
 
 
 def set_etag(response: Response, row: ItemRow) -> None:
