@@ -101,7 +101,7 @@ def fill(database: Database, url: str, folder: Path, runs: int, jobs: int) -> Fi
     upgrade_database(database)
     settings = Settings(data_dir=folder, database_url=url)
     settings.prepare_data_folder()
-    store = open_store(settings.resolved_store_url)
+    store = open_store(settings.store_location)
     record = paper_example.record(1)
     dataset = add_recording(
         database,

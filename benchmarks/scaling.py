@@ -24,7 +24,7 @@ from service.client.embedded import run_embedded_service
 from sysid.core.settings import GeneticAlgorithm, Stop
 from workers.fair_share import HEADSTART_SECONDS
 from workers.packing import PACK_SECONDS
-from workers.protocol import AdvanceRun, CompleteRun, ProblemSpec, Records, RunSpec
+from workers.protocol import AdvanceRun, CompleteRun, Pack, ProblemSpec, Records, RunSpec
 from workers.ray_executor import ClusterSettings, RayExecutor
 
 LONG = {"generations": 2500, "stop": {"settled": None}}
@@ -176,7 +176,7 @@ def cost_of_a_task(count: int) -> list[Row]:
             while fetched < number:
                 while sent < number and sent - fetched < 4:
                     item = AdvanceRun(f"r{sent}", spec, None, PACK_SECONDS)
-                    executor.submit_pack((item,), ("r",), (shared,), _encode_nothing)
+                    executor.submit_pack(Pack((item,), {"r": shared}, _encode_nothing))
                     sent += 1
                 for handle in executor.wait_for_packs(1.0):
                     executor.fetch_results(handle)

@@ -44,6 +44,7 @@ from workers.protocol import (
     Encoder,
     Executor,
     ItemResult,
+    Pack,
     PackHandle,
     PackResult,
     Records,
@@ -89,20 +90,14 @@ class RecordingExecutor(InlineExecutor):
         super().__init__()
         self.recording = RecordedRuns((), {})
 
-    def submit_pack(
-        self,
-        pack: Sequence[WorkItem],
-        keys: Sequence[str],
-        shared: Sequence[Any],
-        encoder: Encoder,
-    ) -> PackHandle:
+    def submit_pack(self, pack: Pack) -> PackHandle:
         """Put a pack at the end of the queue."""
 
         def record_runs(complete: Sequence[CompleteRun], records: Mapping[str, Records]) -> Any:
             self.recording = RecordedRuns((*self.recording.runs, *complete), records)
-            return encoder(complete, records)
+            return pack.encoder(complete, records)
 
-        return super().submit_pack(pack, keys, shared, record_runs)
+        return super().submit_pack(replace(pack, encoder=record_runs))
 
 
 class SimulatedCluster:
@@ -133,17 +128,10 @@ class SimulatedCluster:
         """The player needs no records."""
         return 0
 
-    def submit_pack(
-        self,
-        pack: Sequence[WorkItem],
-        keys: Sequence[str],
-        shared: Sequence[Any],
-        encoder: Encoder,
-    ) -> PackHandle:
+    def submit_pack(self, pack: Pack) -> PackHandle:
         """Send a pack, pickled as Ray would."""
         self._next += 1
-        message = (self._next, encoder, tuple(pack), tuple(keys))
-        self._pipe.send_bytes(pickle.dumps(message, protocol=5))
+        self._pipe.send_bytes(pickle.dumps((self._next, pack), protocol=5))
         return self._next
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
@@ -185,13 +173,13 @@ def _play_workers(pipe: Connection, slots: int, recording: RecordedRuns, seconds
         pause = computing[0][0] - time.perf_counter() if computing else 1.0
         try:
             if pipe.poll(max(0.0, pause)):
-                handle, encoder, pack, _ = pickle.loads(pipe.recv_bytes())
-                if encoder not in scripts:
-                    scripts[encoder] = _write_script(encoder, recording, seconds)
+                handle, pack = pickle.loads(pipe.recv_bytes())
+                if pack.encoder not in scripts:
+                    scripts[pack.encoder] = _write_script(pack.encoder, recording, seconds)
                 answer = handle.to_bytes(8, "little") + _answer_pack(
-                    pack, scripts[encoder], seconds
+                    pack.items, scripts[pack.encoder], seconds
                 )
-                waiting.append((handle, seconds * len(pack), answer))
+                waiting.append((handle, seconds * len(pack.items), answer))
         except (EOFError, OSError):
             return
         now = time.perf_counter()
@@ -326,10 +314,10 @@ class Stage:
         self._server = None if server is None else psutil.Process(server.get_pid())
         self._settings = Settings(data_dir=folder, database_url=url)
         self._settings.prepare_data_folder()
-        self._database = TimedDatabase(self._settings.resolved_database_url)
+        self._database = TimedDatabase(self._settings.database_location)
         parts.callback(self._database.dispose)
         upgrade_database(self._database)
-        self._store = open_store(self._settings.resolved_store_url)
+        self._store = open_store(self._settings.store_location)
         record = paper_example.record(1)
         self._dataset = add_recording(
             self._database,

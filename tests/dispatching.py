@@ -39,7 +39,7 @@ class Place:
         self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
         self.settings.prepare_data_folder()
         self.database = database or migrated_sqlite(folder)
-        self.store: ObjectStore = open_store(self.settings.resolved_store_url)
+        self.store: ObjectStore = open_store(self.settings.store_location)
         self.dataset = self._dataset()
 
     def submit(self, **body: Any) -> str:

@@ -1,8 +1,7 @@
-"""A executor that computes nothing, in a time of its own: what the order of packs does to jobs."""
+"""An executor that computes nothing, in a time of its own: what the order of packs does to jobs."""
 
 import heapq
 from collections import deque
-from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -11,8 +10,8 @@ from sysid.islands.state import RunState
 from tests.runs import RECORDS, ListedRuns, Notebook, spec
 from workers.protocol import (
     AdvanceRun,
-    Encoder,
     ItemResult,
+    Pack,
     PackResult,
     QueuedRun,
     Records,
@@ -42,11 +41,9 @@ class SimulatedExecutor:
     def share_records(self, records: Records) -> Any:
         return records
 
-    def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any], encoder: Encoder
-    ) -> int:
+    def submit_pack(self, pack: Pack) -> int:
         self._next += 1
-        self._packs[self._next] = tuple(pack)
+        self._packs[self._next] = tuple(pack.items)
         self._waiting.append(self._next)
         self._begin()
         self.most_waiting = max(self.most_waiting, len(self._waiting))

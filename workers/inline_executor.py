@@ -1,19 +1,10 @@
 """Executor in this process: the plain loop that a cluster must equal bit for bit."""
 
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 from workers.errors import PackCancelled
-from workers.protocol import Encoder, PackHandle, PackResult, Records, WorkItem
+from workers.protocol import Pack, PackHandle, PackResult, Records
 from workers.tasks import run_pack
-
-
-class _Pack(NamedTuple):
-    encoder: Encoder
-    items: tuple[WorkItem, ...]
-    keys: tuple[str, ...]
-    shared: tuple[Records, ...]
 
 
 class InlineExecutor:
@@ -22,7 +13,7 @@ class InlineExecutor:
     def __init__(self, slots: int = 1) -> None:
         self.slots = slots
         self._waiting: deque[int] = deque()
-        self._packs: dict[int, _Pack | None] = {}
+        self._packs: dict[int, Pack | None] = {}
         self._results: dict[int, PackResult] = {}
         self._next = 0
 
@@ -30,16 +21,10 @@ class InlineExecutor:
         """Return the records unchanged: nothing needs to be sent."""
         return records
 
-    def submit_pack(
-        self,
-        pack: Sequence[WorkItem],
-        keys: Sequence[str],
-        shared: Sequence[Any],
-        encoder: Encoder,
-    ) -> PackHandle:
+    def submit_pack(self, pack: Pack) -> PackHandle:
         """Put a pack at the end of the queue."""
         self._next += 1
-        self._packs[self._next] = _Pack(encoder, tuple(pack), tuple(keys), tuple(shared))
+        self._packs[self._next] = pack
         self._waiting.append(self._next)
         return self._next
 
@@ -50,7 +35,9 @@ class InlineExecutor:
         handle = self._waiting.popleft()
         pack = self._packs[handle]
         if pack is not None:
-            self._results[handle] = run_pack(pack.encoder, pack.items, pack.keys, *pack.shared)
+            self._results[handle] = run_pack(
+                pack.encoder, pack.items, tuple(pack.records), *pack.records.values()
+            )
         return (handle,)
 
     def fetch_results(self, handle: PackHandle) -> PackResult:

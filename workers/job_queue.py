@@ -16,6 +16,7 @@ from workers.protocol import (
     ItemResult,
     JobEntry,
     JobSource,
+    Pack,
     PackHandle,
     PackResult,
     ReusedRun,
@@ -171,14 +172,14 @@ class JobQueue:
     def _submit_items(self, items: list[WorkItem]) -> None:
         keys = items[0].spec.problem.record_keys
         try:
-            shared = [self._share_records(key) for key in keys]
+            shared = {key: self._share_records(key) for key in keys}
         except RecordsUnavailable as error:
             for name in {item.run for item in items}:
                 self._fail_run(name, RunFailure(str(error), type(error).__name__))
             return
         for name in dict.fromkeys(item.run for item in items):
             self._report_start(self._active[name])
-        handle = self._executor.submit_pack(items, keys, shared, self.observer.encoder)
+        handle = self._executor.submit_pack(Pack(items, shared, self.observer.encoder))
         self.in_flight[handle] = tuple(items)
         for item in items:
             self._active[item.run].pack_handles.add(handle)

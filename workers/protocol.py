@@ -252,6 +252,23 @@ Encoder: TypeAlias = Callable[[Sequence[CompleteRun], Mapping[str, Records]], En
 """Encodes the complete runs of a pack, in the worker."""
 
 
+@dataclass(frozen=True, slots=True)
+class Pack:
+    """Items that a worker processes in one call.
+
+    Attributes
+    ----------
+    records : mapping
+        What `Executor.share_records` returned for the records of the items, by their keys.
+    encoder : Encoder
+        Encodes the runs that are complete after this pack.
+    """
+
+    items: Sequence[WorkItem]
+    records: Mapping[str, Any]
+    encoder: Encoder
+
+
 class Executor(Protocol):
     """Computes packs: a Ray cluster, or this process."""
 
@@ -260,14 +277,8 @@ class Executor(Protocol):
     def share_records(self, records: Records) -> Any:
         """Share records once; afterwards only the reference is sent."""
 
-    def submit_pack(
-        self,
-        pack: Sequence[WorkItem],
-        keys: Sequence[str],
-        shared: Sequence[Any],
-        encoder: Encoder,
-    ) -> PackHandle:
-        """Send a pack; `keys` name the shared records in order."""
+    def submit_pack(self, pack: Pack) -> PackHandle:
+        """Send a pack."""
 
     def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
         """Return handles of packs that ended; wait at most `timeout` seconds for the first."""

@@ -28,7 +28,7 @@ from workers.local_ray import (
     LocalRay,
 )
 from workers.memory_limit import compute_worker_memory, process_pack_within
-from workers.protocol import Encoder, PackHandle, PackResult, Records, WorkItem
+from workers.protocol import Pack, PackHandle, PackResult, Records
 from workers.ray_folders import find_folder_processes, kill_processes
 from workers.warmup import warm_up_worker
 
@@ -139,15 +139,16 @@ class RayExecutor:
         """Put records into the object store; afterwards only the reference is sent."""
         return self._ray.put(records)
 
-    def submit_pack(
-        self,
-        pack: Sequence[WorkItem],
-        keys: Sequence[str],
-        shared: Sequence[Any],
-        encoder: Encoder,
-    ) -> PackHandle:
-        """Send a pack; `keys` name the shared records in order."""
-        handle = self._advance.remote(self._memory, encoder, tuple(pack), tuple(keys), *shared)
+    def submit_pack(self, pack: Pack) -> PackHandle:
+        """Send a pack."""
+        # Ray fetches shared records only if they are arguments of their own.
+        handle = self._advance.remote(
+            self._memory,
+            pack.encoder,
+            tuple(pack.items),
+            tuple(pack.records),
+            *pack.records.values(),
+        )
         self._in_flight.add(handle)
         return handle
 

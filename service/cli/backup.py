@@ -31,7 +31,7 @@ def write_backup(
     require_database(settings)
     protect_file(file, force)
     with open_database(settings) as database:
-        store = open_store(settings.resolved_store_url)
+        store = open_store(settings.store_location)
         try:
             report = backup.write_backup(database, store, file)
         except OSError as error:
@@ -59,7 +59,7 @@ def restore_backup(
         lock_data_folder(settings, with_dispatcher=True),
         open_database(settings) as database,
     ):
-        store = open_store(settings.resolved_store_url)
+        store = open_store(settings.store_location)
         report = backup.restore_backup(database, store, file, force=force)
     _print_report(file, "restored", report, as_json)
 

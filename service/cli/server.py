@@ -289,7 +289,7 @@ def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson =
     require_database(settings)
     with open_database(settings) as database:
         migrate.check_revision(database)
-        store = open_store(settings.resolved_store_url)
+        store = open_store(settings.store_location)
         with database.read_session() as session:
             lost = sorted(garbage.find_lost_hashes(session, store))
             n_orphans = sum(1 for _ in garbage.find_orphans(session, store))
@@ -357,7 +357,7 @@ def open_database(settings: "Settings") -> Iterator["Database"]:
 
     from service.storage.sessions import Database
 
-    database = Database(settings.resolved_database_url)
+    database = Database(settings.database_location)
     try:
         yield database
     except SQLAlchemyError as error:

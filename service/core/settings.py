@@ -109,7 +109,7 @@ class Settings(BaseSettings):
         return f"sqlite:///{Path(path).absolute()}"
 
     @property
-    def resolved_database_url(self) -> str:
+    def database_location(self) -> str:
         """SQLAlchemy address of the database."""
         return self.database_url or make_sqlite_url(self.data_dir / "lagid.db")
 
@@ -119,7 +119,7 @@ class Settings(BaseSettings):
         return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
 
     @property
-    def resolved_store_url(self) -> str:
+    def store_location(self) -> str:
         """Address of the object store."""
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
 
@@ -158,7 +158,7 @@ class Settings(BaseSettings):
         Modes of existing files are never changed: their owner may share them on purpose.
         """
         folder = self.data_dir.absolute()
-        database = Path(self.resolved_database_url.removeprefix("sqlite:///"))
+        database = Path(self.database_location.removeprefix("sqlite:///"))
         for path, closed in ((folder, 0o700), (database, 0o600)):
             if path is database and folder in database.parents:
                 continue  # the folder decides

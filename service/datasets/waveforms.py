@@ -161,7 +161,7 @@ def interpolate_channel(channel: Channel, times: FloatArray) -> FloatArray:
     A held channel has the value after a jump at the time of the jump.
     """
     channel = replace(channel, history=trim_missing_history(channel.history)).history_and_samples
-    if channel.resolved_hold != "zero":
+    if channel.effective_hold != "zero":
         return np.interp(times, channel.times, channel.values)
     last = np.searchsorted(channel.times, times, side="right") - 1
     values: FloatArray = channel.values[np.clip(last, 0, channel.times.size - 1)]

@@ -262,9 +262,9 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
     """
     logging.basicConfig(level=logging.INFO, format=LOG_FORMAT)
     settings.prepare_data_folder()
-    database = Database(settings.resolved_database_url)
+    database = Database(settings.database_location)
     retry_transient(partial(migrate.upgrade_database, database))  # the database may be starting too
-    store = open_store(settings.resolved_store_url)
+    store = open_store(settings.store_location)
     compiling = threading.Thread(target=warm_up_worker, name="warm", daemon=True)
     compiling.start()  # in parallel with the start of Ray
     where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory_bytes)

@@ -86,8 +86,8 @@ def _check_model(session: Session, name: str, run: Run) -> None:
         latest = ReferenceRepository(session).get_latest(name)
     except RowNotFound:
         return
-    before = load_run(session, latest.run_id).requested_model
-    new = load_run(session, run.id).requested_model
+    before = load_run(session, latest.run_id).model_of_request
+    new = load_run(session, run.id).model_of_request
     if not have_same_equations(before, new):
         raise InvalidRequest.from_fault(
             "/run",

@@ -44,7 +44,7 @@ def resolve_warm_start(session: Session, reference: str | None) -> str | None:
 
 
 def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
-    other = load_run(session, run.id).requested_model
+    other = load_run(session, run.id).model_of_request
     if have_same_equations(other, model):
         return ""
     return (
@@ -63,7 +63,7 @@ def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
         names = [name for name in names if name in estimates] or names[:1]
     missing = [name for name in names if name not in estimates]
     if missing:
-        other = load_run(session, run.id).requested_model
+        other = load_run(session, run.id).model_of_request
         return (
             f"run {run.id} of {other.name!r} has another model: "
             f"its parameters are {_join_names(estimates)}, "

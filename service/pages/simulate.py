@@ -335,7 +335,7 @@ def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
             signal.unit,
             signal.times,
             signal.values,
-            signal.resolved_hold == "zero",
+            signal.effective_hold == "zero",
         )
         for signal in record.inputs
     )

@@ -6,26 +6,29 @@ same while they do. Names that users can change are not in it.
 """
 
 import io
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from threading import Lock
+from functools import partial
 from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import NotFound, ServiceError
+from service.core.computed import ComputedValues
+from service.core.errors import InvalidRequest, NotFound
 from service.core.json_text import write_json
+from service.core.states import JobState
 from service.formats.mcap import FittedInput, list_fitted_inputs, write_fitted_outputs
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.fitted import load_fitted_signals
-from service.storage.errors import StorageError
+from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
+from service.storage.sessions import release_connection
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 
-CACHE_BYTES = 64 << 20
+CACHE_SIZE = 4
 """Files that stay in memory: a viewer reads one by many ranges."""
+_files = ComputedValues(CACHE_SIZE)
 
 
 def load_run_file(session: Session, store: ObjectStore, run_id: str) -> bytes:
@@ -39,18 +42,19 @@ def load_run_file(session: Session, store: ObjectStore, run_id: str) -> bytes:
         If its signals are not stored and cannot be computed again.
     """
     stored = load_run(session, run_id)
-    content = _files.get(run_id)
-    if content is None:
-        content = _write_run_file(session, store, stored)
-        _files.put(run_id, content)
-    return content
+    if stored.run.state is not JobState.SUCCEEDED:
+        raise NotFound("signals file of run", run_id, f"; the run is {stored.run.state.value}")
+    return _files.get(
+        run_id,
+        partial(_write_run_file, session, store, stored),
+        is_final=True,
+        before_wait=partial(release_connection, session),
+    )
 
 
 def _write_run_file(session: Session, store: ObjectStore, stored: StoredRun) -> bytes:
-    run = stored.run
     fits = load_fitted_signals(session, store, stored)
-    if fits is None:
-        raise NotFound("signals file of run", run.id, f"; the run is {run.state.value}")
+    assert fits is not None  # of a run that succeeded
     datasets = _read_datasets(session, stored)
     target = io.BytesIO()
     write_fitted_outputs(
@@ -67,7 +71,7 @@ def _read_inputs(session: Session, store: ObjectStore, stored: StoredRun) -> Seq
     """Read the inputs of all experiments; none once a dataset was deleted."""
     try:
         records = stored.read_fit_records(session, store)
-    except (SysidError, ServiceError, StorageError):
+    except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing):
         return ()
     inputs = list_fitted_inputs("estimation", records.estimation)
     if records.validation is not None:
@@ -130,26 +134,3 @@ def _find_clock(stored: StoredRun, datasets: Mapping[str, Dataset]) -> datetime 
         return None
     start = rows[0].details.get("started_at")
     return None if start is None else datetime.fromisoformat(start)
-
-
-class _RunFiles:
-    """The latest files, as many as `CACHE_BYTES` holds."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._files: OrderedDict[str, bytes] = OrderedDict()
-
-    def get(self, run: str) -> bytes | None:
-        with self._lock:
-            if run in self._files:
-                self._files.move_to_end(run)
-            return self._files.get(run)
-
-    def put(self, run: str, content: bytes) -> None:
-        with self._lock:
-            self._files[run] = content
-            while sum(map(len, self._files.values())) > CACHE_BYTES:
-                self._files.popitem(last=False)
-
-
-_files = _RunFiles()

@@ -26,7 +26,7 @@ def open_storage(settings: Settings) -> tuple[Database, ObjectStore]:
     settings.prepare_data_folder()
     temporary_files.remove_leftovers(Path(tempfile.gettempdir()))
     # What a request has been told survives a power cut.
-    database = Database(settings.resolved_database_url, is_durable=True)
+    database = Database(settings.database_location, is_durable=True)
     migrate.upgrade_database(database)
     database.update_statistics()
-    return database, open_store(settings.resolved_store_url)
+    return database, open_store(settings.store_location)

@@ -45,7 +45,7 @@ class _RecordSource(NamedTuple):
         return self.simulated is None and self.datasets == [UNSTORED_ID]
 
     @property
-    def unstored_rows(self) -> list[Dataset]:
+    def new_rows(self) -> list[Dataset]:
         return [] if self.simulated is None else [self.simulated.to_row(UNSTORED_ID)]
 
 
@@ -83,7 +83,7 @@ def submit_noise_sweep(
         job = _build_job(store, body, plain, source)
         if source.simulated is not None:
             with database.read_session() as session:
-                submit.check_job(session, job, settings, source.unstored_rows)
+                submit.check_job(session, job, settings, source.new_rows)
                 if key is not None and JobRepository(session).is_key_used(key):
                     raise KeyReused(key)  # with the same body the record would already be stored
             stored = source.simulated.store_dataset(database, store).dataset.id
@@ -136,7 +136,7 @@ def _build_base(
     """
     fields = {"name": "noise sweep", **body.job_fields, "datasets": source.datasets}
     job = JobIn.model_validate(fields)
-    checker = JobChecker(session, source.unstored_rows)
+    checker = JobChecker(session, source.new_rows)
     faults = [*_grid_faults(body, most_runs), *source.faults]
     faults += (
         fault

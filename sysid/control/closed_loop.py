@@ -212,7 +212,7 @@ def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
 def _interpolate_channel(channel: Channel, time: float, side: str) -> float:
     """Interpolate a signal just before ("left") or just after ("right") a time."""
     times, values = channel.history_and_samples.times, channel.history_and_samples.values
-    if channel.resolved_hold != "zero":
+    if channel.effective_hold != "zero":
         return float(np.interp(time, times, values))
     last = int(np.searchsorted(times, time, side=side)) - 1  # type: ignore[call-overload]
     return float(values[max(last, 0)])

@@ -194,7 +194,7 @@ class Channel:
         return self._choice
 
     @property
-    def resolved_hold(self) -> Hold:
+    def effective_hold(self) -> Hold:
         """The hold that was given, or the one chosen by the values."""
         return self.hold_choice.hold if self.hold == "auto" else self.hold
 

@@ -52,7 +52,7 @@ def resample_recording(recording: Recording, arguments: StepArguments) -> Record
     read = _average_periods if method == "mean" else _interpolate_values
     channels = []
     for recorded in recording.channels:
-        channel = replace(recorded, hold=recorded.resolved_hold)
+        channel = replace(recorded, hold=recorded.effective_hold)
         first, *later = [channel.slice_time(*span) for span in spans]
         begun = _resample_channel(first, grids[0], period, read)
         values = [begun.values]

@@ -200,7 +200,7 @@ class GeneratedProgram:
         return "0.5*ratio" if self.grid_step is not None else write_number(0.5 / self.substeps)
 
     @property
-    def averaged_input_names(self) -> frozenset[str]:
+    def mean_input_names(self) -> frozenset[str]:
         """Inputs that are read as means over a step if they are held."""
         return find_averaged_inputs(self.identified.model)
 
@@ -258,7 +258,7 @@ class LoopScope(ExportScope):
                 return program.language.write_element(name, self._write_position(past), 1)
         place = self._write_sample_position(past)
         on_grid = "" if program.grid_step is None else "_on_grid"
-        if held and past.name in program.averaged_input_names:
+        if held and past.name in program.mean_input_names:
             helper = f"averaged{on_grid}"
             place += " + half" if program.is_recursion else ""
         elif held:

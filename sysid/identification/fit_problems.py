@@ -101,8 +101,8 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
 
 def _adopt_holds(record: Record, estimation: Record) -> Record:
     """Read the inputs as those of the part that the model is fitted to."""
-    holds = [channel.resolved_hold for channel in estimation.inputs]
-    if holds == [channel.resolved_hold for channel in record.inputs]:
+    holds = [channel.effective_hold for channel in estimation.inputs]
+    if holds == [channel.effective_hold for channel in record.inputs]:
         return record
     pairs = zip(record.inputs, holds, strict=True)
     return replace(record, inputs=tuple(replace(channel, hold=hold) for channel, hold in pairs))

@@ -33,7 +33,7 @@ def list_input_holds(problem: Problem) -> tuple[InputHold, ...]:
 def _list_holds(name: str, records: Sequence[Record], is_recursion: bool) -> list[InputHold]:
     channels = _find_channels(name, records)
     moving = [channel for channel in channels if np.ptp(channel.values) > 0] or channels[:1]
-    holds = {(channel.resolved_hold, channel.hold == "auto"): channel for channel in moving[::-1]}
+    holds = {(channel.effective_hold, channel.hold == "auto"): channel for channel in moving[::-1]}
     listed = []
     for (chosen, is_chosen), channel in sorted(holds.items(), key=lambda item: item[0]):
         has_effect = is_chosen and not is_recursion and np.ptp(channel.values) > 0
@@ -151,7 +151,7 @@ def _replace_hold(record: Record, hold: InputHold) -> Record:
             replace(channel, hold=hold.other)
             if channel.name == hold.input
             and channel.hold == "auto"
-            and channel.resolved_hold == hold.chosen
+            and channel.effective_hold == hold.chosen
             else channel
             for channel in record.inputs
         ),

@@ -135,7 +135,7 @@ def compute_lagged_sums(
     shifted = _build_lagged_inputs(
         spaced.present.tobytes(),
         spaced.period,
-        channel.resolved_hold,
+        channel.effective_hold,
         *(np.asarray(array, dtype=np.float64).tobytes() for array in floats),
     )
     if isinstance(shifted, str):

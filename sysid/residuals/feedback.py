@@ -62,7 +62,7 @@ def describe_feedback(
 
 def _describe_causes(channel: Channel, advises_noise_model: bool) -> str:
     """Describe the possible causes: feedback, or dynamics that the model misses."""
-    is_held = channel.resolved_hold == "zero"
+    is_held = channel.effective_hold == "zero"
     # A noise model does not replace missing dynamics, which can be the cause otherwise.
     advice = " and use loss: {noise_model: ar1}" if advises_noise_model and is_held else ""
     loop = (
@@ -96,7 +96,7 @@ def compute_explained_share(series: ResidualSeries, channel: Channel) -> float:
     if not spaced.is_regular:
         return 0.0
     # A held input is read after its jump, not as the mean of both sides.
-    after = 0.25 * spaced.period if channel.resolved_hold == "zero" else 0.0
+    after = 0.25 * spaced.period if channel.effective_hold == "zero" else 0.0
     values = interpolate_channel(channel, spaced.times + after)
     values = (values - np.mean(values)) / max(float(np.std(values)), np.finfo(float).tiny)
     scale = float(np.max(np.abs(spaced.values)))

@@ -206,7 +206,7 @@ def _find_event_onsets(
     notable: float,
 ) -> tuple[_Onset, _Onset] | None:
     """Find the onsets of input and output at one event; None if one is not clear."""
-    is_held = cause.resolved_hold == "zero"
+    is_held = cause.effective_hold == "zero"
     input_onset = _find_onset(cause.times, cause.values, event, noise[0], held=is_held)
     if input_onset is None or input_onset.excursion < notable:
         return None

@@ -20,15 +20,15 @@ SMALL = {"population": 8, "generations": 5, "islands": 1}
 
 
 class CountingExecutor(InlineExecutor):
-    """A executor that remembers which runs it was given."""
+    """An executor that remembers which runs it was given."""
 
     def __init__(self):
         super().__init__()
         self.computed = []
 
-    def submit_pack(self, pack, keys, shared, encoder):
-        self.computed += [item.run for item in pack]
-        return super().submit_pack(pack, keys, shared, encoder)
+    def submit_pack(self, pack):
+        self.computed += [item.run for item in pack.items]
+        return super().submit_pack(pack)
 
 
 @pytest.fixture

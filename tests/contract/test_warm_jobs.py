@@ -27,15 +27,15 @@ QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 
 
 
 class KeepingExecutor(InlineExecutor):
-    """A executor that remembers what each run began with; `slots` decide how much is read ahead."""
+    """An executor that remembers what each run began with; `slots` decide what is read ahead."""
 
     def __init__(self, slots):
         super().__init__(slots)
         self.warm = {}
 
-    def submit_pack(self, pack, keys, shared, encoder):
-        self.warm.update({item.run: item.spec.warm_starts for item in pack})
-        return super().submit_pack(pack, keys, shared, encoder)
+    def submit_pack(self, pack):
+        self.warm.update({item.run: item.spec.warm_starts for item in pack.items})
+        return super().submit_pack(pack)
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ def _filled_template() -> tuple[Path, Filled]:
     folder = Path(tempfile.mkdtemp(prefix="lagid-filled-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     settings, database = settings_of(folder), migrated_sqlite(folder)
-    filled = _fill(database, open_store(settings.resolved_store_url), settings)
+    filled = _fill(database, open_store(settings.store_location), settings)
     database.dispose()  # the last connection folds the write-ahead log into the file
     return folder, filled
 

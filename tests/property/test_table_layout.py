@@ -100,10 +100,21 @@ def test_numbers_names_and_units_come_back_from_any_layout(text: Text) -> None:
         np.testing.assert_array_equal(channel.times, np.arange(len(values)) / 8)
 
 
-@given(st.text(max_size=30))
+@given(st.floats(), st.sampled_from(".,"), st.sampled_from(["{}", " {} ", "+{}", "{:e}", "{:E}"]))
+def test_a_written_number_is_called_one(value: float, sign: str, form: str) -> None:
+    text = form.format(abs(value)).replace(".", sign)
+    assert classify_cell(text) == (
+        "empty" if "nan" in text.lower() and "+" not in text else "number"
+    )
+
+
+@given(st.text(alphabet="0123456789.,eE+-_ ٣xnaif", max_size=12))
 @example("1_000")
 @example("٣")
+@example("1e5")
 def test_what_is_called_a_number_is_one(text: str) -> None:
-    """A cell is a number exactly if Python reads it as one, with either decimal sign."""
-    if classify_cell(text) == "number":
+    """Python reads each cell that is called a number, with either decimal sign."""
+    try:
         float(text.replace(",", "."))
+    except ValueError:
+        assert classify_cell(text) != "number"

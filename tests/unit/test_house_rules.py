@@ -22,6 +22,14 @@ def _tracked() -> list[Path]:
     return [ROOT / line for line in listing.stdout.splitlines() if (ROOT / line).is_file()]
 
 
+def test_the_top_level_has_nothing_but_the_house() -> None:
+    folders = {"service", "workers", "sysid", "lagid", "migrations", "tests", "docker", "docs"}
+    files = {"pyproject.toml", "requirements.lock", "alembic.ini", "Makefile", "LICENSE"}
+    others = {"benchmarks", ".ci", ".gitignore", ".dockerignore"}
+    entries = {path.relative_to(ROOT).parts[0] for path in _tracked()}
+    assert {one for one in entries if not one.endswith(".md")} <= folders | files | others
+
+
 def test_the_formatter_has_no_exceptions() -> None:
     mark = re.compile(r"#\s*fmt:\s*(?:skip|off)")
     marked = [str(p.relative_to(ROOT)) for p in list_modules(CODE) if mark.search(p.read_text())]

@@ -9,6 +9,7 @@ from tests.repository import ROOT
 from tests.sources import list_modules, read_facts
 
 MAX_WORDS, MEAN_WORDS = 25, 16
+MAX_WORDS_WITH_COLON = 30
 PROGRAMS = (ROOT / "sysid/export/c.py", ROOT / "sysid/export/python.py")  # texts are code
 DOCUMENTS = sorted(
     path
@@ -17,11 +18,11 @@ DOCUMENTS = sorted(
 )
 
 
-def sentences(markdown: str) -> list[str]:
+def sentences(markdown: str, ends: str = ".!?:") -> list[str]:
     """Sentences of prose: without code, tables and headings; an entry of a list is one."""
     prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
     prose = re.sub(r"^\s*\|.*$|^#.*$", "", prose, flags=re.MULTILINE)
-    parts = re.split(r"(?<=[.!?:])\s+|\n\s*\n|^\s*(?:[-*]|\d+\.) ", prose, flags=re.MULTILINE)
+    parts = re.split(rf"(?<=[{ends}])\s+|\n\s*\n|^\s*(?:[-*]|\d+\.) ", prose, flags=re.MULTILINE)
     return [part for part in parts if len(part.split()) > 2]
 
 
@@ -37,6 +38,8 @@ def test_a_long_sentence_is_seen() -> None:
 def test_sentences_of_documents_are_short(path: Path) -> None:
     lengths = {one: len(one.split()) for one in sentences(path.read_text())}
     assert {one: count for one, count in lengths.items() if count > MAX_WORDS} == {}
+    whole = sentences(path.read_text(), ends=".!?")
+    assert [one for one in whole if len(one.split()) > MAX_WORDS_WITH_COLON] == []
     if lengths:
         assert sum(lengths.values()) / len(lengths) <= MEAN_WORDS
 

@@ -130,11 +130,11 @@ def test_the_validation_part_is_read_as_the_estimation_part() -> None:
     assert parts.validation is not None
     assert parts.validation_runs is not None
     holds = [
-        part[0].inputs[0].resolved_hold
+        part[0].inputs[0].effective_hold
         for part in (parts.estimation, parts.validation, parts.validation_runs)
     ]
     assert holds == ["zero"] * 3
-    assert record.inputs[0].resolved_hold == "first"
+    assert record.inputs[0].effective_hold == "first"
 
 
 def test_the_hold_of_a_channel_that_is_not_there_is_refused() -> None:

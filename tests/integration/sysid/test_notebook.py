@@ -286,7 +286,7 @@ def test_simulation_has_the_step_of_the_result(found: Identification) -> None:
 
 def test_simulation_reads_an_input_as_the_result_did(found: Identification) -> None:
     inputs, values = Channel("u", T, STEPS), found.parameter_values
-    assert inputs.resolved_hold == "zero"
+    assert inputs.effective_hold == "zero"
     lines = replace(found, input_holds=(InputHold("u", "first", None),))
     answer = simulate("fopdt", inputs, lines).channel("y").values
     asked = replace_substeps(load_model("fopdt"), found.substeps)

@@ -18,7 +18,7 @@ from tests.dispatching import LIMIT_SECONDS, Place
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
 from workers import packing
 from workers.inline_executor import InlineExecutor
-from workers.protocol import EvolveIsland, QueuedRun
+from workers.protocol import EvolveIsland, Pack, QueuedRun
 from workers.scheduler import Scheduler
 
 QUICK = {"generations": 60, "population": 16, "stop": {"settled": None}}
@@ -83,7 +83,7 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
     both = threading.Barrier(2)  # a quick one could have them all before the other begins
     leases = [Counted(one, 60.0, both) for one in own]
     dispatchers = [
-        Dispatcher(one, open_store(place.settings.resolved_store_url), InlineExecutor(), mine)
+        Dispatcher(one, open_store(place.settings.store_location), InlineExecutor(), mine)
         for one, mine in zip(own, leases, strict=True)
     ]
     threads = [threading.Thread(target=one.run_until_stopped) for one in dispatchers]
@@ -119,10 +119,10 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     most = 0
     submit, fetch = ray_executor.submit_pack, ray_executor.fetch_results
 
-    def counted(pack, keys, shared, encoder) -> Any:
+    def counted(pack: Pack) -> Any:
         nonlocal most
-        handle = submit(pack, keys, shared, encoder)
-        if isinstance(pack[0], EvolveIsland):
+        handle = submit(pack)
+        if isinstance(pack.items[0], EvolveIsland):
             flying.add(handle)
             most = max(most, len(flying))
         return handle

@@ -1,6 +1,6 @@
 """The driver of a executor, with a executor that answers as the test says; no Ray, no numerics."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,11 +15,11 @@ from workers.job_queue import JobQueue
 from workers.packing import PACKS_PER_CPU
 from workers.protocol import (
     AdvanceRun,
-    Encoder,
     EvolveIsland,
     InvalidRun,
     IslandProgress,
     ItemResult,
+    Pack,
     PackResult,
     QueuedRun,
     Records,
@@ -48,11 +48,9 @@ class ScriptedExecutor:
     def share_records(self, records: Records) -> Any:
         return records
 
-    def submit_pack(
-        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any], encoder: Encoder
-    ) -> int:
-        self.packs[len(self.sent)] = tuple(pack)
-        self.sent.append(tuple(item.run for item in pack))
+    def submit_pack(self, pack: Pack) -> int:
+        self.packs[len(self.sent)] = tuple(pack.items)
+        self.sent.append(tuple(item.run for item in pack.items))
         return len(self.sent) - 1
 
     def wait_for_packs(self, timeout: float) -> tuple[int, ...]:
@@ -132,9 +130,10 @@ def test_runs_of_known_cost_share_a_pack() -> None:
 
 def test_runs_of_different_records_do_not_share_a_pack() -> None:
     class Keeping(ScriptedExecutor):
-        def submit_pack(self, pack, keys, shared, encoder):  # type: ignore[no-untyped-def]
-            assert [item.spec.problem.record_keys for item in pack] == [keys] * len(pack)
-            return super().submit_pack(pack, keys, shared, encoder)
+        def submit_pack(self, pack: Pack) -> int:
+            keys = tuple(pack.records)
+            assert {item.spec.problem.record_keys for item in pack.items} == {keys}
+            return super().submit_pack(pack)
 
     executor, notebook = Keeping(fails), Notebook()
     feeder: Scheduler[str] = Scheduler(executor)
@@ -296,7 +295,7 @@ def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
     executor = ScriptedExecutor(fails)
     feeder = Scheduler(executor)
     notebook = jobs(feeder, a=1)["a"]
-    executor.submit_pack([AdvanceRun("stray", spec(), None, 1.0)], (), (), encode_runs)
+    executor.submit_pack(Pack([AdvanceRun("stray", spec(), None, 1.0)], {}, encode_runs))
     assert finish(feeder) == ["a"]
     assert (executor.packs, list(notebook.failures)) == ({}, ["a0"])
     assert "a pack of no job came back" in caplog.messages

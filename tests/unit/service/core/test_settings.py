@@ -129,9 +129,9 @@ def test_a_data_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 def test_database_and_store_lie_in_the_data_folder_unless_named(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert settings.resolved_database_url == f"sqlite:///{tmp_path / 'lagid.db'}"
-    assert settings.resolved_store_url == (tmp_path / "objects").as_uri()
-    assert Settings(store_url="s3://bucket").resolved_store_url == "s3://bucket"
+    assert settings.database_location == f"sqlite:///{tmp_path / 'lagid.db'}"
+    assert settings.store_location == (tmp_path / "objects").as_uri()
+    assert Settings(store_url="s3://bucket").store_location == "s3://bucket"
 
 
 def mode(path: Path) -> int:
@@ -141,7 +141,7 @@ def mode(path: Path) -> int:
 def test_a_new_data_folder_and_its_database_are_for_their_owner_only(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "above" / "data")
     settings.prepare_data_folder()
-    database = Database(settings.resolved_database_url)
+    database = Database(settings.database_location)
     with database.engine.begin() as connection:
         connection.exec_driver_sql("CREATE TABLE a (b)")
         modes = {file.name: mode(file) for file in settings.data_dir.iterdir()}
@@ -173,9 +173,9 @@ def test_what_other_users_can_read_is_told_in_one_line_and_not_changed(tmp_path:
 def test_the_path_of_a_sqlite_file_does_not_depend_on_the_working_folder(tmp_path: Path) -> None:
     with chdir(tmp_path):
         settings = Settings(database_url="sqlite:///a.db?timeout=3")
-    assert settings.resolved_database_url == f"sqlite:///{tmp_path}/a.db?timeout=3"
+    assert settings.database_location == f"sqlite:///{tmp_path}/a.db?timeout=3"
     for url in ("sqlite:///:memory:", "sqlite:////a.db", "sqlite://", "postgresql+psycopg://h/d"):
-        assert Settings(database_url=url).resolved_database_url == url
+        assert Settings(database_url=url).database_location == url
 
 
 def test_another_connection_drops_no_lock_of_the_first(tmp_path: Path) -> None:

@@ -83,11 +83,11 @@ def test_missing_values_do_not_count() -> None:
 @pytest.mark.parametrize("hold", ["zero", "first", "band-limited"])
 def test_a_given_hold_is_kept(hold: Hold) -> None:
     times = np.arange(float(N))
-    assert Channel("u", times, MOVING["a sine"], hold=hold).resolved_hold == hold
-    assert Channel("u", times, PULSE, hold=hold).resolved_hold == hold
+    assert Channel("u", times, MOVING["a sine"], hold=hold).effective_hold == hold
+    assert Channel("u", times, PULSE, hold=hold).effective_hold == hold
 
 
 def test_the_history_counts() -> None:
     times = np.arange(float(N))
     late = Channel("u", times, HELD["heater steps"][:N]).slice_with_history(900.0, 999.0)
-    assert late.resolved_hold == "zero"
+    assert late.effective_hold == "zero"
