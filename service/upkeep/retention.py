@@ -136,7 +136,8 @@ def _try_delete(session: Session, kind: Any, identity: str, project_id: str) -> 
 def _purge_job(database: Database, job_id: str) -> int:
     n_runs = 0
     with database.read_session() as session:
-        runs = session.scalars(select(Run.id).where(Run.job_id == job_id)).all()
+        of_job = select(Run.id).where(Run.job_id == job_id)
+        runs = session.scalars(of_job.order_by(Run.number)).all()
     for chunk in split_chunks(runs, ROWS_AT_ONCE):
         with database.write_session() as session:
             for table in (RunHistory, MigrationLog, Checkpoint):
