@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
@@ -53,19 +54,14 @@ def read_filter(
 
 
 def read_dataset_filter(
-    name: NamePart = None,
-    tag: Tags = None,
-    label: Labels = None,
-    since: Moment = None,
-    until: Moment = None,
+    common: Annotated[ListFilter, Depends(read_filter)], label: Labels = None
 ) -> ListFilter:
-    """Read the filter of the list of datasets, which also has labels."""
-    terms: list[Term] = [("tag", value) for value in tag or ()]
-    return _build_filter([*terms, *_list_labels(label)], name, since, until)
+    """Read the filter of the list of datasets, which also have labels."""
+    return replace(common, terms=(*common.terms, *_list_labels(label)))
 
 
 def read_job_filter(
-    name: NamePart = None,
+    common: Annotated[ListFilter, Depends(read_dataset_filter)],
     model: Annotated[
         str | None, Query(max_length=200, description="name of the model, without version")
     ] = None,
@@ -73,17 +69,14 @@ def read_job_filter(
         list[str] | None,
         Query(max_length=MAX_TERMS, description="id of a dataset that the job uses"),
     ] = None,
-    tag: Tags = None,
-    label: Labels = None,
-    since: Moment = None,
-    until: Moment = None,
 ) -> ListFilter:
-    """Read the filter of the list of jobs, which also have labels, a model and datasets."""
-    # The first term selects the rows: those come first that few items have.
-    terms: list[Term] = [("tag", value) for value in tag or ()]
-    terms += [*_list_labels(label), *(("dataset", value) for value in dataset or ())]
+    """Read the filter of the list of jobs, which also have a model and datasets.
+
+    The first term selects the rows: those come first that few items have.
+    """
+    terms: list[Term] = [("dataset", value) for value in dataset or ()]
     terms += [] if model is None else [("model", model)]
-    return _build_filter(terms, name, since, until)
+    return replace(common, terms=(*common.terms, *terms))
 
 
 FilterDep = Annotated[ListFilter, Depends(read_filter)]

@@ -209,11 +209,9 @@ class JobRepository:
         RowConflict
             If it is queued or running.
         """
-        job = self._lock_job(job_id)
+        job = self.lock(job_id)
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
-        # A key of the row is not changed, so only this lock makes those wait who use the job.
-        self._session.execute(select(Job.id).where(Job.id == job_id).with_for_update())
         job.deleted_at = utc_now()
         self._session.execute(delete(IdempotencyKey).where(IdempotencyKey.job_id == job_id))
         self._session.flush()
@@ -224,17 +222,17 @@ class JobRepository:
         self._session.execute(lock)
 
     def lock(self, job_id: str) -> Job:
-        """Return a job that nobody else can change until the session ends; else `RowNotFound`."""
-        return self._lock_job(job_id)
+        """Return a job that nobody can change or use until the session ends; else `RowNotFound`."""
+        return self._lock_job(job_id, is_exclusive=True)
 
     def _filter_project(self) -> tuple[Any, ...]:
         return Job.project_id == self._project_id, Job.deleted_at.is_(None)
 
-    def _lock_job(self, job_id: str) -> Job:
+    def _lock_job(self, job_id: str, *, is_exclusive: bool = False) -> Job:
         lock = (
             select(Job)
             .where(Job.id == job_id, *self._filter_project())
-            .with_for_update(key_share=True)
+            .with_for_update(key_share=not is_exclusive)
         )
         job = self._session.scalar(lock, execution_options={"populate_existing": True})
         if job is None:

@@ -375,6 +375,31 @@ def test_a_dataset_that_is_being_used_cannot_be_deleted_meanwhile(database: Data
         DatasetRepository(session).lock_used([data, "ds_none"])
 
 
+@pytest.mark.parametrize("kind", ["job", "run"])
+def test_a_run_that_is_being_used_cannot_be_deleted_meanwhile(
+    database: Database, kind: ItemKind
+) -> None:
+    job, (run,) = end_job(database, (JobState.SUCCEEDED,))
+    locked, deleted = threading.Event(), []
+
+    def remove() -> None:
+        locked.wait()
+        try:
+            deleted.extend(delete(database, kind, run if kind == "run" else job))
+        except Conflict as error:
+            deleted.append(type(error).__name__)
+
+    thread = threading.Thread(target=remove)
+    thread.start()
+    with database.write_session() as session:
+        JobRepository(session).share_lock(job)
+        locked.set()
+        later = JobRepository(session).submit(NewJob("a", spec_of(warm_start=run))).job
+        store_job_links(session, later)
+    thread.join()
+    assert deleted == ["HasDependents"]
+
+
 def test_submit_still_works_without_links(database: Database) -> None:
     """Rows of earlier versions have no terms; lists without a filter show them."""
     old = submit(database, "old")

@@ -222,6 +222,9 @@ def test_commands_edit_find_and_delete(served: tuple[str, Client], tmp_path: Pat
     assert "five" in run("jobs", "--dataset", "tube 5 m", "--state", "queued").stdout
     assert run("jobs", "--name", "none").stdout == "no such jobs\n"
     assert json.loads(run("datasets", "--tag", "night", "--json").stdout)[0]["name"] == "tube 5 m"
+    assert json.loads(run("models", "list", "--name", "OPD", "--json").stdout)
+    assert run("models", "list", "--tag", "none").stdout == "no models\n"
+    assert run("references", "list", "--name", "none").stdout == "no such references\n"
     assert "nothing to change" in check_refusal(run("job", "edit", job), 2)
     assert "--yes" in check_refusal(run("job", "delete", job))
     assert "is queued" in check_refusal(run("job", "delete", job, "--yes"))
