@@ -8,7 +8,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.api.dependencies import Parts, PartsDep, ReadSession
 from service.core.errors import FieldError, Unavailable
-from service.queue.dispatchers import DispatcherRepository
+from service.queue.dispatchers import NO_DISPATCHER, DispatcherRepository
 from service.repositories.jobs import JobRepository
 from service.storage import migrate
 from service.storage.errors import StorageError
@@ -97,6 +97,4 @@ def _check_store(parts: Parts) -> None:
 def _check_dispatcher(parts: Parts) -> None:
     with parts.database.read_session() as session:
         if not DispatcherRepository(session).list_alive():
-            raise Unavailable(
-                "no dispatcher is alive; jobs are accepted, but wait until one starts"
-            )
+            raise Unavailable(NO_DISPATCHER)

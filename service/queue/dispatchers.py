@@ -12,6 +12,10 @@ from service.storage.statements import upsert
 from service.storage.tables import DispatcherHeartbeat
 
 _FORGET_AFTER = timedelta(days=1)
+NO_DISPATCHER = (
+    "no dispatcher is alive; jobs are accepted, but wait until one starts. A first start compiles "
+    "the search, which takes about a minute"
+)
 LEASE_SECONDS_KEY = "lease_seconds"
 """Key of the lease length in the details of a dispatcher."""
 
