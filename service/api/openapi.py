@@ -13,6 +13,7 @@ from service.api.problems import PROBLEM_TYPE
 from service.core import errors
 from service.core.errors import ServiceError
 from service.core.wire import Answer, FaultOut
+from service.items.schemas import ItemOut
 
 Operation = Mapping[str, Any]
 _Rule = Callable[[str, Operation], bool]
@@ -23,7 +24,10 @@ _BINARY_TYPE = "application/x-mcap"
 
 
 class ProblemOut(Answer):
-    """A problem document (RFC 9457). `type` is a path of the service that explains it."""
+    """A problem document (RFC 9457). `type` is a path of the service that explains it.
+
+    `dependents` are given where an item was not deleted because they were made from it.
+    """
 
     type: str
     title: str
@@ -31,6 +35,7 @@ class ProblemOut(Answer):
     detail: str
     instance: str
     errors: tuple[FaultOut, ...] = ()
+    dependents: tuple[ItemOut, ...] = ()
 
 
 def _is_any(_method: str, _operation: Operation) -> bool:
@@ -51,6 +56,11 @@ def _has_file(_method: str, operation: Operation) -> bool:
 
 def _gives_file(_method: str, operation: Operation) -> bool:
     return any(_BINARY_TYPE in response.get("content", {}) for response in _answers(operation))
+
+
+def _has_precondition(method: str, operation: Operation) -> bool:
+    named = {parameter["name"].lower() for parameter in operation.get("parameters", ())}
+    return "if-match" in named or _gives_file(method, operation)
 
 
 def _creates_job(_method: str, operation: Operation) -> bool:
@@ -76,7 +86,7 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.NotFound, _names_resource),
     (errors.StalledRequest, _has_file),
     (errors.Conflict, _names_resource),
-    (errors.StaleVersion, _gives_file),
+    (errors.StaleVersion, _has_precondition),
     (errors.TooLarge, _has_body),
     (errors.UnsupportedMediaType, _has_body),
     (errors.UnsatisfiableRange, _gives_file),

@@ -137,6 +137,16 @@ def test_times_far_away_are_no_fault(server: TestClient, moment: str) -> None:
         assert server.get("/v1/jobs", params={name: moment}).status_code == 200
 
 
+def test_the_document_of_the_interface_has_edits_and_deletions(server: TestClient) -> None:
+    document = server.get("/openapi.json").json()
+    for path in ("jobs/{job_id}", "runs/{run_id}", "datasets/{dataset_id}", "models/{name}"):
+        for method in ("patch", "delete"):
+            operation = document["paths"][f"/v1/{path}"][method]
+            assert {"200", "403", "404", "409", "412", "422", "503"} <= {*operation["responses"]}
+    listed = {one["name"] for one in document["paths"]["/v1/jobs"]["get"]["parameters"]}
+    assert {"name", "model", "dataset", "tag", "label", "state", "since", "until"} <= listed
+
+
 def test_what_was_made_from_an_item_is_listed_and_deleted_on_request(own: TestClient) -> None:
     data = store_csv(own, recording())
     derived = own.post(f"/v1/datasets/{data}:derive", json={"steps": [{"trim": {"stop": 20}}]})
