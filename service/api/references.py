@@ -5,10 +5,9 @@ from fastapi import APIRouter, Response
 from service.api.bodies import JsonRoute
 from service.api.dependencies import Cursor, Limit, ReadSession, WriteSession
 from service.api.items import Cascade, FilterDep, IfMatch, delete, edit, set_etag
-from service.core.wire import Page
 from service.items.schemas import DeletedOut, EditIn
 from service.jobs import references
-from service.jobs.schemas import ReferenceIn, ReferenceOut
+from service.jobs.schemas import ReferenceIn, ReferenceOut, ReferencePage
 from service.repositories.references import ReferenceRepository
 
 reference_router = APIRouter(prefix="/v1/references", tags=["references"], route_class=JsonRoute)
@@ -17,7 +16,7 @@ reference_router = APIRouter(prefix="/v1/references", tags=["references"], route
 @reference_router.get("")
 def list_references(
     session: ReadSession, chosen: FilterDep, cursor: Cursor = None, limit: Limit = 50
-) -> Page[ReferenceOut]:
+) -> ReferencePage:
     """List the current references by name; all conditions must hold."""
     return references.list_references(session, cursor, limit, chosen)
 

@@ -27,6 +27,11 @@ def _split_names(value: Any) -> Any:
     return [name.strip().lower() for name in value.split(",") if name.strip()]
 
 
+def _strip_slash(value: Any) -> Any:
+    """Strip the slash at the end of a path."""
+    return value.rstrip("/") if isinstance(value, str) else value
+
+
 class Settings(BaseSettings):
     """Storage, address and limits of the service.
 
@@ -48,6 +53,8 @@ class Settings(BaseSettings):
         Serve other hosts although this version has no API keys yet.
     allowed_hosts : tuple of str
         More names by which requests may address the service, such as that of a reverse proxy.
+    root_path : str
+        Path under which a reverse proxy publishes the service, such as ``/lagid``; empty: none.
     max_upload_bytes, max_body_bytes : int
         Longest recording, and longest body of any other request. Larger ones are answered by 413.
     max_uploads : int
@@ -84,6 +91,9 @@ class Settings(BaseSettings):
     require_keys: bool | None = None
     allow_open_host: bool = False
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
+    root_path: Annotated[
+        str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
+    ] = ""
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
     max_uploads: int = Field(default=4, ge=1)

@@ -29,20 +29,22 @@ class EditIn(Body):
     runs have none.
     """
 
-    name: Annotated[str, Field(min_length=1, max_length=200), PlainText] = ""
-    note: str | None = Field(default=None, max_length=10_000)
-    tags: list[Tag] = Field(default=[], max_length=MAX_TAGS)
+    name: Annotated[str, Field(min_length=1, max_length=200), PlainText] = Field(
+        default="", description="new name"
+    )
+    note: str | None = Field(default=None, max_length=10_000, description="note; null removes it")
+    tags: list[Tag] = Field(default=[], max_length=MAX_TAGS, description="all tags")
 
 
 class ItemOut(Answer):
     """A stored item: its kind, its identifier (of a reference its name), and its name."""
 
-    kind: ItemKindName
-    id: str
-    name: str
+    kind: ItemKindName = Field(description="kind of the item")
+    id: str = Field(description="identifier; of a reference its name")
+    name: str = Field(description="name of the item")
 
 
 class DeletedOut(Answer):
     """Everything that was deleted, the requested item first."""
 
-    deleted: list[ItemOut]
+    deleted: list[ItemOut] = Field(description="all items, the requested one first")

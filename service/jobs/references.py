@@ -4,16 +4,15 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
-from service.core.wire import Page
-from service.items.reference_names import REFERENCE_PREFIX, check_reference_name
-from service.jobs.schemas import ReferenceIn, ReferenceOut
+from service.items.reference_names import REFERENCE_PREFIX, check_reference_name, find_name_fault
+from service.jobs.schemas import ReferenceIn, ReferenceOut, ReferencePage
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
 from service.repositories.jobs import JobRepository
 from service.repositories.references import CurrentReference, ReferenceRepository
 from service.repositories.runs import RunRepository
 from service.repositories.search import NO_FILTER, ListFilter
-from service.storage.errors import RowNotFound
+from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
 
@@ -50,10 +49,12 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
 
 def list_references(
     session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
-) -> Page[ReferenceOut]:
+) -> ReferencePage:
     """List the references in use that meet a filter, by name."""
+    if cursor is not None and find_name_fault(cursor) is not None:
+        raise InvalidCursor(cursor)
     page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
-    return Page(
+    return ReferencePage(
         items=[_to_reference_out(reference, []) for reference in page.items], next=page.next
     )
 

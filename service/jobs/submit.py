@@ -14,7 +14,6 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
-from service.core.wire import Page
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
@@ -24,7 +23,7 @@ from service.jobs.job_links import (
     list_used_runs,
     store_job_links,
 )
-from service.jobs.schemas import JobIn, JobOut, ProgressOut
+from service.jobs.schemas import JobIn, JobOut, JobPage, ProgressOut
 from service.jobs.stored_cells import (
     CELLS_AT_SUBMISSION,
     build_stored_cells,
@@ -232,13 +231,13 @@ def list_jobs(
     limit: int,
     states: Sequence[JobState] = (),
     chosen: ListFilter = NO_FILTER,
-) -> Page[JobOut]:
+) -> JobPage:
     """List the jobs that meet a filter, latest first."""
     page = JobRepository(session).list_page(
         cursor=cursor, limit=limit, states=states, chosen=chosen
     )
     items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in page.items]
-    return Page(items=items, next=page.next)
+    return JobPage(items=items, next=page.next)
 
 
 def _choose_name(checker: JobChecker, spec: Mapping[str, Any]) -> str:

@@ -11,9 +11,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, NotFound
-from service.core.wire import Page
 from service.models.catalogue import list_catalogue, to_builtin_out, to_model_out
-from service.models.schemas import ModelOut
+from service.models.schemas import ModelOut, ModelPage
 from service.repositories.models import ModelRepository
 from service.repositories.search import NO_FILTER, ListFilter
 from service.storage import errors
@@ -26,7 +25,7 @@ from sysid.models.parse import keep_terms, parse_model
 
 def list_models(
     session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
-) -> Page[ModelOut]:
+) -> ModelPage:
     """List the built-in models (first page), then all versions of user models, latest first.
 
     Built-in models have names only: a filter of tags or times excludes them.
@@ -35,7 +34,7 @@ def list_models(
     part = (chosen.name or "").lower()
     is_first = not (cursor or chosen.terms or chosen.since or chosen.until)
     built_in = [model for model in list_catalogue() if part in model.name] if is_first else []
-    return Page(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
+    return ModelPage(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
 
 
 def get_model(session: Session, reference: str) -> ModelOut:

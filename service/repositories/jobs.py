@@ -13,7 +13,13 @@ from service.repositories.events import EventRepository
 from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
-from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
+from service.storage.statements import (
+    RETURNING_OPTIONS,
+    RowPage,
+    check_id_cursor,
+    make_page,
+    new_id,
+)
 from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
@@ -120,7 +126,7 @@ class JobRepository:
             return self._search_page(chosen, states, cursor, limit)
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
-            query = query.where(Job.id < cursor)
+            query = query.where(Job.id < check_id_cursor(cursor, "job"))
         rows: Sequence[Job]
         if states:  # each by itself, so that an index has them in order
             found = [

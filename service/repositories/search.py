@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 from sqlalchemy import ColumnElement, Select, delete, exists, select
 from sqlalchemy.orm import Session, aliased
 
-from service.storage.statements import IdPrefix, insert_missing, make_id_bound
+from service.storage.statements import IdPrefix, check_id_cursor, insert_missing, make_id_bound
 from service.storage.tables import DEFAULT_PROJECT, Dataset, Job, ModelVersion, SearchTerm
 
 ItemKind = Literal["job", "run", "dataset", "model", "reference"]
@@ -81,7 +81,7 @@ def select_ids(
         bound = make_id_bound(prefix, chosen.until + CLOCK_SLACK)
         conditions += [order < bound, table.created_at < chosen.until]
     if cursor is not None:
-        conditions.append(order < cursor)
+        conditions.append(order < check_id_cursor(cursor, prefix))
     return query.where(*conditions).order_by(order.desc()).limit(limit + 1)
 
 

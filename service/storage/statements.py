@@ -19,6 +19,7 @@ from sqlalchemy import update as update_of
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
+from service.storage.errors import InvalidCursor
 from service.storage.tables import Base
 
 if TYPE_CHECKING:
@@ -189,6 +190,20 @@ def new_ids(prefix: IdPrefix, n: int) -> list[str]:
 def make_id_bound(prefix: IdPrefix, moment: datetime) -> str:
     """Return the least identifier of an item that is made at this moment."""
     return f"{prefix}_{_encode_base32(max(0, int(moment.timestamp() * 1000)) << _RANDOM_BITS)}"
+
+
+def check_id_cursor(cursor: str, prefix: IdPrefix) -> str:
+    """Check that a cursor may be the identifier of a row, as `make_page` gave it.
+
+    Raises
+    ------
+    InvalidCursor
+        If it has another form.
+    """
+    head, _, tail = cursor.partition("_")
+    if head != prefix or not 1 <= len(tail) <= _LENGTH or not set(tail) <= set(_ALPHABET):
+        raise InvalidCursor(cursor)
+    return cursor
 
 
 def _encode_base32(number: int) -> str:
