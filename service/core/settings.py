@@ -82,6 +82,9 @@ class Settings(BaseSettings):
         Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
     project_cores : int or None
         Cores of each dispatcher that the runs of one project may use; None: all.
+    keep_days : float or None
+        Ended jobs are deleted after this number of days, unless their project says otherwise. None:
+        they are kept.
     keep_signals : bool
         Whether sweeps store the fitted signals of their runs, unless a job says otherwise. Else
         they are computed again when they are asked for.
@@ -120,6 +123,7 @@ class Settings(BaseSettings):
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)
     project_cores: int | None = Field(default=None, ge=1)
+    keep_days: float | None = Field(default=None, gt=0, le=36_500)
     keep_signals: bool = False
     lease_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)

@@ -4,47 +4,20 @@ import hashlib
 import os
 import threading
 import time
-import uuid
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import boto3
 import obstore
 import pytest
-from moto.server import ThreadedMotoServer
 
 from service.storage import objects
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from service.storage.objects import open_store
+from tests.contract.conftest import CREDENTIALS
 
 FUTURE = datetime.now(UTC) + timedelta(days=1)
 ABSENT = "0" * 64
-CREDENTIALS = {"aws_access_key_id": "test", "aws_secret_access_key": "test"}
-
-
-@pytest.fixture(scope="session")
-def s3_endpoint():
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
-
-
-@pytest.fixture
-def bucket(s3_endpoint):
-    """Options of a store in a fresh bucket, and its address."""
-    name = f"lagid-{uuid.uuid4().hex}"
-    client = boto3.client("s3", endpoint_url=s3_endpoint, region_name="us-east-1", **CREDENTIALS)
-    client.create_bucket(Bucket=name)
-    client.close()
-    options = {
-        "endpoint": s3_endpoint,
-        "region": "us-east-1",
-        **CREDENTIALS,
-        "client_options": {"allow_http": True},
-    }
-    return f"s3://{name}/lagid", options
 
 
 @pytest.fixture(params=["folder", "bucket"])
