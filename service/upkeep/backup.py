@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
@@ -332,7 +332,7 @@ def _restore_rows(
         for name, table in manifest["tables"].items():
             _insert_rows(connection, name, table["columns"], _read_lines(archive, name))
         if not database.is_sqlite:
-            _continue_numbers(connection)
+            _continue_numbers(connection, existing)
 
 
 def _insert_rows(
@@ -350,11 +350,11 @@ def _insert_rows(
         connection.execute(sa.insert(target), rows)
 
 
-def _continue_numbers(connection: Connection) -> None:
+def _continue_numbers(connection: Connection, existing: Collection[str]) -> None:
     """Let PostgreSQL number further rows after those that were restored."""
     for table in Base.metadata.sorted_tables:
         column = table.autoincrement_column
-        if column is not None:
+        if column is not None and table.name in existing:
             last = sa.select(sa.func.coalesce(sa.func.max(column), 0) + 1).scalar_subquery()
             sequence = sa.func.pg_get_serial_sequence(table.name, column.name)
             connection.execute(sa.select(sa.func.setval(sequence, last, sa.false())))
