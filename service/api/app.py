@@ -23,6 +23,7 @@ from service.api.dependencies import Parts
 from service.api.html import PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
 from service.api.openapi import DocumentedApp
+from service.api.request_log import RequestLog
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
@@ -53,7 +54,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
     app.add_middleware(OriginCheck, settings=chosen)
-    app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)  # the last one is outermost
+    app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)
+    app.add_middleware(RequestLog)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
         health.router,

@@ -30,6 +30,7 @@ class ProblemOut(Answer):
     status: int
     detail: str
     instance: str
+    request_id: str
     errors: tuple[FaultOut, ...] = ()
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import datasets, jobs, models, runs, server, sweeps
+from service.cli import datasets, health, jobs, models, runs, server, sweeps
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -138,6 +138,7 @@ upkeep.add(
 )
 upkeep.add("dispatcher", server.run_dispatcher, "lagid dispatcher --cpus 8")
 upkeep.add_group("db", server.database_app)
+upkeep.add("health", health.check_health, "lagid health web", "lagid health dispatcher")
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
 

@@ -10,9 +10,7 @@ from pydantic import BeforeValidator, Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.core.errors import Misconfigured
-
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-"""Format of the log lines of all processes."""
+from service.core.logs import LogFormat
 
 
 def make_sqlite_url(path: Path) -> str:
@@ -64,6 +62,14 @@ class Settings(BaseSettings):
         they are computed again when they are asked for.
     lease_seconds : float
         How long a job stays with a dispatcher that sends no heartbeat.
+    start_seconds : float
+        How long a dispatcher waits for Ray and its workers to start, before it starts anew.
+    log_format : {"text", "json"}
+        Form of the log lines.
+    access_log : bool or None
+        Whether each request has a log line; None: with JSON only.
+    metrics_host, metrics_port : str, int or None
+        Where a dispatcher answers Prometheus; None: nowhere. The web process has `/metrics`.
     data : Path or None
         Folder of measured records, for tests and benchmarks.
     """
@@ -93,6 +99,11 @@ class Settings(BaseSettings):
     lease_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)
     poll_seconds: float = Field(default=0.3, gt=0)
+    start_seconds: float = Field(default=900.0, ge=30)
+    log_format: LogFormat = "text"
+    access_log: bool | None = None
+    metrics_host: str = "127.0.0.1"
+    metrics_port: int | None = Field(default=None, ge=1, le=65535)
     data: Path | None = None
 
     @field_validator("database_url")
@@ -108,6 +119,11 @@ class Settings(BaseSettings):
     def database_location(self) -> str:
         """SQLAlchemy address of the database."""
         return self.database_url or make_sqlite_url(self.data_dir / "lagid.db")
+
+    @property
+    def writes_access_log(self) -> bool:
+        """Whether each request has a log line."""
+        return self.log_format == "json" if self.access_log is None else self.access_log
 
     @property
     def worker_memory_bytes(self) -> int | None:

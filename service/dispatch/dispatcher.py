@@ -9,33 +9,37 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core import metrics
 from service.core.errors import Misconfigured
-from service.core.settings import LOG_FORMAT, Settings
+from service.core.logs import bind_ids
+from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.job_end import build_end_maker
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.leases import HeldLeases
 from service.dispatch.recorder import RunRecorder
+from service.dispatch.start import DispatcherStart
 from service.dispatch.supervisor import RESTART_EXIT_CODE, SUPERVISED_VARIABLE
 from service.queue.admission import Admission
 from service.queue.leases import Claim, Lease
 from service.queue.notifications import open_notifier
-from service.storage import migrate
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
+from sysid.kernels.compilation import get_compile_seconds
 from workers.errors import ClusterLost, WorkersError
 from workers.local_ray import LocalRay
 from workers.protocol import Executor
 from workers.ray_executor import ClusterSettings, RayExecutor
 from workers.scheduler import Scheduler
-from workers.warmup import warm_up_worker
 
 _log = logging.getLogger("lagid.dispatcher")
 
@@ -94,6 +98,7 @@ class Dispatcher:
             If the workers are lost. The jobs were released as lost.
         """
         self._leases.start_heartbeat({"cpus": self._executor.slots, "pid": os.getpid()})
+        metrics.cores.set_function(lambda: self._executor.slots)
         _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
         self._listener.start()
         try:
@@ -119,11 +124,14 @@ class Dispatcher:
             self._end_runs(lease)
         for lease in self._list_ready_to_conclude():
             self._conclude_job(lease)
+        metrics.record_kernel_seconds("process", get_compile_seconds())
+        metrics.record_kernel_seconds("workers", self._scheduler.compile_seconds)
         for recorder in self._list_held_recorders():
             if not self._leases.is_held(recorder.lease):
                 continue  # the pending heartbeat, or the next one, decides
             try:
-                retry_transient(recorder.write_due)
+                with bind_lease(recorder.lease):
+                    retry_transient(recorder.write_due)
             except LeaseLost as error:
                 self._drop_lost_job(recorder, error)
 
@@ -176,10 +184,14 @@ class Dispatcher:
         self._scheduler.add_job(
             claim.lease, source, recorder, priority=job.priority, project=job.project_id
         )
-        _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
+        metrics.held_jobs.set(len(self._recorders))
+        with bind_lease(claim.lease):
+            _log.info("%s: %d runs, attempt %d", job.id, job.n_runs, claim.lease.attempt)
 
     def _drop_lost_job(self, recorder: RunRecorder, error: LeaseLost) -> None:
-        _log.warning("the job is dropped: %s", error)
+        metrics.lease_losses.labels("owner").inc()
+        with bind_lease(recorder.lease):
+            _log.warning("the job is dropped: %s", error)
         self._lost.add(recorder.lease)
         self._leases.forget_lease(recorder.lease)
         recorder.is_stopped = True
@@ -208,16 +220,22 @@ class Dispatcher:
     def _conclude_job(self, lease: Lease) -> None:
         floors = self._side_jobs.take_result(lease) if lease in self._side_jobs else None
         recorder = self._recorders.pop(lease)
+        metrics.held_jobs.set(len(self._recorders))
         del self._priorities[lease]
         if lease in self._lost:
             self._lost.discard(lease)
             return
         try:
-            retry_transient(
-                recorder.cancel_job if recorder.is_stopped else partial(recorder.finish_job, floors)
-            )
+            with bind_lease(lease):
+                retry_transient(
+                    recorder.cancel_job
+                    if recorder.is_stopped
+                    else partial(recorder.finish_job, floors)
+                )
+                _log.info("%s has ended", lease.job_id)
         except LeaseLost as error:
-            _log.warning("the end of the job was not written: %s", error)
+            with bind_lease(lease):
+                _log.warning("the end of the job was not written: %s", error)
         self._leases.forget_lease(lease)
 
     def _release_jobs(self, *, lost: bool = False) -> None:
@@ -232,16 +250,23 @@ class Dispatcher:
         _log.info("stopped")
 
 
-def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
+def run_dispatcher(
+    settings: Settings,
+    local: LocalRay | None = None,
+    prepare: Callable[[], DispatcherStart] | None = None,
+) -> int:
     """Run a dispatcher and return the exit code. Expected errors are logged in one line.
 
     Parameters
     ----------
     local : LocalRay, optional
         A Ray that is already running; it is closed here.
+    prepare : callable, optional
+        Returns a start that was made while Ray started, or raises its error.
     """
     try:
-        return serve_jobs(settings, local)
+        start = DispatcherStart(settings) if prepare is None else prepare()
+        return serve_jobs(settings, local, start)
     except (Misconfigured, StorageError, WorkersError) as error:
         _log.error("%s", error)
     except SQLAlchemyError as error:
@@ -252,7 +277,7 @@ def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
     return 1
 
 
-def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
+def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStart) -> int:
     """Run a dispatcher until it is stopped.
 
     Raises
@@ -260,24 +285,25 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
     Misconfigured, StorageError, WorkersError
         If the data folder, the database, the object store or Ray cannot be used.
     """
-    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT)
-    settings.prepare_data_folder()
-    database = Database(settings.database_location)
-    retry_transient(partial(migrate.upgrade_database, database))  # the database may be starting too
-    store = open_store(settings.store_location)
-    compiling = threading.Thread(target=warm_up_worker, name="warm", daemon=True)
-    compiling.start()  # in parallel with the start of Ray
-    where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory_bytes)
-    executor = RayExecutor(where, local)
+    start.announce()
+    # In parallel with joining Ray; an error is met again below.
+    threading.Thread(target=start.compile_search, name="compile", daemon=True).start()
+    where = ClusterSettings(
+        settings.ray_address, settings.cpus, settings.worker_memory_bytes, settings.start_seconds
+    )
+    executor = None
     try:
-        compiling.join()
+        store = open_store(settings.store_location)
+        executor = RayExecutor(where, local)
+        start.finish("ray")
+        start.compile_search()
         executor.warm_up_workers()
-        leases = HeldLeases(database, settings.lease_seconds)
+        start.finish("workers")
         dispatcher = Dispatcher(
-            database,
+            start.database,
             store,
             executor,
-            leases,
+            start.leases,
             project_cores=settings.project_cores,
             keeps_signals=settings.keep_signals,
         )
@@ -285,11 +311,18 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
         dispatcher.run_until_stopped()
     except ClusterLost as error:
         _log.error("%s", error)
+        assert executor is not None
         _exit_now(executor)
     finally:
-        executor.close()
-        database.dispose()
+        if executor is not None:
+            executor.close()
+        start.close()
     return 0
+
+
+def bind_lease(lease: Lease) -> AbstractContextManager[None]:
+    """Let log lines name the job and the attempt."""
+    return bind_ids(job_id=lease.job_id, attempt=lease.attempt)
 
 
 def _stop_on_signals(stopping: threading.Event, executor: RayExecutor) -> None:
