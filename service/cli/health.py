@@ -1,5 +1,6 @@
 """`lagid health`: whether a process of the service runs on this machine, for container engines."""
 
+import os
 import socket
 from enum import StrEnum
 from pathlib import Path
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from service.core.settings import Settings
 
 ANSWER_SECONDS = 5.0
+RAY_SOCKET = Path("ray/session_latest/sockets/raylet")
 RAY_SOCKET = Path("/tmp/ray/session_latest/sockets/raylet")
 _ANY_ADDRESS = ("0.0.0.0", "::", "")
 
@@ -43,7 +45,7 @@ def check_health(
         case Part.DISPATCHER:
             found = _check_dispatcher(settings)
         case Part.RAY:
-            found = _check_ray(RAY_SOCKET)
+            found = _check_ray(Path(os.environ.get("RAY_TMPDIR", "/tmp")) / RAY_SOCKET)
     out.print(found, markup=False, soft_wrap=True)
 
 

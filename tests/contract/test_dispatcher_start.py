@@ -4,6 +4,7 @@ import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import httpx
 import pytest
@@ -95,14 +96,16 @@ def test_the_health_of_the_web_process_is_its_answer(tmp_path: Path) -> None:
     assert "does not answer as it should" in line
 
 
-def test_the_health_of_ray_is_its_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # a path of a socket must be short
-    monkeypatch.setattr(health, "RAY_SOCKET", Path("raylet"))
-    assert "Ray does not answer at raylet" in check_refusal(run_lagid("health", "ray"))
-    with socket.socket(socket.AF_UNIX) as raylet:
-        raylet.bind("raylet")
-        raylet.listen()
-        assert run_lagid("health", "ray").code == 0
+def test_the_health_of_ray_is_its_socket() -> None:
+    with TemporaryDirectory() as folder:  # a path of a socket must be short
+        words = {"RAY_TMPDIR": folder}
+        assert "Ray does not answer at" in check_refusal(run_lagid("health", "ray", **words))
+        path = Path(folder, health.RAY_SOCKET)
+        path.parent.mkdir(parents=True)
+        with socket.socket(socket.AF_UNIX) as raylet:
+            raylet.bind(str(path))
+            raylet.listen()
+            assert run_lagid("health", "ray", **words).code == 0
 
 
 def test_a_dispatcher_answers_prometheus_at_its_port_and_works_on_without_it(
