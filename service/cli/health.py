@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 ANSWER_SECONDS = 5.0
 RAY_SOCKET = Path("ray/session_latest/sockets/raylet")
-RAY_SOCKET = Path("/tmp/ray/session_latest/sockets/raylet")
 _ANY_ADDRESS = ("0.0.0.0", "::", "")
 
 

@@ -19,6 +19,7 @@ ID_NAMES = ("request_id", "job_id", "run_id", "attempt")
 ACCESS_NAMES = ("method", "path", "route", "status", "seconds")
 """What a line of the access log has besides its ids."""
 ACCESS_LOGGER = "lagid.access"
+_OWN_LOGGERS = ("lagid", "service", "workers", "sysid")
 _TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 _ids: ContextVar[Mapping[str, object]] = ContextVar("ids", default={})  # noqa: B039 - never changed
@@ -99,11 +100,13 @@ def configure_logging(
     log_format : {"text", "json"}
         Form of the lines.
     level : int
-        Lowest level that is written.
+        Lowest level of lagid's own lines that is written.
     with_access : bool
         Whether each request has a line of its own.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
-    logging.basicConfig(level=level, handlers=[handler])
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])  # of libraries: warnings only
+    for name in _OWN_LOGGERS:
+        logging.getLogger(name).setLevel(level)
     logging.getLogger(ACCESS_LOGGER).setLevel(logging.INFO if with_access else logging.WARNING)

@@ -26,85 +26,83 @@ def _split_names(value: Any) -> Any:
 
 
 class Settings(BaseSettings):
-    """Storage, address and limits of the service.
+    """Storage, address, limits and habits of the service.
 
-    Attributes
-    ----------
-    data_dir : Path
-        Folder of everything that the embedded service stores.
-    database_url, store_url : str or None
-        None: SQLite and a folder of objects inside `data_dir`.
-    ray_address : str or None
-        None: a local Ray cluster, started by this process.
-    cpus : int or None
-        Workers of the local Ray; None: all cores.
-    worker_memory_mb : int or None
-        Memory of a worker for its runs, in MiB; None: its share of 80 % of the machine.
-    require_keys : bool or None
-        None: API keys are off on loopback and required elsewhere.
-    allow_open_host : bool
-        Serve other hosts although this version has no API keys yet.
-    allowed_hosts : tuple of str
-        More names by which requests may address the service, such as that of a reverse proxy.
-    max_upload_bytes, max_body_bytes : int
-        Longest recording, and longest body of any other request. Larger ones are answered by 413.
-    max_uploads : int
-        Uploads that a web process receives and reads at once. A further one waits for 20 s, and is
-        then answered by 503.
-    max_streams : int
-        Event streams of one web process. A further one is answered by 503.
-    max_open_jobs, max_open_runs : int
-        Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
-    project_cores : int or None
-        Cores of each dispatcher that the runs of one project may use; None: all.
-    keep_signals : bool
-        Whether sweeps store the fitted signals of their runs, unless a job says otherwise. Else
-        they are computed again when they are asked for.
-    lease_seconds : float
-        How long a job stays with a dispatcher that sends no heartbeat.
-    start_seconds : float
-        How long a dispatcher waits for Ray and its workers to start, before it starts anew.
-    log_format : {"text", "json"}
-        Form of the log lines.
-    access_log : bool or None
-        Whether each request has a log line; None: with JSON only.
-    metrics_host, metrics_port : str, int or None
-        Where a dispatcher answers Prometheus; None: nowhere. The web process has `/metrics`.
-    data : Path or None
-        Folder of measured records, for tests and benchmarks.
+    The texts below the fields are the page ``docs/settings.md`` (``make docs``).
     """
 
-    model_config = SettingsConfigDict(env_prefix="LAGID_", env_file="lagid.env", extra="ignore")
+    model_config = SettingsConfigDict(
+        env_prefix="LAGID_", env_file="lagid.env", extra="ignore", use_attribute_docstrings=True
+    )
 
     data_dir: Path = Path("lagid-data")
+    """Folder of database, objects and logs. May be relative."""
     database_url: str | None = None
+    """SQLAlchemy address of the database, such as `postgresql+psycopg://…`. Without it: SQLite in
+    the data folder."""
     store_url: str | None = None
-    ray_address: str | None = None
-    cpus: int | None = Field(default=None, ge=1)
-    worker_memory_mb: int | None = Field(default=None, ge=256)
+    """Where objects are: `s3://bucket/prefix` or `file:///folder`. Without it: `objects` in the
+    data folder."""
     host: str = "127.0.0.1"
+    """Address where the web process listens."""
     port: int = Field(default=8000, ge=0, le=65535)
+    """Port of the web process. 0 chooses a free one."""
     require_keys: bool | None = None
+    """Reserved: this version has no API keys, and refuses `true`."""
     allow_open_host: bool = False
+    """Serve other hosts although this version has no API keys. Only behind a proxy that
+    authenticates."""
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
+    """More host names that are answered, separated by commas, such as that of a reverse proxy."""
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
+    """Largest recording. A larger one is answered by 413."""
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
+    """Largest body of any other request; 413 beyond. About 40,000 labelled values of a sweep have
+    room. In any case 100,000 lists and objects with 200,000 fields are the most."""
     max_uploads: int = Field(default=4, ge=1)
+    """Uploads that one web process receives and reads at once, each with up to 4 GiB of memory for
+    120 s. Others wait, and are answered by 503 after 20 s. A sender that stops for 60 s is answered
+    by 408."""
     max_streams: int = Field(default=500, ge=1)
+    """Event streams of one web process; 503 beyond."""
     max_runs_per_job: int = Field(default=100_000, ge=1)
+    """Runs of one job."""
     max_open_jobs: int = Field(default=1000, ge=1)
+    """Unfinished jobs of a project; 429 beyond."""
     max_open_runs: int = Field(default=1_000_000, ge=1)
-    project_cores: int | None = Field(default=None, ge=1)
-    keep_signals: bool = False
-    lease_seconds: float = Field(default=10.0, gt=0)
-    max_attempts: int = Field(default=3, ge=1)
+    """Unfinished runs of a project; 429 beyond."""
     poll_seconds: float = Field(default=0.3, gt=0)
+    """How often the web process looks for news, once for all event streams."""
+    ray_address: str | None = None
+    """Head of the Ray cluster that the dispatcher joins, `host:port` or `auto`. Without it: a local
+    Ray."""
+    cpus: int | None = Field(default=None, ge=1)
+    """Workers of the local Ray, or cores that are used of a joined one. Without it: all cores."""
+    worker_memory_mb: int | None = Field(default=None, ge=256)
+    """Memory that a worker may use for its runs, in MiB. Without it: its share of 80 % of the
+    machine."""
+    project_cores: int | None = Field(default=None, ge=1)
+    """Cores that one project may use of a dispatcher. Without it: all."""
+    keep_signals: bool = False
+    """Whether sweeps store fitted signals, unless a job says otherwise (`keep_signals`). Else they
+    are computed again when they are asked for."""
+    lease_seconds: float = Field(default=10.0, gt=0)
+    """After this time a silent dispatcher loses its jobs."""
+    max_attempts: int = Field(default=3, ge=1)
+    """Losses of the dispatcher without progress, after which a job fails."""
     start_seconds: float = Field(default=900.0, ge=30)
+    """How long a dispatcher waits for Ray, and then for its workers, before it starts anew."""
     log_format: LogFormat = "text"
+    """Form of the log lines: `text` for people, `json` for machines."""
     access_log: bool | None = None
+    """Whether each request has a log line. Without it: with `json` only."""
     metrics_host: str = "127.0.0.1"
+    """Address where a dispatcher answers Prometheus."""
     metrics_port: int | None = Field(default=None, ge=1, le=65535)
+    """Port where a dispatcher answers Prometheus. Without it: nowhere. The web process has
+    `/metrics` in any case."""
     data: Path | None = None
+    """Folder of measured records, for tests and benchmarks."""
 
     @field_validator("database_url")
     @classmethod

@@ -91,7 +91,8 @@ def bare_root() -> Iterator[None]:
     yield
     logger.handlers[:] = handlers
     logger.setLevel(level)
-    logging.getLogger("lagid.access").setLevel(logging.NOTSET)
+    for name in ("lagid", "lagid.access", "service", "workers", "sysid"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
 
 
 @pytest.mark.parametrize("with_access", [False, True])
@@ -102,6 +103,7 @@ def test_the_access_log_is_written_only_where_it_is_wanted(
         configure_logging("json", logging.WARNING, with_access=with_access)
         logging.getLogger("lagid.access").info("GET / 200", extra={"status": 200})
         logging.getLogger("service.jobs").info("not of interest")
+        logging.getLogger("alembic").info("of a library")
         logging.getLogger("service.jobs").warning("of interest")
     lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     access = [line["status"] for line in lines if line["logger"] == "lagid.access"]
