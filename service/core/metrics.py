@@ -20,7 +20,8 @@ from prometheus_client import (
 
 _log = logging.getLogger(__name__)
 
-disable_created_metrics()  # else each series has a second one, which nobody reads
+# Else each series has a second one, which nobody reads.
+disable_created_metrics()  # type: ignore[no-untyped-call]  # the library has no type for it
 _LATENCIES = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0)
 _COMPILATIONS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 

@@ -63,9 +63,12 @@ def test_the_commands_of_compose_carry_out_a_job_on_postgresql_s3_and_two_nodes(
         open_states = ("queued", "running")
         deployment.wait_until(lambda: httpx.get(at).json()["state"] not in open_states, "the end")
         ended = httpx.get(at).json()
-        assert (ended["state"], ended["n_done"], ended["n_failed"]) == ("succeeded", 4, 0)
-        run = httpx.get(f"{at}/runs").json()["items"][0]
-        assert abs(run["estimates"]["L"]["value"] - 0.5) < 0.1
+        progress = ended["progress"]
+        assert (ended["state"], progress["finished"], progress["failed"]) == ("succeeded", 4, 0)
+        run = httpx.get(f"{at}/runs").json()["items"][0]["id"]
+        found = httpx.get(f"{second}/v1/runs/{run}").json()["parameters"]
+        values = {parameter["name"]: parameter["value"] for parameter in found}
+        assert abs(values["L"] - 0.5) < 0.1
 
         endpoint = deployment.environments["web"]["AWS_ENDPOINT_URL"]
         stored = open_client(endpoint).list_objects_v2(Bucket=BUCKET)["Contents"]
