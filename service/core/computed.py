@@ -42,12 +42,24 @@ class ComputedValues:
         self._lock, self._size = Lock(), size
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
 
-    def get(self, key: Hashable, compute: Callable[[], T], *, is_final: bool) -> T:
+    def get(
+        self,
+        key: Hashable,
+        compute: Callable[[], T],
+        *,
+        is_final: bool,
+        before_wait: Callable[[], object] = lambda: None,
+    ) -> T:
         """Return the value of a key.
 
         A value that `is_final` is computed once. Another one is computed again once its age is
         `REUSE_FACTOR` times what it took, so that readers of a running sweep take a small part of
         the processor, however many they are.
+
+        Parameters
+        ----------
+        before_wait : callable
+            Releases what the caller need not hold while another request computes the value.
 
         Examples
         --------
@@ -60,10 +72,15 @@ class ComputedValues:
             self._entries.move_to_end(key)
             while len(self._entries) > self._size:
                 self._entries.popitem(last=False)
-        with entry.lock:
+        if not entry.lock.acquire(blocking=False):
+            before_wait()
+            entry.lock.acquire()
+        try:
             if not entry.is_usable(is_final=is_final):
                 begun = time.monotonic()
                 entry.value = compute()
                 entry.made_at = time.monotonic()
                 entry.seconds = entry.made_at - begun
             return cast(T, entry.value)
+        finally:
+            entry.lock.release()

@@ -23,9 +23,8 @@ from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
-from sysid.data.noise import Noise, add_output_noise
+from sysid.data.noise import Noise
 from sysid.data.records import Record
-from sysid.data.splitting import split_record
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.uncertainty.estimates import Estimate
@@ -103,21 +102,26 @@ class StoredRun:
         rows = DatasetRepository(session, self.job.project_id).get_all(datasets)
         return read_records(store, rows, self.channels)
 
-    def records(self, session: Session, store: ObjectStore) -> list[Record]:
-        """Read the records that the run was fitted to: no validation part, noise added."""
-        records: Sequence[Record] = self.read_datasets(session, store, self.body["datasets"])
-        fraction = (self.body["validation"] or {}).get("fraction")
-        if fraction is not None:
-            records = [split_record(record, fraction)[0] for record in records]
-        noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
-        return [add_output_noise(record, noise, number) for number, record in enumerate(records)]
+    def read_fit_records(self, session: Session, store: ObjectStore) -> "FitRecords":
+        """Read the records that the run was fitted to, noise added, and its validation data."""
+        # This imports the compiler.
+        from sysid.identification.fit_problems import prepare_records
+
+        validation = self.body["validation"] or {}
+        others = validation.get("datasets")
+        return prepare_records(
+            self.read_datasets(session, store, self.body["datasets"]),
+            None if others is None else self.read_datasets(session, store, others),
+            validation.get("fraction"),
+            Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"])),
+        )
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
         """Build the problem that the run solved."""
         # This imports the compiler.
         from sysid.simulation.problem import Problem
 
-        records = self.records(session, store)
+        records = self.read_fit_records(session, store).estimation
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
         loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
@@ -136,20 +140,9 @@ class StoredRun:
             If a dataset is not there any more, or has no such channel.
         """
         # This imports the compiler.
-        from sysid.identification.fit_problems import prepare_records
         from sysid.identification.resimulate import resimulate_run
 
-        validation = self.body["validation"] or {}
-        model, others = self.model_of_request, validation.get("datasets")
-        channels = map_channels(model, self.body["channels"], self.body["hold"])
-        datasets = DatasetRepository(session, self.job.project_id)
-        noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
-        records = prepare_records(
-            read_records(store, datasets.get_all(self.body["datasets"]), channels),
-            None if others is None else read_records(store, datasets.get_all(others), channels),
-            validation.get("fraction"),
-            noise,
-        )
+        model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = self.result.get("substeps", model.solver.substeps)
         estimates = [_to_estimate(document) for document in self.estimates]
         settings = fit_settings_of(self.body)

@@ -17,7 +17,7 @@ from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
 from service.runs.fitted import load_fitted_signals
 from service.runs.residuals import ResidualAnalysis, analyse_residuals
-from service.storage.errors import StorageError
+from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
@@ -31,7 +31,12 @@ from sysid.figures.data import (
     RunFigureData,
     SignalTrace,
 )
-from sysid.identification.figures import join_validation, label_fitness, to_signal_trace
+from sysid.identification.figures import (
+    RecordTraces,
+    arrange_experiments,
+    label_fitness,
+    to_signal_trace,
+)
 from sysid.models.parameters import Parameter, ParameterScale
 
 
@@ -209,24 +214,24 @@ def read_run_experiments(
     fitted = _by_experiment(fits)
     estimation, validation = fitted["estimation"], fitted["validation"]
     validation_settings = stored.body["validation"] or {}
+    is_part = validation_settings.get("fraction") is not None
+    others = [] if is_part else validation_settings.get("datasets") or []
     inputs = list(_read_inputs(session, store, stored, stored.body["datasets"]))
-    experiments = [
-        ExperimentTraces(
-            f"estimation {number}", _to_output_traces(parts), _get_inputs(inputs, number)
-        )
-        for number, parts in estimation.items()
-    ]
-    if validation_settings.get("fraction") is not None:
-        return [
-            join_validation(experiment, _to_output_traces(validation.get(n, ())))
-            for n, experiment in enumerate(experiments, 1)
-        ]
-    other = list(_read_inputs(session, store, stored, validation_settings.get("datasets") or []))
-    return experiments + [
-        ExperimentTraces(
-            f"validation {number}", _to_output_traces(parts), _get_inputs(other, number), -inf
-        )
-        for number, parts in validation.items()
+    later = inputs if is_part else list(_read_inputs(session, store, stored, others))
+    if is_part:
+        validation = {number: validation.get(number, ()) for number in estimation}
+    return arrange_experiments(
+        _pair_with_inputs(estimation, inputs),
+        _pair_with_inputs(validation, later),
+        is_part=is_part,
+    )
+
+
+def _pair_with_inputs(
+    outputs: Mapping[int, Sequence[FittedOutput]], inputs: Sequence[tuple[SignalTrace, ...]]
+) -> list[RecordTraces]:
+    return [
+        (_to_output_traces(parts), _get_inputs(inputs, number)) for number, parts in outputs.items()
     ]
 
 
@@ -259,5 +264,5 @@ def _read_inputs(
         try:
             for record in stored.read_datasets(session, store, [name]):
                 yield tuple(to_signal_trace(channel) for channel in record.inputs)
-        except (StorageError, SysidError):
+        except (RowNotFound, ObjectMissing, SysidError):
             yield ()

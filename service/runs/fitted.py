@@ -1,16 +1,15 @@
 """Use case of a run's response: measured and simulated outputs, stored or computed again."""
 
 import io
-from collections import OrderedDict
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import groupby
-from threading import Lock
 
 from sqlalchemy.orm import Session
 
+from service.core.computed import ComputedValues
 from service.core.concurrency import simulation_limit
-from service.core.errors import Conflict, NotFound, ServiceError
+from service.core.errors import Conflict, InvalidRequest, NotFound
 from service.core.states import JobState
 from service.datasets.datasets import to_series
 from service.formats.mcap import (
@@ -21,13 +20,15 @@ from service.formats.mcap import (
 )
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ExperimentOut, ResponseOut
-from service.storage.errors import StorageError
+from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
+from service.storage.sessions import release_connection
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel
 
 _CACHE_SIZE = 4
 """Runs whose signals stay in memory: a zoom reads the same ones repeatedly."""
+_computed_signals = ComputedValues(_CACHE_SIZE)
 
 
 def load_fitted_signals(
@@ -49,8 +50,11 @@ def load_fitted_signals(
         return _read_object(store, run.signals_sha256, run.signals_start, run.signals_size)
     if run.state is not JobState.SUCCEEDED:
         return None
-    return _computed_signals.get(run.id) or _computed_signals.put(
-        run.id, _compute_signals(session, store, stored)
+    return _computed_signals.get(
+        run.id,
+        partial(_compute_signals, session, store, stored),
+        is_final=True,
+        before_wait=partial(release_connection, session),
     )
 
 
@@ -71,44 +75,23 @@ def _read_object(
     return read_fitted_outputs(store.get_range(sha256, start, size))
 
 
-@simulation_limit.acquire()
 def _compute_signals(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> tuple[FittedOutput, ...]:
-    try:
-        records, signals = stored.resimulate(session, store)
-    except (SysidError, ServiceError, StorageError) as error:
-        raise Conflict(
-            f"the signals of run {stored.run.id} are not stored, and cannot be computed again: "
-            f"{error}"
-        ) from error
+    release_connection(session)
+    with simulation_limit.acquire():
+        try:
+            records, signals = stored.resimulate(session, store)
+        except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:
+            raise Conflict(
+                f"the signals of run {stored.run.id} are not stored, and cannot be computed "
+                f"again: {error}"
+            ) from error
     fits = list_fitted_outputs("estimation", records.estimation, signals.simulated)
     if records.validation is not None:
         validated = signals.simulated_validation
         fits += list_fitted_outputs("validation", records.validation, validated)
     return tuple(fits)
-
-
-class _ComputedSignals:
-    """Signals of the latest runs, which never change."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._fits: OrderedDict[str, tuple[FittedOutput, ...]] = OrderedDict()
-
-    def get(self, run: str) -> tuple[FittedOutput, ...] | None:
-        with self._lock:
-            return self._fits.get(run)
-
-    def put(self, run: str, fits: tuple[FittedOutput, ...]) -> tuple[FittedOutput, ...]:
-        with self._lock:
-            self._fits[run] = fits
-            while len(self._fits) > _CACHE_SIZE:
-                self._fits.popitem(last=False)
-        return fits
-
-
-_computed_signals = _ComputedSignals()
 
 
 def build_response(

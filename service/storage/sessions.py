@@ -84,7 +84,7 @@ class Database:
     @contextmanager
     def read_session(self) -> Iterator[Session]:
         """Open a session that only reads."""
-        with self._read.begin() as session:
+        with self._read() as session:
             yield session
 
     def get_waiting_engine(self, seconds: float) -> Engine:
@@ -105,6 +105,14 @@ class Database:
     def dispose(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
+
+
+def release_connection(session: Session) -> None:
+    """Return the connection of a reading session to the pool, before a wait.
+
+    Rows that were loaded stay. The next statement takes a connection again, and sees newer rows.
+    """
+    session.commit()
 
 
 def find_database(session: Session) -> Database:

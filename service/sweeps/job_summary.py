@@ -9,6 +9,7 @@ first request does. While a job runs, they are remembered for many times the tim
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,7 +28,7 @@ from service.repositories.summaries import (
     write_summary,
 )
 from service.storage.columns import Document
-from service.storage.sessions import Database, find_database
+from service.storage.sessions import Database, find_database, release_connection
 from service.storage.statements import split_chunks
 from service.storage.tables import Job, Run
 from service.sweeps.groups import GroupKey, RunGroup, SweepGroups, aggregate_runs
@@ -75,7 +76,7 @@ def list_default_keys(spec: Mapping[str, Any]) -> list[GroupKey]:
 
 def load_summary(session: Session, job: Job) -> JobSummary:
     """Load the summary of a job, or compute it."""
-    return _remember(_summaries, job, "summary", lambda: _load_or_compute(session, job))
+    return _remember(_summaries, session, job, "summary", lambda: _load_or_compute(session, job))
 
 
 def load_groups(session: Session, job: Job, groups: SweepGroups) -> Sequence[RunGroup]:
@@ -84,6 +85,7 @@ def load_groups(session: Session, job: Job, groups: SweepGroups) -> Sequence[Run
         return load_summary(session, job).groups
     return _remember(
         _summaries,
+        session,
         job,
         groups.by,
         lambda: aggregate_runs(_load_table(session, job), groups, _pending(job)),
@@ -118,6 +120,7 @@ def _load_or_compute(session: Session, job: Job) -> JobSummary:
         return _from_document(job, document)
     summary = _compute_summary(session, job, _load_table(session, job))
     with suppress(SQLAlchemyError):  # busy, full or read-only: the next request tries again
+        release_connection(session)  # so that a request never holds two connections
         _keep_summary(find_database(session), job, summary)
     return summary
 
@@ -209,7 +212,7 @@ def _load_table(session: Session, job: Job) -> RunTable:
     """Load the columns of a job's runs; those of ended jobs are cached for other keys."""
     if not job.state.is_terminal or job.n_runs > MAX_CACHED_RUNS:
         return _read_table(session, job)
-    return _remember(_tables, job, "table", lambda: _read_table(session, job))
+    return _remember(_tables, session, job, "table", lambda: _read_table(session, job))
 
 
 def _read_table(session: Session, job: Job) -> RunTable:
@@ -221,7 +224,14 @@ MAX_CACHED_RUNS = 200_000
 _summaries, _tables = ComputedValues(32), ComputedValues(2)
 
 
-def _remember(values: ComputedValues, job: Job, what: Hashable, compute: Callable[[], T]) -> T:
+def _remember(
+    values: ComputedValues, session: Session, job: Job, what: Hashable, compute: Callable[[], T]
+) -> T:
     """Return a value of a job; one of a resumed job is computed again when it has ended."""
     key = job.id, job.attempt, job.finished_at, what
-    return values.get(key, compute, is_final=job.state.is_terminal)
+    return values.get(
+        key,
+        compute,
+        is_final=job.state.is_terminal,
+        before_wait=partial(release_connection, session),
+    )

@@ -1,6 +1,7 @@
 """Use case of trends: a batch of re-identifications over one label, compared with its reference."""
 
 from collections.abc import Hashable, Sequence
+from functools import partial
 
 from sqlalchemy.orm import Session
 
@@ -12,6 +13,7 @@ from service.repositories.jobs import JobRepository
 from service.repositories.lineage import list_reference_names
 from service.repositories.runs import RunRepository
 from service.repositories.trends import TrendRow, count_succeeded, read_trend_rows
+from service.storage.sessions import release_connection
 from service.storage.tables import Job
 from service.trends.drift import BatchReference, compare_with_reference
 from service.trends.notes import describe_noise_models, describe_quantity
@@ -60,7 +62,12 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
             f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
     key = job.id, job.attempt, job.finished_at, _find_reference_version(session, job)
-    return _trends.get(key, lambda: _compute(session, job), is_final=job.state.is_terminal)
+    return _trends.get(
+        key,
+        lambda: _compute(session, job),
+        is_final=job.state.is_terminal,
+        before_wait=partial(release_connection, session),
+    )
 
 
 _trends = ComputedValues(8)

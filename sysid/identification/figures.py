@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import inf
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -37,6 +37,8 @@ FigureName = Literal[
     "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
 ]
 FIGURES: tuple[FigureName, ...] = get_args(FigureName)
+RecordTraces: TypeAlias = tuple[tuple[OutputTraces, ...], tuple[SignalTrace, ...]]
+"""Outputs and inputs of a record."""
 _USUAL: tuple[FigureName, ...] = ("response", "residuals", "correlation", "waterfall")
 
 
@@ -187,25 +189,38 @@ def list_experiments(found: Identification) -> list[ExperimentTraces]:
     data = found.data
     if data is None:
         return []
-    estimation = [
+    return arrange_experiments(
+        list(_pair(data.records, found.simulated)),
+        list(_pair(data.validation, found.simulated_validation)),
+        is_part=data.is_part,
+    )
+
+
+def arrange_experiments(
+    estimation: Sequence[RecordTraces], validation: Sequence[RecordTraces], *, is_part: bool
+) -> list[ExperimentTraces]:
+    """Name the records of estimation and validation data.
+
+    If validation `is_part` of the same records, each is one experiment with the inputs of both.
+    """
+    fitted = [
         ExperimentTraces(f"estimation {number}", outputs, inputs)
-        for number, (outputs, inputs) in enumerate(_pair(data.records, found.simulated), 1)
+        for number, (outputs, inputs) in enumerate(estimation, 1)
     ]
-    later = list(_pair(data.validation, found.simulated_validation))
-    if data.is_part:
+    if is_part:
         return [
-            join_validation(replace(experiment, inputs=inputs), outputs)
-            for experiment, (outputs, inputs) in zip(estimation, later, strict=True)
+            _join_validation(replace(experiment, inputs=inputs), outputs)
+            for experiment, (outputs, inputs) in zip(fitted, validation, strict=True)
         ]
-    return estimation + [
+    return fitted + [
         ExperimentTraces(f"validation {number}", outputs, inputs, -inf)
-        for number, (outputs, inputs) in enumerate(later, 1)
+        for number, (outputs, inputs) in enumerate(validation, 1)
     ]
 
 
 def _pair(
     records: Sequence[Record], simulated: Sequence[Sequence[FloatArray]]
-) -> Iterator[tuple[tuple[OutputTraces, ...], tuple[SignalTrace, ...]]]:
+) -> Iterator[RecordTraces]:
     for record, outputs in zip(records, simulated, strict=True):
         pairs = zip(record.outputs, outputs, strict=True)
         yield (
@@ -214,7 +229,7 @@ def _pair(
         )
 
 
-def join_validation(
+def _join_validation(
     experiment: ExperimentTraces, later: Sequence[OutputTraces]
 ) -> ExperimentTraces:
     """Join the parts of a record whose last part was used for validation."""

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -142,6 +143,29 @@ def summarise_without_runs(place: Place, job: str) -> SummaryOut:
         told = summarise(place, job)
     assert not [one for one, _ in statements if "FROM runs" in one]
     return told
+
+
+def test_readers_that_hold_all_connections_get_and_store_one_summary(
+    stored_place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None of them may wait for the one that computes, and hold what it needs to store."""
+    job, lease, _ = ended(stored_place)
+    finish(stored_place, lease)
+    url = stored_place.database.engine.url.render_as_string(hide_password=False)
+    few = Database(url, pool_size=2, max_overflow=0, pool_timeout=0.5)
+    both = Barrier(2)
+
+    def read() -> int:
+        with few.read_session() as session:
+            row = JobRepository(session).get(job)
+            both.wait(30.0)
+            return len(job_summary.load_summary(session, row).groups)
+
+    with ThreadPoolExecutor() as threads:
+        assert [one.result() for one in [threads.submit(read) for _ in range(2)]] == [2, 2]
+    few.dispose()
+    with stored_place.database.read_session() as session:
+        assert session.get(StoredSummary, job) is not None
 
 
 def test_a_dispatcher_stores_what_the_first_reader_would_compute(

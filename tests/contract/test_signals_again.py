@@ -7,12 +7,15 @@ import pytest
 
 from service.core.errors import Conflict
 from service.core.states import JobState
+from service.datasets import recordings
 from service.datasets.datasets import add_recording
 from service.jobs.stored_run import load_run
 from service.repositories.datasets import DatasetRepository
 from service.runs.fitted import load_fitted_signals, write_signals_file
+from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from sysid.data.records import Recording
+from tests import polynomials
 from tests.dispatching import Place, carry_out
 from tests.runs import step_record
 from workers.inline_executor import InlineExecutor
@@ -38,6 +41,11 @@ CASES: dict[str, dict[str, Any]] = {
     "coloured": {"loss": {"noise_model": "ar1"}, "noise": NOISE},
     "held": {"hold": {"u": "first"}, "validation": {"fraction": 0.3}},
     "tied": {"parameters": {"K": {"tied": "2*T"}, "T": {"upper": 10.0}, "L": {"fixed": 0.7}}},
+    "selected terms": {
+        "model": polynomials.document(polynomials.frols(3), coefficients={"lower": -5, "upper": 5}),
+        "parameters": {},
+        "noise": NOISE,
+    },
     "integrator": {"model": "ipdt", "parameters": {}, "validation": {"fraction": 0.2}},
 }
 
@@ -106,6 +114,20 @@ def test_a_sweep_stores_no_signals_and_a_single_run_does_unless_the_job_says_oth
     runs = carry_out_sweep(place, **body)
     assert {run.state for run in runs} == {JobState.SUCCEEDED}
     assert {run.signals_sha256 is not None for run in runs} == {is_kept}
+
+
+def test_a_store_that_is_down_is_not_told_as_a_deleted_dataset(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run, _) = carry_out_sweep(place)
+
+    def fail(*_: object) -> bytes:
+        raise ObjectStoreFailed("the store is down")
+
+    monkeypatch.setattr(type(place.store), "get_bytes", fail)
+    monkeypatch.setattr(recordings, "_recording_cache", recordings._RecordingCache())
+    with pytest.raises(ObjectStoreFailed, match="the store is down"):
+        compute_again(place, run.id)
 
 
 def test_signals_that_cannot_be_computed_again_say_why(place: Place) -> None:
