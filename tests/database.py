@@ -90,7 +90,8 @@ def migrated_postgres() -> Database:
     """A PostgreSQL database of its own with the tables of today; it ends with its server."""
     with empty_postgres(keep=True) as database:
         upgrade_database(database)
-        return Database(database.engine.url.render_as_string(hide_password=False), pool_size=10)
+        url = database.engine.url.render_as_string(hide_password=False)
+    return Database(url, poolclass=NullPool)  # nobody disposes of it, and it leaves nothing open
 
 
 @contextmanager

@@ -112,7 +112,7 @@ class RunSpec:
             self.problem.cache_key,
             _describe_algorithm(self.algorithm),
             self.seed,
-            [*map(dict, self.warm_starts)],
+            [sorted(values.items()) for values in self.warm_starts],  # JSONB sorts the names too
             self.posterior,
         )
         fingerprint = compute_fingerprint(
