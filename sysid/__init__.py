@@ -4,8 +4,9 @@ The public names are imported from their modules on first use. `import sysid.cor
 neither the compiler nor SciPy, so web process, command line and upload reader start fast.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sysid.core.lazy_names import load_on_first_use
 
 if TYPE_CHECKING:
     from sysid.core.errors import SysidError
@@ -79,12 +80,8 @@ _PUBLIC_NAMES = {
     "simulation.simulate": ("simulate",),
     "uncertainty.estimates": ("Estimate",),
 }
-_MODULE_BY_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
+_MODULE_BY_NAME = {
+    name: f"{__name__}.{module}" for module, names in _PUBLIC_NAMES.items() for name in names
+}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_BY_NAME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_MODULE_BY_NAME[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = load_on_first_use(__name__, _MODULE_BY_NAME)

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import struct
 import zipfile
 from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
@@ -126,6 +127,46 @@ def write_open_sheet(rows: Sequence[Sequence[object]]) -> bytes:
         for part, text in parts.items():
             archive.writestr(part, text)
     return buffer.getvalue()
+
+
+def write_old_sheet(rows: Sequence[Sequence[object]]) -> bytes:
+    """An Excel 97 file (.xls) with at most 64 kB of rows: BIFF8 records in a compound file."""
+
+    def record(kind: int, content: bytes = b"") -> bytes:
+        return struct.pack("<HH", kind, len(content)) + content
+
+    def begin(kind: int) -> bytes:
+        return record(0x0809, struct.pack("<4H2I", 0x0600, kind, 0, 0, 0, 0))
+
+    def write(row: int, column: int, value: object) -> bytes:
+        place = struct.pack("<3H", row, column, 0)
+        if isinstance(value, str):
+            text = struct.pack("<HB", len(value), 1) + value.encode("utf-16-le")
+            return record(0x0204, place + text)
+        return record(0x0203, place + struct.pack("<d", value))
+
+    def list_entry(name: str, kind: int, child: int, start: int, size: int) -> bytes:
+        text = name.encode("utf-16-le")
+        head = struct.pack("<HBB3I", len(text) + 2, kind, 1, free, free, child)
+        return text.ljust(64, b"\0") + head + bytes(36) + struct.pack("<IQ", start, size)
+
+    free, end_of_chain, of_table, sector = 0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD, 512
+    cells = [write(i, j, value) for i, row in enumerate(rows) for j, value in enumerate(row)]
+    sheet = begin(0x0010) + b"".join(cells) + record(0x000A)
+    opening, name = begin(0x0005), b"\x04\x00Data"
+    start = len(opening) + 4 + 6 + len(name) + 4
+    book = opening + record(0x0085, struct.pack("<IH", start, 0) + name) + record(0x000A) + sheet
+    book = book.ljust(4096, b"\0")  # shorter streams are stored elsewhere
+    book += bytes(-len(book) % sector)
+    n = len(book) // sector  # then one sector with the folder, and one with the table of sectors
+    folder = list_entry("Root Entry", 5, 1, end_of_chain, 0)
+    folder += list_entry("Workbook", 2, free, 0, len(book)) + 2 * list_entry("", 0, free, 0, 0)
+    chain = [*range(1, n), end_of_chain, end_of_chain, of_table]
+    table = struct.pack("<128I", *chain, *[free] * (128 - len(chain)))
+    head = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(16)
+    head += struct.pack("<5H6x", 0x3E, 3, 0xFFFE, 9, 6)
+    head += struct.pack("<9I", 0, 1, n, 0, 4096, end_of_chain, 0, end_of_chain, 0)
+    return head + struct.pack("<109I", n + 1, *[free] * 108) + book + folder + table
 
 
 def write_npz(**arrays: object) -> bytes:

@@ -10,7 +10,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.api.dependencies import Parts, PartsDep
 from service.api.queue_metrics import write_metrics
 from service.core.errors import FieldError, Unavailable
-from service.queue.dispatchers import DispatcherRepository, describe_start
+from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.storage import migrate
 from service.storage.errors import StorageError
 
@@ -87,11 +87,7 @@ def _check_store(parts: Parts) -> None:
 
 
 def _check_dispatcher(parts: Parts) -> None:
-    """Check that a dispatcher takes jobs. One that starts says what it waits for."""
     with parts.database.read_session() as session:
-        alive = DispatcherRepository(session).list_alive()
-        starting = [start for one in alive if (start := describe_start(one)) is not None]
-    if alive and len(starting) < len(alive):
-        return
-    what = starting[0] if starting else "no dispatcher is alive"
-    raise Unavailable(f"{what}; jobs are accepted, but wait until one is ready")
+        wait = describe_wait(DispatcherRepository(session).list_alive())
+    if wait is not None:
+        raise Unavailable(wait)

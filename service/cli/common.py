@@ -53,6 +53,21 @@ def _restore_notes() -> None:
     err.quiet = False
 
 
+def complete_model_name(incomplete: str) -> list[str]:
+    """List the built-in models that a shell may complete a name to; files are its own task."""
+    from sysid.models.catalogue.load import catalogue
+
+    return [name for name in catalogue() if name.startswith(incomplete)]
+
+
+ModelName = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        help="Built-in model (`lagid models` lists them), or the YAML file of your own.",
+        autocompletion=complete_model_name,
+    ),
+]
 DOCUMENT_HELP = "YAML or JSON file with the body of the request; - for standard input."
 SERVER_PANEL, OUTPUT_PANEL = "Server", "Output"
 Url = Annotated[
@@ -72,7 +87,8 @@ Key = Annotated[
     ),
 ]
 Segments = Annotated[
-    str | None, typer.Option(help="Label columns that divide the rows into segments: col,col.")
+    str | None,
+    typer.Option(help="Columns of labels that divide the rows into experiments: run,repeat."),
 ]
 SampleTime = Annotated[
     float | None, typer.Option(help="Sampling period in s, for a file without a time column.")
@@ -323,6 +339,12 @@ def read_file(path: Path) -> bytes:
         fail(f"{name_file(path)} cannot be read: {error.strerror}")
 
 
+def check_file(path: Path) -> None:
+    """End the command if a file that the user names is none."""
+    if path != STANDARD_INPUT and not path.is_file():
+        fail(f"{path} is a folder; name a file" if path.is_dir() else f"there is no file {path}")
+
+
 def name_file(path: Path) -> str:
     """Name a file in a message."""
     return "standard input" if path == STANDARD_INPUT else str(path)
@@ -357,12 +379,15 @@ def write_file(path: Path, text: str) -> None:
         fail(f"{path} cannot be written: {error.strerror}")
 
 
-def protect_file(path: Path, force: bool) -> None:
-    """Ask before a file is overwritten; end the command where nobody can answer."""
+def protect_file(path: Path, force: bool, option: str = "--output") -> None:
+    """Ask before a file is overwritten; end the command where nobody can answer.
+
+    `option` names another file.
+    """
     if not force and path.exists():
         ask_to_go_on(
             f"{path} exists. Overwrite it?",
-            f"{path} exists, and nothing was written. Add --force, or name another by --output",
+            f"{path} exists, and nothing was written. Add --force, or name another by {option}",
         )
 
 
@@ -417,6 +442,7 @@ def format_decimals(value: float | None) -> str | None:
 
 
 INVALID_STATUS = 422
+UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
 READ_OPTIONS = (
     (re.compile(r"\bsample_time\b"), "--sample-time"),
     (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
@@ -466,6 +492,11 @@ class FieldOrigins:
                 return _format_option(self.options[above], pointer.removeprefix(above))
         return _format_option(self.rest, pointer, is_whole=True)
 
+    @property
+    def file(self) -> str:
+        """The file that the whole body was read from; empty if options made it."""
+        return "" if "{}" in self.rest else self.rest.removesuffix(" …")
+
     def describe_faults(self, faults: Iterable[FieldError]) -> str:
         """Describe faults in one line."""
         return "; ".join(self._describe_fault(fault) for fault in faults)
@@ -480,7 +511,7 @@ class FieldOrigins:
         return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
 
     def _describe_fault(self, fault: FieldError) -> str:
-        origin = self.locate(fault.pointer) if fault.pointer else ""
+        origin = self.locate(fault.pointer) if fault.pointer else self.file
         column = "" if fault.column is None else f", column {fault.column}"
         detail = fault.detail
         if not self.rest.endswith("…"):
@@ -492,6 +523,11 @@ class FieldOrigins:
 def file_origins(path: Path, options: Mapping[str, str] | None = None) -> FieldOrigins:
     """Return the origins of a body that is read from a file, except fields that options set."""
     return FieldOrigins(options or {}, rest=f"{name_file(path)} …")
+
+
+def upload_origins(path: Path) -> FieldOrigins:
+    """Return the origins of an upload: options, and the file for all faults in it."""
+    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path), rewrite=name_read_options)
 
 
 @contextmanager

@@ -20,13 +20,13 @@ from service.cli.common import (
     SampleTime,
     Segments,
     Url,
+    check_file,
     connect_client,
     fail,
     fail_usage,
     fetch_listing,
     file_origins,
     name_file,
-    name_read_options,
     parse_number,
     parse_pairs,
     print_json,
@@ -40,6 +40,7 @@ from service.cli.common import (
     read_object,
     report_faults,
     show_examples,
+    upload_origins,
 )
 from service.client.calls import DEFAULT_URL
 from sysid.core.errors import suggest_name
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Add, show, download, simulate and derive recordings.", no_args_is_help=True)
 
-UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
 DATASET_ID = "ds_"
 
 
@@ -98,11 +98,9 @@ def add_dataset(
     quiet: Quiet = False,
 ) -> None:
     """Store a recording."""
-    if file != STANDARD_INPUT and not file.is_file():
-        fail(f"there is no file {file}")
+    check_file(file)
     source = read_file(file) if file == STANDARD_INPUT else file
-    origins = FieldOrigins(UPLOAD_OPTIONS, rest=name_file(file), rewrite=name_read_options)
-    with connect_client(url, key) as client, report_faults(origins):
+    with connect_client(url, key) as client, report_faults(upload_origins(file)):
         stored = client.add_dataset(source, name, segments=segments, sample_time=sample_time)
     _print_dataset(stored, as_json)
 

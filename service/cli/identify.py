@@ -17,10 +17,13 @@ from service.cli.common import (
     STANDARD_INPUT,
     AsJson,
     FieldOrigins,
+    Force,
+    ModelName,
     Quiet,
     SampleTime,
     Segments,
     apply_setting,
+    check_file,
     describe_status,
     err,
     fail,
@@ -32,6 +35,7 @@ from service.cli.common import (
     parse_channels,
     print_json,
     print_table,
+    protect_file,
     read_file,
     split_names,
     split_setting_path,
@@ -93,13 +97,23 @@ def identify(
         Path,
         typer.Argument(metavar="DATA", help=DATA_HELP),
     ],
-    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    model: ModelName,
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", help="path=value of the job body: algorithm.population=100."),
+        typer.Option(
+            "--set",
+            metavar="PATH=VALUE",
+            help="Change a bound or a setting: parameters.L.upper=2, parameters.K.fixed=1, seed=3. "
+            "May be repeated.",
+        ),
     ] = None,
     channels: Annotated[
-        str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
+        str | None,
+        typer.Option(
+            metavar="SIGNAL=CHANNEL,…",
+            help="Channel of each signal of the model: u=P1,y=P2. By default of the same name, "
+            "else in their order, inputs first.",
+        ),
     ] = None,
     validation: Annotated[
         Path | None,
@@ -130,18 +144,23 @@ def identify(
             rich_help_panel=OUTPUT_PANEL,
         ),
     ] = None,
+    force: Force = False,
     output: ResultFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Identify a model's parameters and time lags from a recording, in this process."""
+    """Identify a model's parameters and time lags from a recording, without a server.
+
+    Prints each estimate with its standard error, its unit and a status that says if the data
+    determine it.
+    """
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
     if posterior:
         changes.append("posterior=true")
     if report is not None:
-        _check_report(report)
+        _check_report(report, force)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
@@ -164,7 +183,7 @@ def identify(
         _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
 
 
-def _check_report(path: Path) -> None:
+def _check_report(path: Path, force: bool) -> None:
     """End the command before the search if no report could be written after it."""
     from importlib.util import find_spec
 
@@ -175,6 +194,7 @@ def _check_report(path: Path) -> None:
         fail_usage(f"--report {path}: this is a folder; name a file")
     if not path.parent.is_dir():
         fail_usage(f"--report {path}: there is no folder {path.parent}")
+    protect_file(path, force, "--report")
 
 
 def _write_report(
@@ -285,8 +305,7 @@ def read_recording(path: Path, reading: FileOptions) -> "Recording":
     from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
 
-    if path != STANDARD_INPUT and not path.is_file():
-        fail(f"there is no file {path}")
+    check_file(path)
     try:
         recording, notes = read_with_notes(
             read_file(path) if path == STANDARD_INPUT else path,

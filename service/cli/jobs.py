@@ -70,7 +70,7 @@ def submit_job(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Submit a job."""
+    """Submit a job, described in a file, to the server."""
     body = read_job(file)
     with connect_client(url, key) as client:
         with report_faults(file_origins(file)):

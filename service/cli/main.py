@@ -20,6 +20,7 @@ from service.client.calls import ClientError, NotFinite, ProblemError
 from service.core.errors import ServiceError
 
 SERVER_ERROR_STATUS = 500
+EXTRA_ARGUMENT = "unexpected extra argument"
 SURROGATE_REASON = "surrogates not allowed"
 """Python's reason for an argument or a file name in another encoding."""
 app = typer.Typer(
@@ -28,7 +29,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=show_examples("lagid demo", "lagid identify recording.csv --model fopdt"),
+    epilog=show_examples(
+        "lagid identify recording.csv --model fopdt", "lagid models", "lagid demo"
+    ),
 )
 
 
@@ -49,7 +52,9 @@ def describe_program(
 ) -> None:
     """Identification of nonlinear systems with unknown time delays.
 
-    Exit code 0: success, 1: the work failed, 2: wrong arguments. LAGID_URL names a server.
+    `identify` and `models` work alone. The commands on jobs and data need a server: start one with
+    `lagid serve`, or name one by LAGID_URL. Exit code 0: success, 1: the work failed, 2: wrong
+    arguments.
     """
 
 
@@ -78,7 +83,7 @@ def run_demo(
         typer.Option(min=0, max=65535, help="Port (default: LAGID_PORT, or any free one)."),
     ] = None,
 ) -> None:
-    """Run the paper's Example 1 through the whole service and print its Table 1."""
+    """Run one example through the whole service: Example 1 of the paper, with its Table 1."""
     from service.cli import demo
 
     demo.run_demo(data_dir, port, out)
@@ -178,7 +183,18 @@ def _usage_message(error: TyperException) -> str:
         text = text.replace(error.message, describe_error(cause.errors()[0], ()))
     context = getattr(error, "ctx", None)
     command = "lagid" if context is None else context.command_path
-    return f"{text[:1].lower()}{text[1:].rstrip('.')} ({command} --help)"
+    hint = "" if context is None or EXTRA_ARGUMENT not in text else _advise_on_json(context.command)
+    return f"{text[:1].lower()}{text[1:].rstrip('.')}{hint} ({command} --help)"
+
+
+def _advise_on_json(command: Any) -> str:
+    """Say how JSON is written to a file, if a word that is none of the options follows --json."""
+    words = sys.argv[sys.argv.index("--json") + 1 :] if "--json" in sys.argv else []
+    if not words or words[0].startswith("-"):
+        return ""
+    has_output = any("--output" in option.opts for option in command.params)
+    file = f"--output {words[0]}" if has_output else f"--json > {words[0]}"
+    return f"; --json takes no file, it prints on standard output. To write one: {file}"
 
 
 def _exit_with_message(message: str, code: int = 1) -> None:

@@ -11,6 +11,7 @@ from service.cli.common import (
     Limit,
     Listing,
     Url,
+    complete_model_name,
     connect_client,
     err,
     fetch_listing,
@@ -28,7 +29,7 @@ from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
 
-app = typer.Typer(help="Built-in models and your own.", invoke_without_command=True)
+app = typer.Typer(help="List, show, check and add models.", invoke_without_command=True)
 
 ModelFile = Annotated[
     Path, typer.Argument(help="Model document, YAML or JSON; - for standard input.")
@@ -83,7 +84,12 @@ def list_models(
     "show", epilog=show_examples("lagid models show tube > mine.yaml", "lagid models show mine@2")
 )
 def show_model(
-    name: Annotated[str, typer.Argument(help="Name, or name@version of your own model.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name, or name@version of your own model.", autocompletion=complete_model_name
+        ),
+    ],
     url: Annotated[
         str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of your own models.")
     ] = None,

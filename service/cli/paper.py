@@ -37,7 +37,7 @@ def reproduce_paper(
     key: Key = None,
     quiet: Quiet = False,
 ) -> None:
-    """Reproduce the paper's tables and figures with real jobs; print tables and write a report."""
+    """Reproduce tables and figures of the paper that the method is from, by real jobs."""
     check_extra("server", "this command")
     from service.paper.bench import StudyBench
     from service.paper.document import to_markdown

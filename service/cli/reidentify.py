@@ -16,6 +16,7 @@ from service.cli.common import (
     FieldOrigins,
     Key,
     Limit,
+    ModelName,
     Quiet,
     Url,
     apply_setting,
@@ -37,6 +38,7 @@ from service.cli.common import (
     report_faults,
     show_examples,
     split_names,
+    upload_origins,
     write_file,
 )
 from service.cli.tables import print_reuse_note, print_trend
@@ -57,7 +59,6 @@ Experiments = Annotated[
         "joined by a comma are fitted together.",
     ),
 ]
-Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")]
 Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
 Reference = Annotated[
     str | None,
@@ -97,7 +98,7 @@ TrendFile = Annotated[
 
 def reidentify(
     experiments: Experiments,
-    model: Model,
+    model: ModelName,
     label: Label,
     reference: Reference = None,
     parameters: Parameters = "",
@@ -115,7 +116,7 @@ def reidentify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Re-identify a model for several values of a label: estimates, trend, predictions, flags.
+    """Identify one model on each recording of a batch: a trend over a label such as length.
 
     Each run starts at the reference, or at the result of its neighbour.
     """
@@ -216,10 +217,13 @@ def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> lis
     for source in (name for _, sources in batch for name in sources):
         if source in dataset_ids:
             continue
-        is_file = Path(source).is_file()
-        if not is_file and source.endswith(SUFFIXES):
+        path = Path(source)
+        if not path.is_file() and source.endswith(SUFFIXES):
             fail(f"there is no file {source}")
-        dataset_ids[source] = client.add_dataset(Path(source))["id"] if is_file else source
+        dataset_ids[source] = source
+        if path.is_file():
+            with report_faults(upload_origins(path)):
+                dataset_ids[source] = client.add_dataset(path)["id"]
     return [{"x": x, "datasets": [dataset_ids[name] for name in sources]} for x, sources in batch]
 
 
@@ -235,7 +239,9 @@ def _drop_missing(**options: str | None) -> dict[str, str]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
+app = typer.Typer(
+    help="Runs that later batches are compared with: list, show, accept.", no_args_is_help=True
+)
 
 REFERENCE_ORIGINS = FieldOrigins(
     {"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"}

@@ -9,6 +9,7 @@ from service.cli.common import (
     AsJson,
     FieldOrigins,
     Key,
+    ModelName,
     Quiet,
     Url,
     apply_setting,
@@ -38,7 +39,9 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-app = typer.Typer(help="Recipes: sweeps for one purpose.", no_args_is_help=True)
+app = typer.Typer(
+    help="Repeat an identification under noise: how far the estimates move.", no_args_is_help=True
+)
 
 MAX_SIGMA_VALUES = 100_000
 RELATIVE_KEY = "relative"
@@ -118,7 +121,7 @@ IdempotencyKey = Annotated[str | None, typer.Option(help="The same key returns t
     ),
 )
 def sweep_noise(
-    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    model: ModelName,
     sigma: Sigma,
     data: Data = None,
     true: TrueParameters = None,

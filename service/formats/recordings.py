@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -79,6 +80,7 @@ def read_with_notes(
             return read_with_notes(
                 file.name, sample_time=sample_time, segments=segments, limits=limits
             )
+    _check_arguments(source, sample_time, segments)
     path, limits = Path(source), DEFAULT_LIMITS if limits is None else limits
     if path.is_dir():
         raise InvalidUpload(f"{path} is a folder; need a file")
@@ -94,3 +96,13 @@ def read_with_notes(
         path, limits, suffix=path.suffix, sample_time=sample_time, segments=segments
     )
     return upload.recording, upload.notes
+
+
+def _check_arguments(source: object, sample_time: object, segments: object) -> None:
+    """Refuse arguments of another kind, which Python lets through."""
+    if not isinstance(source, str | os.PathLike):
+        raise InvalidUpload(f"found {source!r}; need the path of a file, or its content as bytes")
+    if sample_time is not None and not isinstance(sample_time, Real):
+        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
+    if isinstance(segments, str):
+        raise InvalidUpload(f"segments is {segments!r}; need a list of columns: [{segments!r}]")

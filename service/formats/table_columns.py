@@ -13,7 +13,14 @@ from service.core.text import unescape_formula
 from service.formats.cells import FLAGS, MISSING
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.table_layout import TableColumn, TableLayout, is_comment, split_blanks
+from service.formats.table_layout import (
+    MAX_FOOTER_ROWS,
+    TableColumn,
+    TableLayout,
+    count_footer_rows,
+    is_comment,
+    split_blanks,
+)
 from sysid.core.types import FloatArray, IntArray
 
 BLOCK_ROWS = 50_000
@@ -85,7 +92,7 @@ def read_rows(
     """Read the rows of the body, which are split into fields; raises as `read_lines`."""
     blocks = []
     comments = 0
-    for fields, numbers, skipped in _iterate_blocks(rows, layout):
+    for fields, numbers, skipped in _iterate_blocks(rows, layout, notes):
         comments += skipped
         if numbers.size and numbers[-1] > max_rows + layout.skipped:
             raise InvalidUpload(f"the file has more than {max_rows} rows")
@@ -105,11 +112,18 @@ def read_rows(
 
 
 def _iterate_blocks(
-    rows: Iterator[list[str]], layout: TableLayout
+    rows: Iterator[list[str]], layout: TableLayout, notes: list[str]
 ) -> Iterator[tuple[list[list[str]], IntArray, int]]:
-    """Yield rows that are neither blank nor comments, their numbers, and how many comments."""
-    rows_before = layout.skipped
-    while fields := list(islice(rows, BLOCK_ROWS)):
+    """Yield rows of data, their numbers, and how many comments were among them.
+
+    Blank rows are left out, and words below the data.
+    """
+    rows_before, following = layout.skipped, list[list[str]]()
+    while fields := [*following, *islice(rows, BLOCK_ROWS)]:
+        following = list(islice(rows, MAX_FOOTER_ROWS))
+        is_last = len(following) < MAX_FOOTER_ROWS
+        if is_last:
+            fields, following = fields + following, []
         numbers = np.arange(rows_before + 1, rows_before + 1 + len(fields))
         rows_before += len(fields)
         comments = 0
@@ -120,7 +134,23 @@ def _iterate_blocks(
         if not filled.all():
             fields = [row for row, keep in zip(fields, filled, strict=True) if keep]
             numbers = numbers[filled]
+        if is_last:
+            fields, numbers = _cut_footer(fields, numbers, layout, notes)
         yield fields, numbers, comments
+
+
+def _cut_footer(
+    fields: list[list[str]], numbers: IntArray, layout: TableLayout, notes: list[str]
+) -> tuple[list[list[str]], IntArray]:
+    """Cut rows of words below the data, and tell which."""
+    stop = len(fields) - count_footer_rows(fields, layout.columns)
+    if stop == len(fields):
+        return fields, numbers
+    first, last = int(numbers[stop]), int(numbers[-1])
+    rows = f"row {first} is" if first == last else f"rows {first} to {last} are"
+    word = next(field for field in fields[stop] if field.strip())
+    notes.append(f"{rows} below the data ({shorten_text(word.strip())}) and left out")
+    return fields[:stop], numbers[:stop]
 
 
 def _parse_block(

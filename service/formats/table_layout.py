@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 from service.core.text import unescape_formula
-from service.formats.cells import CellKind, classify_cell, classify_column
+from service.formats.cells import CellKind, begins_like_number, classify_cell, classify_column
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import suggest_name
@@ -49,6 +49,8 @@ MAX_TIME_UNIT = 86_400.0
 """Longest unit of time in s (a day); a longer one is taken for a mistake."""
 PEEK_CELLS = 20_000
 """Most cells of the first rows that are looked at."""
+MAX_FOOTER_ROWS = 20
+"""Most rows of words below the data, such as mean values; more are faults."""
 _MAX_UNIT_CHARACTERS = 12
 
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
@@ -236,11 +238,47 @@ def _find_block(rows: Sequence[_Row], separator: str) -> _DataBlock:
             width = -1
     first, stop = best
     data = [row for row in full[first:stop] if not is_comment(row.fields)]
+    data = data[: len(data) - _count_last_words([row.fields for row in data], 0)]
     if len(data) > 1 and not first and _is_header_of(data[0].fields, data[1].fields):
         return _DataBlock(separator, full[:1], data[1:])
     if not data:
         return _DataBlock(separator, list(full), [])
     return _DataBlock(separator, full[:first], data)
+
+
+def count_footer_rows(rows: Sequence[Sequence[str]], columns: Sequence[TableColumn]) -> int:
+    """Count the rows at the end of a table that are no samples, such as ``Mean,0.5,1.2``.
+
+    They have words where the time stands, or the first signal of a table without times. More than
+    `MAX_FOOTER_ROWS` are none: they are faults.
+    """
+    roles = [column.role for column in columns]
+    place = next((roles.index(role) for role in ("time", "value") if role in roles), 0)
+    count = _count_last_words(rows, place)
+    return count if count <= MAX_FOOTER_ROWS else 0
+
+
+def _count_last_words(rows: Sequence[Sequence[str]], place: int) -> int:
+    """Count the last rows that begin with a word and have no value at a place.
+
+    None if the first row has no value there either.
+    """
+    if not rows or not _has_value(rows[0], place):
+        return 0
+    return next(
+        count
+        for count, row in enumerate(reversed(rows))
+        if _has_value(row, place) or not _begins_with_word(row)
+    )
+
+
+def _has_value(fields: Sequence[str], place: int) -> bool:
+    return place < len(fields) and classify_cell(fields[place]) not in ("text", "empty")
+
+
+def _begins_with_word(fields: Sequence[str]) -> bool:
+    first = next((field for field in fields if field.strip()), "")
+    return classify_cell(first) == "text" and not begins_like_number(first)
 
 
 def _is_data(fields: Sequence[str]) -> bool:

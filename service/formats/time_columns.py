@@ -30,6 +30,8 @@ EPOCH_THRESHOLD_SECONDS: Final = 1e8
 _PLAUSIBLE_CLOCK: Final = (6.3e8, 4.2e9)  # s since 1970: the years 1990 to 2103
 _EPOCH_UNITS: Final = (("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds"))
 _DAY_SECONDS: Final = 86_400.0
+_SERIAL_DAYS: Final = (36_526.0, 73_050.0)  # of a spreadsheet: the years 2000 to 2099
+_SERIAL_ORIGIN: Final = np.datetime64("1899-12-30T00:00:00", "us")
 _EXACT_INTEGER: Final = 2.0**53
 _ZONE_FORM: Final = "%#z"
 _EXACT_DECIMALS: Final = 6  # of s since 1970 in a number of 53 bits
@@ -52,8 +54,12 @@ def find_clock_start(seconds: float) -> datetime | None:
 def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]) -> ClockTimes:
     """Convert a column of numbers to seconds; a clock is counted from the first sample.
 
-    Numbers without a unit are s, unless they can only be a finer clock since 1970.
+    Numbers without a unit are s, unless they can only be a finer clock since 1970, or the days
+    since 1900 that a spreadsheet counts.
     """
+    if _are_serial_dates(values, unit):
+        notes.append(f"column {name!r} holds serial dates of a spreadsheet, in days")
+        return read_stamp_times(_read_serial_dates(values), name, False, notes)
     first = float(np.min(values))
     if not unit:
         for symbol, word in _EPOCH_UNITS:
@@ -80,6 +86,20 @@ def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]
         f"{moment}"
     )
     return ClockTimes(shifted, start)
+
+
+def _are_serial_dates(values: FloatArray, unit: str) -> bool:
+    """Whether numbers are dates of a spreadsheet; without a unit, if they stay within a day."""
+    first, last = float(np.min(values)), float(np.max(values))
+    is_day = find_unit_seconds(unit) == _DAY_SECONDS
+    is_possible = is_day or (not unit and 0 < last - first < 1.0)
+    return is_possible and _SERIAL_DAYS[0] <= first <= last <= _SERIAL_DAYS[1]
+
+
+def _read_serial_dates(values: FloatArray) -> NDArray[np.datetime64]:
+    """Convert days to time stamps, rounded to 10 µs: a number of that size has no finer ones."""
+    ticks = np.round(values * (_DAY_SECONDS * 1e5)).astype(np.int64) * 10
+    return _SERIAL_ORIGIN + ticks.astype("timedelta64[us]")
 
 
 def _scale_times(times: FloatArray, size: float) -> FloatArray:

@@ -71,7 +71,7 @@ def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
         )
     for parameter in model.parameters:
         unit = estimates[parameter.name]["unit"] if parameter.name in estimates else parameter.unit
-        if unit != parameter.unit:
+        if unit != parameter.unit and not parameter.has_unit_of_data:
             return (
                 f"run {run.id} has another model: {parameter.name} is in {unit} there, but in "
                 f"{parameter.unit} in {model.name!r}"

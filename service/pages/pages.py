@@ -32,6 +32,7 @@ from service.pages.views import (
     to_job_view,
     to_run_view,
 )
+from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
@@ -115,6 +116,7 @@ def job_page(
     return render_template(
         "job.html",
         job=view,
+        obstacle=_describe_obstacle(session, job),
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in page.items],
         run=load_full_run(session, stored) if stored else None,
         next_runs=_encode_query({"cell": cell, "cursor": page.next}) if page.next else "",
@@ -129,6 +131,14 @@ def job_page(
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
+
+
+def _describe_obstacle(session: Session, job: Job) -> str:
+    """Describe why a job cannot begin; empty if nothing is in its way but other jobs."""
+    if job.state is not JobState.QUEUED:
+        return ""
+    wait = describe_wait(DispatcherRepository(session).list_alive())
+    return "" if wait is None else f"This job waits: {wait}."
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """Heartbeats of the dispatchers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from typing import Literal
 
@@ -14,6 +14,10 @@ from service.storage.statements import upsert
 from service.storage.tables import DispatcherHeartbeat
 
 _FORGET_AFTER = timedelta(days=1)
+_NO_DISPATCHER = (
+    "no dispatcher is alive; jobs are accepted, but wait until one starts. A first start compiles "
+    "the search, which takes about a minute"
+)
 LEASE_SECONDS_KEY = "lease_seconds"
 """Key of the lease length in the details of a dispatcher."""
 STARTING_KEY = "starting"
@@ -83,3 +87,11 @@ def describe_start(dispatcher: DispatcherHeartbeat) -> str | None:
     seconds = (dispatcher.seen_at - dispatcher.started_at).total_seconds()
     waits = " and ".join(_STEPS.get(step, step) for step in steps)
     return f"a dispatcher is starting ({seconds:.0f} s): {waits}"
+
+
+def describe_wait(alive: Sequence[DispatcherHeartbeat]) -> str | None:
+    """Describe why jobs wait for a dispatcher; None if one of these is ready."""
+    starts = [describe_start(one) for one in alive]
+    if None in starts:
+        return None
+    return f"{starts[0]}; jobs are accepted, but wait for it" if starts else _NO_DISPATCHER

@@ -256,6 +256,20 @@ def multiply_units(unit: str, other: str) -> str:
     return other if unit in ("1", "") else f"{unit}·{other}"
 
 
+def divide_units(unit: str, other: str) -> str:
+    """Write the quotient of two units, ``(l/min)/%``; ``"1"`` for equal ones.
+
+    Examples
+    --------
+    >>> divide_units("°C", "%"), divide_units("l/min", "N·s"), divide_units("V", "V")
+    ('°C/%', '(l/min)/(N·s)', '1')
+    """
+    if unit == other:
+        return "1"
+    above, below = (f"({text})" if set(text) & set("·*/ ") else text for text in (unit, other))
+    return f"{above}/{below}"
+
+
 def suggest_unit(unit: str) -> str:
     """Suggest a known unit for an unknown one, to append to a message.
 

@@ -1,10 +1,11 @@
 """Read what a user gives to `identify`: recordings and tables, channels, changes of parameters."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import isfinite
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
-from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
@@ -81,12 +82,13 @@ def check_kinds(values: Mapping[str, object]) -> None:
     """
     for name, value in values.items():
         kinds, need = _KINDS[name]
+        is_left_out = value is None and name not in _NEEDED
         is_flag = isinstance(value, bool) and bool not in kinds
-        if value is not None and (is_flag or not isinstance(value, kinds)):
+        if not is_left_out and (is_flag or not isinstance(value, kinds)):
             raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
 
 
-_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+_KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
     "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
     "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
@@ -97,7 +99,28 @@ _KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
     "weights": ((Mapping,), "a mapping of outputs to numbers"),
     "warm": ((Mapping,), "a mapping of parameters to values"),
     "validation_fraction": ((Real,), "a number between 0 and 1"),
+    "posterior": ((bool,), "True or False"),
+    "progress": ((Callable,), "a function of the run's state"),
 }
+_NEEDED = ("seed", "skip", "posterior")
+"""Arguments that None does not leave out."""
+
+
+def check_warm(warm: Mapping[str, float] | None, known: Sequence[str]) -> None:
+    """Check the values that the search starts from.
+
+    Raises
+    ------
+    InvalidSettings
+        If a name is no parameter, or a value is no finite number.
+    """
+    for name, value in (warm or {}).items():
+        if name not in known:
+            detail = f"there is no parameter {name!r}{suggest_name(str(name), known)}"
+            raise InvalidSettings(join_pointer("warm", str(name)), detail)
+        if not _is_number(value) or not isfinite(value):
+            detail = f"found {value!r}; need a finite number"
+            raise InvalidSettings(join_pointer("warm", name), detail)
 
 
 def read_changes(

@@ -1,11 +1,20 @@
 """Identify a model from records, in this process."""
 
+from __future__ import annotations  # the help of `identify` shows `Data`, not all that it is
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
 from sysid.data.noise import Noise
-from sysid.identification.arguments import Change, Data, check_kinds, read_changes, read_records
+from sysid.identification.arguments import (
+    Change,
+    Data,
+    check_kinds,
+    check_warm,
+    read_changes,
+    read_records,
+)
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
@@ -41,7 +50,8 @@ def identify(
 ) -> Identification:
     """Estimate the free parameters of a model, including its unknown time lags.
 
-    If the terms of a polynomial are to be selected, they are selected on the records first.
+    The result has each estimate with its standard error, its unit and a status, tests of the
+    residuals, and warnings. It shows itself as a table.
 
     Parameters
     ----------
@@ -51,30 +61,31 @@ def identify(
         Experiments that are fitted jointly. A table is one of pandas, xarray or polars, or a
         mapping of lists, with its time as index or in a column ``t`` or ``time``.
     settings : GeneticAlgorithm
-        The improved algorithm with its defaults if not given.
+        Settings of the search. Default: the improved genetic algorithm.
     channels : mapping of str to str
-        Model's signal → name of its channel. A signal that is not given takes the channel of its
-        name. If as many channels are left as signals, their order decides, inputs first. A warning
-        of the result says so.
+        Channel of each signal of the model: ``{"u": "P1"}``. A signal that is not given takes the
+        channel of its name. If as many channels are left as signals, their order decides, inputs
+        first. A warning of the result says so.
     seed : int
         The same seed gives the same result, bit for bit.
     parameters : mapping
         Changes by parameter: its bounds ``{"L": (0, 2)}``, a fixed value ``{"K": 1.5}``, or fields
         ``{"T": {"upper": 2, "scale": "log"}}`` (lower, upper, scale, fixed, tied).
     prediction : {"simulation", "one-step"}
-        Fit the free run, or predictions one sample ahead.
+        What is compared with the outputs: the model driven by the inputs alone, or its
+        predictions one sample ahead.
     loss : Loss
-        Squares by default, or soft-l1 for data with outliers; the noise model.
+        Squares by default. ``Loss("soft-l1")`` for data with outliers; also the noise model.
     weights : mapping of str to float
         Weight of each output. Default: 1 for one output, else 1 / its standard deviation.
     skip : int
-        First samples of each output that are not compared.
+        Number of first samples of each output that are not compared.
     validation : Record, Recording, table, or sequence of them
         Data that are not used for the estimate.
     validation_fraction : float
         Instead of `validation`: the last part of each record. Simulation covers the whole record.
     noise : Noise
-        Added to the outputs of `records` before fitting.
+        Added to the outputs of `records` before fitting, to study its effect.
     warm : mapping of str to float
         Values that a part of the population starts from.
     posterior : bool
@@ -95,6 +106,10 @@ def identify(
         If the model cannot be found or has faults.
     InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
         If an argument cannot be used.
+
+    Notes
+    -----
+    If the terms of a polynomial are to be selected, they are selected on the records first.
 
     Examples
     --------
@@ -117,6 +132,8 @@ def identify(
             "weights": weights,
             "warm": warm,
             "validation_fraction": validation_fraction,
+            "posterior": posterior,
+            "progress": progress,
         }
     )
     algorithm = settings or GeneticAlgorithm()
@@ -131,6 +148,7 @@ def identify(
     fit = FitSettings(changes, prediction, loss or Loss(), weights, skip)
     prepared = prepare_records(whole, validation_records, validation_fraction, noise)
     problem, validation_problem = problems = build_problems(model, prepared, fit)
+    check_warm(warm, [parameter.name for parameter in problem.all_parameters])
     found = conclude_run(
         problem,
         algorithm,

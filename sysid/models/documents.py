@@ -106,6 +106,8 @@ def _describe_yaml_error(error: yaml.YAMLError) -> str:
         problem = f"{getattr(error, 'context', '')}, {problem}"
     if "'\\t' that cannot start" in problem:
         problem += "; indent with spaces, not tabs"
+    elif "that cannot start any token" in problem:
+        problem += "; put a text that begins with it in quotes, such as '%'"
     place = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
     return f"the YAML cannot be read: {place}{' '.join(problem.split())}"
 

@@ -7,9 +7,12 @@ from math import isfinite
 from typing import Any, Literal
 
 from sysid.core.errors import InvalidBounds, InvalidSettings, suggest_name
+from sysid.core.units import is_blank_unit
 
 ParameterScale = Literal["linear", "log"]
 BoundsRule = Literal["gain", "rate", "offset", "time", "delay", "state"]
+RATE_UNIT = "1/s"
+"""Unit of an integral gain between two signals without units."""
 
 _INITIAL_STATE_NAME = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
 
@@ -71,6 +74,13 @@ class Parameter:
     def is_free(self) -> bool:
         """Whether the parameter is searched."""
         return self.fixed is None and self.tied is None
+
+    @property
+    def has_unit_of_data(self) -> bool:
+        """Whether the unit is that of the channels: the model says what it is, but no unit."""
+        if self.bounds == "rate":
+            return is_blank_unit(self.unit) or self.unit == RATE_UNIT
+        return self.bounds in ("gain", "offset", "state") and is_blank_unit(self.unit)
 
 
 _CHANGEABLE_FIELDS = ("lower", "upper", "scale", "fixed", "tied")

@@ -48,7 +48,8 @@ def assign_channels(
         example = ", ".join(f"{signal!r}: …" for signal in left)
         raise InvalidRecord(
             f"model {model.name!r} has inputs {inputs} and outputs {outputs}; the recording has "
-            f"{', '.join(names)}. Say which channel is which: channels={{{example}}}"
+            f"{', '.join(names) or 'no channels'}. Say which channel is which: "
+            f"channels={{{example}}}"
         )
     by_order = dict(zip(left, free, strict=True)) if left else {}
     return Assignment({**assigned, **by_order}, _describe_order(by_order))
@@ -133,7 +134,8 @@ def match_names(
 def _check_given(given: Mapping[str, str], signals: Sequence[str], names: Sequence[str]) -> None:
     for signal, channel in given.items():
         if signal not in signals:
-            turned = f". Write {{{channel!r}: {signal!r}}}" if channel in signals else ""
+            is_turned = channel in signals and signal in names
+            turned = f". Write {{{channel!r}: {signal!r}}}" if is_turned else ""
             hint = turned or suggest_name(str(signal), signals)
             detail = f"the model has no signal {signal!r}{hint}"
             raise InvalidSettings(f"/channels/{signal}", detail)

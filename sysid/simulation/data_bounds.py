@@ -1,17 +1,19 @@
-"""Bounds that follow the data, for parameters of generic models.
+"""Bounds and units that follow the data, for parameters of generic models.
 
 A gain of 1 between a heater in % and an oven in °C is no more likely than one of 0.01. So a generic
-model declares what a parameter is, and its bounds come from spans, range, period and duration.
+model declares what a parameter is. Its bounds come from spans, range, period and duration, and its
+unit, °C/%, from those of the channels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.core.types import FloatArray
+from sysid.core.units import divide_units, is_blank_unit
 from sysid.data.records import Channel, Record
-from sysid.models.parameters import BoundsRule, Parameter
+from sysid.models.parameters import RATE_UNIT, BoundsRule, Parameter
 
 Interval = tuple[float, float]
 
@@ -65,6 +67,41 @@ def bound_by_data(
         else _set_interval(parameter, _choose_interval(parameter.bounds, spans, has_offset))
         for parameter in parameters
     )
+
+
+def add_units_of_data(
+    parameters: tuple[Parameter, ...], records: Sequence[Record]
+) -> tuple[Parameter, ...]:
+    """Give their units to parameters that have those of the data, such as °C/% to a gain.
+
+    Parameters stay without a unit where the inputs or the outputs have none, or several.
+    """
+    if not any(parameter.has_unit_of_data for parameter in parameters):
+        return parameters
+    output = _find_common_unit(channel for record in records for channel in record.outputs)
+    driven = _find_common_unit(channel for record in records for channel in record.inputs)
+    return tuple(
+        replace(parameter, unit=_choose_unit(parameter, output, driven))
+        if parameter.has_unit_of_data
+        else parameter
+        for parameter in parameters
+    )
+
+
+def _choose_unit(parameter: Parameter, output: str | None, driven: str | None) -> str:
+    if output is None or (parameter.bounds in ("gain", "rate") and driven is None):
+        return parameter.unit
+    if parameter.bounds == "gain":
+        return divide_units(output, str(driven))
+    if parameter.bounds == "rate":
+        return RATE_UNIT if output == driven else divide_units(output, f"{driven}·s")
+    return output
+
+
+def _find_common_unit(channels: Iterable[Channel]) -> str | None:
+    """Find the unit that channels share; None if they have none, or several."""
+    units = {channel.unit for channel in channels if not is_blank_unit(channel.unit)}
+    return units.pop() if len(units) == 1 else None
 
 
 def _choose_interval(rule: BoundsRule, spans: _Spans, has_offset: bool) -> Interval:

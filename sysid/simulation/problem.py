@@ -18,7 +18,7 @@ from sysid.models.delays import check_delays
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.ties import Ties, apply_ties, resolve_ties
-from sysid.simulation.data_bounds import bound_by_data
+from sysid.simulation.data_bounds import add_units_of_data, bound_by_data
 from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
 from sysid.simulation.experiments import (
     GridExperiment,
@@ -134,7 +134,8 @@ class Problem:
                 f"found {len(scoring_starts)} times for {len(records)} records. Need one each",
             )
         declared = (*model.parameters, *build_initial_parameters(model, len(records)))
-        all_parameters = override_parameters(bound_by_data(declared, records), settings.parameters)
+        bounded = bound_by_data(add_units_of_data(declared, records), records)
+        all_parameters = override_parameters(bounded, settings.parameters)
         ties = resolve_ties(model, all_parameters)
         tied = apply_ties(model, ties)
         check_delays(tied, all_parameters)

@@ -1,5 +1,6 @@
 """Jobs that start from earlier results: what each run begins with, and that it repeats."""
 
+from copy import deepcopy
 from itertools import takewhile
 
 import pytest
@@ -159,6 +160,24 @@ def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
             place.submit(warm_start=warm, model=model, parameters={})
         assert [one.pointer for one in caught.value.errors] == ["/warm_start"]
         assert said in caught.value.errors[0].detail
+
+
+def test_a_run_in_another_unit_is_refused_unless_the_unit_is_that_of_its_data(place):
+    (first,), _ = carried_out(place)
+
+    def set_unit(name, unit):
+        with place.database.write_session() as session:
+            run = session.get(Run, first.id)
+            result = deepcopy(run.result)
+            (entry,) = [one for one in result["parameters"] if one["name"] == name]
+            entry["unit"], run.result = unit, result
+
+    set_unit("K", "°C/%")
+    assert place.submit(warm_start=first.id)
+    set_unit("T", "min")
+    with pytest.raises(InvalidRequest) as caught:
+        place.submit(warm_start=first.id)
+    assert "T is in min there, but in s in 'fopdt'" in caught.value.errors[0].detail
 
 
 LABELLED = {**NOISE, "labels": [{"x": 1}, {"x": 2}, {"x": 3}]}

@@ -318,6 +318,31 @@ def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Pat
     assert "row 3" in check_refusal(run_lagid("identify", bad, "--model", "fopdt"))
 
 
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b'{"t": [0, 1]}', "the file is JSON, which is not read"),
+        (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "the spreadsheet cannot be opened"),
+        (b"t,u\n0,1\n1,a\n", "row 3, column 'u': found 'a'"),
+        (b"u,y\n0,1\n1,2\n", "row 1: there is no time column; found u, y"),
+    ],
+)
+def test_every_refusal_of_a_file_begins_with_its_name(
+    server: str, tmp_path: Path, content: bytes, told: str
+) -> None:
+    path = tmp_path / "rig.dat"
+    path.write_bytes(content)
+    for words in (
+        ("identify", path, "--model", "fopdt"),
+        ("dataset", "add", path),
+        ("reidentify", "--model", "fopdt", "--label", "x", f"1={path}", f"2={path}"),
+    ):
+        line = check_refusal(run_lagid(*words, LAGID_URL=server))
+        assert line.startswith(f"lagid: {path}: {told}")
+    folder = check_refusal(run_lagid("dataset", "add", tmp_path, LAGID_URL=server))
+    assert folder == f"lagid: {tmp_path} is a folder; name a file"
+
+
 def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(
     server: str, data: Path, tmp_path: Path
 ) -> None:

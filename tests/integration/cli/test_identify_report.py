@@ -88,6 +88,18 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_search(
     assert told in check_refusal(run_lagid(*words), 2)
 
 
+def test_a_report_is_overwritten_only_if_that_is_asked_for(data: Path, tmp_path: Path) -> None:
+    report = tmp_path / "old.html"
+    report.write_text("old")
+    words = ["identify", str(data), *WORDS, "--report", str(report)]
+    assert check_refusal(run_lagid(*words)).endswith(
+        "exists, and nothing was written. Add --force, or name another by --report"
+    )
+    assert report.read_text() == "old"
+    assert run_lagid(*words, "--force").code == 0
+    assert report.read_text().startswith("<!doctype html>")
+
+
 def test_a_report_without_its_libraries_is_refused_before_the_search(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ from starlette.testclient import TestClient
 
 from service.api import event_feed
 from service.core.states import JobState
+from service.queue.dispatchers import DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
@@ -32,13 +33,28 @@ def events(server: TestClient, job: str, **headers: str) -> list[str]:
 
 
 def test_a_job_without_a_dispatcher_is_accepted_and_waits(server: TestClient, dataset: str) -> None:
-    assert server.get("/readyz").status_code == 503
+    unready = server.get("/readyz")
+    assert unready.status_code == 503
+    assert "A first start compiles the search" in unready.json()["detail"]
     job = submit(server, dataset, name="first")
     read = server.get(f"/v1/jobs/{job['id']}").json()
     assert read["state"] == "queued"
     assert read["name"] == "first"
     assert read["request"]["datasets"] == [dataset]
     assert read["request"]["algorithm"]["bits"] == 24
+
+
+def test_a_page_says_that_its_job_waits_for_a_dispatcher(server: TestClient, dataset: str) -> None:
+    job = submit(server, dataset)["id"]
+    page = f"/jobs/{job}"
+    assert "This job waits: no dispatcher is alive" in server.get(page).text
+    with parts_of(server).database.write_session() as session:
+        DispatcherRepository(session).add_dispatcher("one", {})
+    assert "This job waits" not in server.get(page).text
+    with parts_of(server).database.write_session() as session:
+        DispatcherRepository(session).remove_dispatcher("one")
+    server.post(f"/v1/jobs/{job}:cancel")
+    assert "This job waits" not in server.get(page).text
 
 
 def test_a_dataset_may_be_named_instead_of_identified(server: TestClient, dataset: str) -> None:

@@ -157,7 +157,7 @@ def test_a_failure_of_the_store_is_counted(server: TestClient) -> None:
     assert find_value(read_samples(server), name, store="objects") == before + 1
 
 
-def test_readiness_says_what_a_dispatcher_waits_for(server: TestClient) -> None:
+def test_readiness_says_what_a_dispatcher_waits_for(server: TestClient, dataset: str) -> None:
     parts = parts_of(server)
 
     def tell(owner: str, **details: Any) -> None:
@@ -173,7 +173,11 @@ def test_readiness_says_what_a_dispatcher_waits_for(server: TestClient) -> None:
     (fault,) = refused(answer, 503, "unavailable")
     assert re.search(r"starting \(\d+ s\): Ray is starting and the search is comp", fault["detail"])
     assert (count("starting"), count("ready")) == (1, 0)
+    job = server.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset]}).json()["id"]
+    page = server.get(f"/jobs/{job}").text
+    assert re.search(r"This job waits: a dispatcher is starting \(\d+ s\): Ray is starting", page)
     tell("d2")
+    assert "This job waits" not in server.get(f"/jobs/{job}").text
     assert server.get("/readyz").status_code == 200
     assert (count("starting"), count("ready")) == (1, 1)
     tell("d1")

@@ -15,8 +15,6 @@ from sysid import Channel, Identification, simulate
 from sysid.control.linear_form import IdentifiedModel
 from tests.repository import ROOT
 
-pytest.importorskip("lagid")
-
 PAGE = (ROOT / "docs/notebooks.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 README = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)

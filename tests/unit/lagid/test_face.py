@@ -61,6 +61,19 @@ def test_nothing_heavy_is_loaded_before_a_name_is_used() -> None:
     assert not {"numpy", "pydantic", "ray"} & after
 
 
+def test_a_command_seldom_looks_for_garbage() -> None:
+    """A short command makes many values that live as long as it does."""
+    done = run_python(
+        "import atexit, gc, lagid\n"
+        "usual, *others = gc.get_threshold()\n"
+        "check = lambda: print(gc.isenabled(), gc.get_threshold()[0] > 10 * usual)\n"
+        "atexit.register(check)\n"
+        "sys.argv.append('--version')\n"
+        "lagid.main()"
+    )
+    assert done.stdout.splitlines()[-1] == "True True"
+
+
 def test_the_example_of_the_module_holds() -> None:
     assert doctest.testmod(lagid) == (0, 7)
 

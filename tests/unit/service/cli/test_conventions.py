@@ -95,6 +95,17 @@ def test_what_asks_a_server_for_data_has_json() -> None:
     assert without == {"demo", "paper", "serve", "dispatcher", "report", "dataset download"}
 
 
+def test_a_file_after_json_is_refused_with_the_option_that_writes_it() -> None:
+    for words in ("a.csv --json b.json", "--json b.json a.csv"):
+        line = check_refusal(run_lagid("identify", *words.split(), "--model", "fopdt"), 2)
+        assert "--json takes no file, it prints on standard output" in line
+        assert "To write one: --output b.json" in line
+    line = check_refusal(run_lagid("jobs", "--json", "jobs.json"), 2)
+    assert "To write one: --json > jobs.json" in line
+    line = check_refusal(run_lagid("identify", "a.csv", "b.csv", "--model", "fopdt", "--json"), 2)
+    assert "--json" not in line
+
+
 def test_the_version_is_printed_alone() -> None:
     printed = run_lagid("--version")
     assert re.fullmatch(r"lagid \d+\.\d+\.\d+\S*\n", printed.stdout)
@@ -111,6 +122,9 @@ def test_a_shell_completes_commands_and_options() -> None:
     assert complete("lagid ide") == ["identify"]
     assert complete("lagid dataset dow") == ["download"]
     assert complete("lagid submit --wa") == ["--wait"]
+    assert complete("lagid identify a.csv --model tube") == ["tube", "tube-second-order"]
+    assert complete("lagid reidentify --model fo") == ["fopdt"]
+    assert complete("lagid models show duffing-d") == ["duffing-delay"]
     shown = run_lagid("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     assert "_LAGID_COMPLETE=complete_bash" in shown.stdout
 

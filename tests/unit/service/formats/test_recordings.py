@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.formats import recordings
+from service.formats import recordings, table_columns
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import SUFFIXES, detect_kind
@@ -31,6 +31,7 @@ from tests.recorded_files import (
     write_experiment_sheet,
     write_mat,
     write_npz,
+    write_old_sheet,
     write_open_sheet,
     write_parquet,
     write_sheet,
@@ -205,6 +206,20 @@ def test_times_of_day_go_on_after_midnight() -> None:
     assert any("times of day, 0.1 s apart, from 23:59:58" in note for note in notes)
 
 
+@pytest.mark.parametrize("heading", ["time", "Zeit", "time [day]"])
+def test_serial_dates_of_a_spreadsheet_are_time_stamps(heading: str) -> None:
+    days = (START - datetime.fromisoformat("1899-12-30")) / timedelta(days=1)
+    text = join_rows(f"{heading},u,y", time=lambda t: repr(float(days + t / 86_400)))
+    recording, notes = read_with_notes(text.encode())
+    check_experiment(recording)
+    assert recording.started_at == START
+    assert any("serial dates of a spreadsheet" in note for note in notes)
+    seconds, _ = read_with_notes(
+        join_rows("time,u,y", time=lambda t: repr(float(days + 10 * t))).encode()
+    )
+    assert seconds.duration == 10 * TIMES[-1]
+
+
 def test_midnight_that_is_written_as_a_date_is_one_of_the_stamps() -> None:
     text = join_rows("t,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
     assert " 00:00:00.000" in text
@@ -303,6 +318,47 @@ def test_a_kind_that_is_recognised_is_named_in_its_refusal(
 def test_a_text_that_begins_like_another_kind_is_a_text() -> None:
     check_experiment(read_csv(ROWS.replace("t,u,y", "time,MDF ,y").encode())[0], ("MDF", "y"))
     check_experiment(read_csv(b"RIFF test\n\n" + ROWS.encode())[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 42 to 43 are below the data ('Mean')"),
+        (ROWS + "\n\nEnd of file\n", "row 44 is below the data ('End of file')"),
+        (
+            join_rows("time;u;y", ";", time=stamp("%Y-%m-%d %H:%M:%S.%f")) + "Mittel;0.5;0.3\n",
+            "row 42 is below the data ('Mittel')",
+        ),
+        (
+            "u,y,t\n"
+            + "".join(f"{u},{y},{t}\n" for u, y, t in zip(INPUT, OUTPUT, TIMES, strict=True))
+            + "End\n",
+            "row 42 is below the data ('End')",
+        ),
+    ],
+)
+def test_words_below_the_data_are_left_out_and_said(text: str, told: str) -> None:
+    recording, notes = read_with_notes(text.encode())
+    check_experiment(recording)
+    assert f"{told} and left out" in notes
+
+
+def test_words_below_the_data_are_found_wherever_blocks_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for rows in range(N - 2, N + 4):
+        monkeypatch.setattr(table_columns, "BLOCK_ROWS", rows)
+        recording, notes = read_with_notes((ROWS + "Mean,1,2\n" * 3).encode())
+        check_experiment(recording)
+        assert notes == ("rows 42 to 44 are below the data ('Mean') and left out",)
+
+
+@pytest.mark.parametrize(
+    "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
+)
+def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
+    with pytest.raises(InvalidUpload, match=r"^row 42"):
+        read_with_notes((ROWS + end).encode())
 
 
 def test_labels_that_divide_every_row_are_refused() -> None:
@@ -412,10 +468,13 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
         read_bytes(tmp_path, write_experiment_sheet()[:700])
 
 
-def test_an_open_document_is_a_sheet_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [write_open_sheet, write_old_sheet])
+def test_an_open_document_and_an_old_excel_file_are_sheets_too(tmp_path: Path, write: Any) -> None:
     rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
-    content = write_open_sheet([["t", "u", "y"], *rows])
+    content = write([["t", "u", "y"], *rows])
     check_experiment(read_bytes(tmp_path, content)[0])
+    with pytest.raises(InvalidUpload, match="cannot be opened"):
+        read_bytes(tmp_path, content[: len(content) // 2])
 
 
 def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
@@ -429,6 +488,21 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
         check_experiment(read_recording(ROWS.encode()))
         path.write_text(ROWS)
         check_experiment(read_recording(str(path)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"source": None}, "found None; need the path of a file"),
+        ({"source": 3}, "found 3; need the path of a file"),
+        ({"sample_time": "0.1 s"}, "sample_time is '0.1 s'; need a positive number"),
+        ({"sample_time": -1}, "sample_time is -1; need a positive number"),
+        ({"segments": "run"}, "segments is 'run'; need a list of columns: ['run']"),
+    ],
+)
+def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told: str) -> None:
+    with pytest.raises(InvalidUpload, match=re.escape(told)):
+        read_recording(**{"source": ROWS.encode(), **arguments})
 
 
 def test_every_kind_comes_through_the_child_with_its_clock(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from datetime import UTC, timedelta
 
 import numpy as np
 import pandas as pd
+import polars
 import pytest
 import xarray as xr
 
@@ -153,7 +154,6 @@ def test_a_table_is_a_recording(table: object) -> None:
 
 
 def test_a_table_of_polars_is_a_recording() -> None:
-    polars = pytest.importorskip("polars")
     table = polars.DataFrame({"when": DATES, "P1 [bar]": [1.0, None, 3.0, 4.0]})
     recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
     [channel] = recording.channels

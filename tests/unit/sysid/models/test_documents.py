@@ -315,6 +315,11 @@ def test_a_tab_that_indents_is_called_that() -> None:
         parse_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")
 
 
+def test_a_unit_of_percent_without_quotes_is_told_to_need_them() -> None:
+    with pytest.raises(InvalidModel, match="put a text that begins with it in quotes"):
+        parse_yaml("inputs: {u: %}\n")
+
+
 @pytest.mark.parametrize("part", ["equations", "outputs", "initial"])
 def test_all_expressions_of_a_model_count_together(part: str) -> None:
     """Each is within the limits of one expression, but all are compiled into one kernel."""

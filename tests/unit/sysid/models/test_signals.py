@@ -57,6 +57,13 @@ def test_a_signal_without_a_channel_is_told_with_all_channels() -> None:
         assign_channels(MODEL, ["P1", "P2", "P3"])
     with pytest.raises(InvalidRecord, match="'y': …"):
         assign_channels(MODEL, ["u"])
+    with pytest.raises(InvalidRecord, match="the recording has no channels"):
+        assign_channels(MODEL, [])
+
+
+def test_a_mapping_is_turned_only_if_both_names_exist() -> None:
+    with pytest.raises(InvalidSettings, match="known are u, y"):
+        assign_channels(MODEL, ["P1"], {"q": "u"})
 
 
 @pytest.mark.parametrize(

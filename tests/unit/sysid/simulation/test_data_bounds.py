@@ -50,6 +50,40 @@ def test_bounds_contain_the_plant_in_any_units(gain: float, offset: float) -> No
     assert found["K"].upper < 200 * abs(gain)
 
 
+@pytest.mark.parametrize(
+    ("model", "u", "y", "units"),
+    [
+        ("fopdt", "%", "°C", {"K": "°C/%", "T": "s", "L": "s", "y0": "°C", "x(0)": "°C"}),
+        ("sopdt", "N·s", "l/min", {"K": "(l/min)/(N·s)", "r": "1", "x(0)": "l/min"}),
+        ("ipdt", "%", "m", {"K": "m/(%·s)", "y(0)": "m"}),
+        ("ipdt", "V", "V", {"K": "1/s"}),
+        ("fopdt", "V", "V", {"K": "1", "y0": "V"}),
+        ("fopdt", "1", "°C", {"K": "1", "y0": "°C"}),
+        ("fopdt", "%", "1", {"K": "1", "y0": "1"}),
+    ],
+)
+def test_generic_parameters_have_the_units_of_the_channels(
+    model: str, u: str, y: str, units: dict[str, str]
+) -> None:
+    plain = make_record()
+    sides = ((plain.inputs, u), (plain.outputs, y))
+    record = Record(*(tuple(replace(c, unit=unit) for c in side) for side, unit in sides))
+    for records in ([record], [plain, record]):  # a record without units says nothing
+        problem = Problem.build(load_model(model), records)
+        parameters = {parameter.name: parameter.unit for parameter in problem.all_parameters}
+        assert parameters == parameters | units
+
+
+def test_a_declared_unit_is_kept() -> None:
+    document = copy_catalogue_document("fopdt")
+    document["parameters"]["K"]["unit"] = "K/%"
+    del document["parameters"]["y0"]["bounds"]
+    record = Record((Channel("u", TIMES, U, unit="%"),), (Channel("y", TIMES, 2.0 * U, unit="°C"),))
+    problem = Problem.build(load_model(document), [record])
+    units = {parameter.name: parameter.unit for parameter in problem.all_parameters}
+    assert (units["K"], units["y0"]) == ("K/%", "1")
+
+
 def test_times_follow_period_and_duration() -> None:
     found, duration = find_bounds(make_record()), float(TIMES[-1])
     assert (found["L"].lower, found["L"].upper) == (0.0, duration / 2)
