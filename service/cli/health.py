@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import out
+from service.cli.common import AsJson, out, print_json
 from service.cli.server import load_settings, open_database
 from service.core.errors import Unavailable
 
@@ -32,6 +32,7 @@ def check_health(
     part: Annotated[Part, typer.Argument(help="Process that should run here.")],
     host: Annotated[str | None, typer.Option(help="Host of the web process.")] = None,
     port: Annotated[int | None, typer.Option(help="Port of the web process.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Check that a process of the service runs on this machine; exit code 1 if not.
 
@@ -45,7 +46,10 @@ def check_health(
             found = _check_dispatcher(settings)
         case Part.RAY:
             found = _check_ray(Path(os.environ.get("RAY_TMPDIR", "/tmp")) / RAY_SOCKET)
-    out.print(found, markup=False, soft_wrap=True)
+    if as_json:
+        print_json({"part": part.value, "detail": found})
+    else:
+        out.print(found, markup=False, soft_wrap=True)
 
 
 def _check_web(settings: "Settings") -> str:

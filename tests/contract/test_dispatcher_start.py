@@ -1,5 +1,6 @@
 """The start of a dispatcher as seen from outside: heartbeat, health command, metrics port."""
 
+import json
 import re
 import socket
 from collections.abc import Iterator
@@ -105,7 +106,8 @@ def test_the_health_of_ray_is_its_socket() -> None:
         with socket.socket(socket.AF_UNIX) as raylet:
             raylet.bind(str(path))
             raylet.listen()
-            assert run_lagid("health", "ray", **words).code == 0
+            found = run_lagid("health", "ray", "--json", **words)
+            assert json.loads(found.stdout) == {"part": "ray", "detail": f"Ray answers at {path}"}
 
 
 def test_a_dispatcher_answers_prometheus_at_its_port_and_works_on_without_it(
