@@ -10,7 +10,7 @@ TEST_PROCESSES ?= 3
 export MYPY_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/lagid/mypy
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format docs bench bench-full mutants night real-data clean
+.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format docs openapi bench bench-full mutants night real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -20,6 +20,7 @@ help:
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
 	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
 	@echo "make docs        write the pages that the program makes: docs/settings.md"
+	@echo "make openapi     write docs/openapi.json and the client's types after a change of the interface"
 	@echo "make mutants     the gate's tests against faults made by hand, about an hour"
 	@echo "make night       all long tests with new seeds, mutants, robustness, torture: hours, one table"
 
@@ -101,6 +102,10 @@ bench-full: $(READY)
 	@mkdir -p $(RESULTS)
 	@for name in $(FULL); do rm -f $(RESULTS)/$$name.*; $(BIN)/python -m benchmarks.$$name --json $(RESULTS)/$$name.json; done
 	@$(BIN)/python -m benchmarks.collect $(RESULTS) $(FULL)
+
+# The contract of the interface, after a change of it: OpenAPI document and types of the client.
+openapi: $(READY)
+	$(BIN)/python -m service.api.write_contract .
 
 mutants: $(READY)
 	$(BIN)/python -m tests.mutants -j 2

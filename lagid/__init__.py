@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         NotFinite,
         ProblemError,
         ServerUnreachable,
+        WaitTimeout,
     )
     from service.formats.recordings import read_recording
     from sysid import (
@@ -79,6 +80,7 @@ __all__ = [
     "ServerUnreachable",
     "Stop",
     "SysidError",
+    "WaitTimeout",
     "catalogue",
     "export_model",
     "identify",
@@ -149,7 +151,10 @@ from sysid.core.lazy_names import load_on_first_use  # noqa: E402  # `sysid` is 
 
 _OTHER_MODULES = {
     **dict.fromkeys(
-        ("AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"),
+        (
+            *("AsyncClient", "Client", "ClientError"),
+            *("NotFinite", "ProblemError", "ServerUnreachable", "WaitTimeout"),
+        ),
         "service.client",
     ),
     "read_recording": "service.formats.recordings",

@@ -25,7 +25,7 @@ def write_page() -> str:
 
 def format_default(name: str, value: Any) -> str:
     """Write a default as a user would set it; bytes with their unit."""
-    if value is None or value == ():
+    if value in (None, (), ""):
         return "none"
     if name.endswith("_bytes"):
         size, unit = next((value // size, unit) for size, unit in UNITS if value % size == 0)

@@ -4,12 +4,14 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 
 from service.api import (
     datasets,
     events,
+    figures,
     health,
     jobs,
     models,
@@ -19,11 +21,14 @@ from service.api import (
     references,
     runs,
 )
+from service.api.content import MCAP_TYPE
 from service.api.dependencies import Parts
 from service.api.html import PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
-from service.api.openapi import DocumentedApp
+from service.api.openapi import DocumentedApp, get_route_name
+from service.api.query_names import check_query_names
 from service.api.request_log import RequestLog
+from service.api.root_path import RootPath
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
@@ -47,6 +52,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=version("lagid"),
         description=DESCRIPTION,
         lifespan=_build_lifespan(chosen),
+        dependencies=[Depends(check_query_names)],
+        generate_unique_id_function=get_route_name,
         separate_input_output_schemas=False,
         docs_url=None,  # FastAPI's own page loads its scripts from elsewhere; ours is at /docs
         redoc_url=None,
@@ -55,6 +62,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
     app.add_middleware(OriginCheck, settings=chosen)
     app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)
+    app.add_middleware(
+        GZipMiddleware,
+        minimum_size=1000,
+        compresslevel=4,
+        exclude_content_types=(*DEFAULT_EXCLUDED_CONTENT_TYPES, MCAP_TYPE),
+    )
+    app.add_middleware(RootPath, default=chosen.root_path)
     app.add_middleware(RequestLog)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
@@ -67,6 +81,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         events.router,
         runs.comparison_router,
         runs.router,
+        figures.router,
         pages.router,
     ):
         app.include_router(router)

@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Message, Receive
@@ -35,7 +36,7 @@ from service.core.settings import Settings
 from service.core.text_checks import parse_digits
 from service.datasets.datasets import check_upload_size
 
-MCAP_TYPE = "application/x-mcap"
+MCAP_TYPE, FILE_TYPE = "application/x-mcap", "application/octet-stream"
 # Foxglove and others read from a page of another origin; an id cannot be guessed.
 CROSS_ORIGIN = {
     "Access-Control-Allow-Origin": "*",
@@ -43,7 +44,10 @@ CROSS_ORIGIN = {
     "Cross-Origin-Resource-Policy": "cross-origin",
 }
 FILE_ANSWERS: dict[int | str, dict[str, Any]] = {
-    206: {"description": "The requested range of bytes"},
+    206: {
+        "description": "The requested range of bytes",
+        "content": {MCAP_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+    },
     304: {"description": "The content is what the request's ETag names"},
 }
 """Further statuses of an answer with a file, for the OpenAPI document."""
@@ -281,13 +285,27 @@ async def _take_place(places: asyncio.Semaphore) -> AsyncIterator[None]:
 
 
 async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:
-    async with request.form(max_files=1, max_fields=20) as form:
+    async with _read_form(request) as form:
         file = next((value for value in form.values() if isinstance(value, UploadFile)), None)
         if file is None or not file.filename:
             raise InvalidRequest.from_fault("/file", "the form has no file; need one recording")
         digest = await _save_body(_read_pieces(file), path, settings)
         name = Path(file.filename)
         return Upload(path, digest, _find_stem(name), name.suffix)
+
+
+@asynccontextmanager
+async def _read_form(request: Request) -> AsyncIterator[FormData]:
+    try:
+        form = await request.form(max_files=1, max_fields=20)
+    except HTTPException as error:
+        raise InvalidRequest.from_fault(
+            "", f"the form cannot be read: {error.detail} Need multipart/form-data with one file"
+        ) from None
+    try:
+        yield form
+    finally:
+        await form.close()
 
 
 async def _read_pieces(file: UploadFile) -> AsyncIterator[bytes]:

@@ -18,10 +18,17 @@ from service.api.content import (
     receive_upload,
 )
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
-from service.core.wire import Page
+from service.core.root_path import to_address
 from service.datasets import datasets, simulated
 from service.datasets.recordings import load_recording
-from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
+from service.datasets.schemas import (
+    DatasetOut,
+    DatasetPage,
+    DeriveIn,
+    LineageOut,
+    SignalsOut,
+    SimulateIn,
+)
 from service.formats.csv_recordings import generate_csv
 from service.repositories.datasets import DatasetRepository, StoredDataset
 
@@ -33,7 +40,6 @@ UPLOAD_BODY: dict[str, Any] = {
         "content": {
             "text/csv": {"schema": {"type": "string"}},
             "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-            "application/x-mcap": {"schema": {"type": "string", "format": "binary"}},
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
@@ -44,7 +50,12 @@ UPLOAD_BODY: dict[str, Any] = {
         },
     }
 }
-Name = Annotated[str | None, Query(max_length=200)]
+EXISTING_DATASET: dict[int | str, dict[str, Any]] = {
+    200: {"model": DatasetOut, "description": "The same data are stored already"}
+}
+Name = Annotated[
+    str | None, Query(max_length=200, description="name of the dataset; by default the file's")
+]
 Segments = Annotated[
     str | None,
     Query(description="label columns, separated by commas; each combination is a segment"),
@@ -54,7 +65,7 @@ SampleTime = Annotated[
 ]
 
 
-@router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY)
+@router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY, responses=EXISTING_DATASET)
 async def add_dataset(
     request: Request,
     response: Response,
@@ -82,7 +93,7 @@ async def add_dataset(
     return _dataset_response(stored, response, name)
 
 
-@router.post("/datasets:simulate", status_code=201)
+@router.post("/datasets:simulate", status_code=201, responses=EXISTING_DATASET)
 def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Simulate a dataset from a model, its true parameters, inputs and noise."""
     return _dataset_response(
@@ -90,7 +101,7 @@ def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> D
     )
 
 
-@router.post("/datasets/{dataset_id}:derive", status_code=201)
+@router.post("/datasets/{dataset_id}:derive", status_code=201, responses=EXISTING_DATASET)
 def derive_dataset(
     dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
 ) -> DatasetOut:
@@ -100,9 +111,7 @@ def derive_dataset(
 
 
 @router.get("/datasets")
-def list_datasets(
-    session: ReadSession, cursor: Cursor = None, limit: Limit = 50
-) -> Page[DatasetOut]:
+def list_datasets(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> DatasetPage:
     """List datasets, latest first."""
     return datasets.list_datasets(session, cursor, limit)
 
@@ -155,7 +164,7 @@ def read_content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> 
 def _dataset_response(
     stored: StoredDataset, response: Response, name: str | None = None
 ) -> DatasetOut:
-    response.headers["Location"] = f"/v1/datasets/{stored.dataset.id}"
+    response.headers["Location"] = to_address(f"/v1/datasets/{stored.dataset.id}")
     if not stored.is_new:
         response.status_code = 200
     return datasets.to_stored_out(stored, name)

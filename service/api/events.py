@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header
 from fastapi.responses import Response, StreamingResponse
@@ -45,9 +45,17 @@ class EventStreamResponse(StreamingResponse):
             await super().__call__(scope, receive, send)
 
 
-@router.get("/{job_id}/events", response_class=EventStreamResponse)
+ENDED: dict[int | str, dict[str, Any]] = {
+    204: {"description": "The job has ended, and there is no further event"}
+}
+LastEventId = Annotated[
+    str | None, Header(description="id of the last event that was received; then the next follow")
+]
+
+
+@router.get("/{job_id}/events", response_class=EventStreamResponse, responses=ENDED)
 async def stream_events(
-    job_id: str, parts: PartsDep, last_event_id: Annotated[str | None, Header()] = None
+    job_id: str, parts: PartsDep, last_event_id: LastEventId = None
 ) -> Response:
     """Stream events as they happen: state, progress, log, end. Continues after `Last-Event-ID`."""
     last = _parse_event_id(last_event_id)

@@ -1,15 +1,18 @@
 """Routes for health checks and Prometheus metrics."""
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import Literal
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse, Response
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.api.dependencies import Parts, PartsDep
 from service.api.queue_metrics import write_metrics
 from service.core.errors import FieldError, Unavailable
+from service.core.wire import Answer
 from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.storage import migrate
 from service.storage.errors import StorageError
@@ -39,23 +42,40 @@ PROBLEM_KINDS = {
 }
 
 
+class HealthOut(Answer):
+    """The web process answers."""
+
+    status: Literal["ok"] = Field(default="ok", description="always ok: else there is no answer")
+
+
+class ReadyOut(Answer):
+    """Every part of the service works."""
+
+    database: Literal["ok"] = Field(default="ok", description="its tables are of this version")
+    store: Literal["ok"] = Field(default="ok", description="objects can be written")
+    dispatcher: Literal["ok"] = Field(default="ok", description="at least one claims jobs")
+
+
+@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz")
-def check_alive() -> dict[str, str]:
+def check_alive() -> HealthOut:
     """Confirm that the web process answers."""
-    return {"status": "ok"}
+    return HealthOut()
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz")
-def check_ready(parts: PartsDep) -> dict[str, str]:
+def check_ready(parts: PartsDep) -> ReadyOut:
     """Check that the database is at head, the store writable, and a dispatcher alive; else 503."""
     checks = {"database": _check_database, "store": _check_store, "dispatcher": _check_dispatcher}
     failures = list(_collect_failures(parts, checks))
     if failures:
         detail = "; ".join(failure.detail for failure in failures)
         raise Unavailable(detail, failures)
-    return dict.fromkeys(checks, "ok")
+    return ReadyOut()
 
 
+@router.head("/metrics", include_in_schema=False, response_class=PlainTextResponse)
 @router.get("/metrics", response_class=PlainTextResponse)
 def read_metrics(parts: PartsDep) -> Response:
     """Read this process's numbers and those of the queue, in Prometheus' text format."""

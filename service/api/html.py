@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from fastapi import Request
 from fastapi.responses import HTMLResponse
 
+from service.api.root_path import get_service_path
 from service.core.errors import FieldError
 from service.pages.render import render_template
 
@@ -40,7 +41,8 @@ class HtmlPage(HTMLResponse):
 def wants_html(request: Request) -> bool:
     """Whether a browser requests a page; an error is then shown as a page."""
     accepted = request.headers.get("accept", "")
-    is_page = request.method in ("GET", "HEAD") and not request.url.path.startswith(PROGRAM_PATHS)
+    path = get_service_path(request.scope)
+    is_page = request.method in ("GET", "HEAD") and not path.startswith(PROGRAM_PATHS)
     return is_page and "text/html" in accepted
 
 

@@ -7,15 +7,15 @@ from fastapi import APIRouter, Header, Query, Response, status
 from service.api.bodies import JsonRoute
 from service.api.content import CsvResponse
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.core.root_path import to_address
 from service.core.states import JobState
-from service.core.wire import Page
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs import submit
-from service.jobs.schemas import JobIn, JobOut
+from service.jobs.schemas import JobIn, JobOut, JobPage
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunOrder
 from service.runs import runs
-from service.runs.schemas import RunOut
+from service.runs.schemas import RunPage
 from service.sweeps import summary, table
 from service.sweeps.schemas import SummaryOut
 from service.trends import trend
@@ -33,6 +33,9 @@ CellFilter = Annotated[
     list[str] | None,
     Query(description="`/noise/sigma=0.1` selects the cells with that value; may be repeated"),
 ]
+RunCursor = Annotated[str | None, Query(max_length=200, description="`next` of the previous page")]
+Order = Annotated[RunOrder, Query(description="column to sort by; runs without a value come last")]
+Descending = Annotated[bool, Query(description="whether the largest value comes first")]
 
 
 @router.post("", status_code=status.HTTP_202_ACCEPTED)
@@ -48,13 +51,13 @@ def submit_job(
     as queued, and have no page and no identifier.
     """
     job = submit.submit_job(parts.database, body, parts.settings, idempotency_key)
-    return _set_location(job, response)
+    return set_location(job, response)
 
 
 @router.get("")
 def list_jobs(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: StatesFilter = None
-) -> Page[JobOut]:
+) -> JobPage:
     """List jobs, latest first."""
     return submit.list_jobs(session, cursor, limit, state or [])
 
@@ -75,7 +78,7 @@ def cancel_job(job_id: str, session: WriteSession) -> JobOut:
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
 def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
     """Queue a failed or cancelled job again; it continues from its last checkpoints."""
-    return _set_location(
+    return set_location(
         submit.to_job_out(submit.resume_job(session, job_id, parts.settings)), response
     )
 
@@ -83,7 +86,7 @@ def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Re
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
 def clone_job(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     """Queue the same request as a new job."""
-    return _set_location(submit.clone_job(parts.database, job_id, parts.settings), response)
+    return set_location(submit.clone_job(parts.database, job_id, parts.settings), response)
 
 
 @router.get("/{job_id}/runs.csv", response_class=CsvResponse)
@@ -98,14 +101,14 @@ def export_runs_csv(job_id: str, parts: PartsDep) -> CsvResponse:
 def list_runs(
     job_id: str,
     session: ReadSession,
-    cursor: Annotated[str | None, Query(max_length=200)] = None,
+    cursor: RunCursor = None,
     limit: Limit = 50,
     state: StatesFilter = None,
     cell: CellFilter = None,
     label: CellFilter = None,
-    order: RunOrder = "number",
-    descending: bool = False,
-) -> Page[RunOut]:
+    order: Order = "number",
+    descending: Descending = False,
+) -> RunPage:
     """List the runs of a job that exist already; filter by axis values, labels or state."""
     choice = runs.RunQuery(state or [], cell or [], label or [], order, descending)
     return runs.list_runs(session, job_id, cursor, limit, choice)
@@ -132,6 +135,7 @@ def read_trend(job_id: str, session: ReadSession) -> TrendOut:
     return trend.compute_trend(session, job_id)
 
 
-def _set_location(job: JobOut, response: Response) -> JobOut:
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
+def set_location(job: JobOut, response: Response) -> JobOut:
+    """Name the address of a new job in the head of its answer."""
+    response.headers["Location"] = to_address(f"/v1/jobs/{job.id}")
     return job

@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.problems import error_response
+from service.api.root_path import get_service_path
 from service.core.errors import ForeignOrigin, MisdirectedRequest, TooLarge
 from service.core.settings import Settings
 from service.core.text_checks import parse_digits
@@ -31,7 +32,7 @@ class BodyLimit:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on and count the bytes of its body."""
-        if scope["type"] != "http" or (scope["method"], scope["path"]) == UPLOAD_ROUTE:
+        if scope["type"] != "http" or (scope["method"], get_service_path(scope)) == UPLOAD_ROUTE:
             await self._app(scope, receive, send)
         else:
             await self._app(scope, self._limit_receive(scope, receive), send)

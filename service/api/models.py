@@ -1,17 +1,18 @@
 """Routes of models."""
 
 from typing import Any
+from urllib.parse import quote
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.bodies import check_counts, check_shape
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
 from service.core.documents import MAX_DOCUMENT_BYTES, parse_json, parse_yaml
 from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
-from service.core.wire import Page
+from service.core.root_path import to_address
 from service.models import catalogue, models
-from service.models.schemas import CheckOut, ModelOut
+from service.models.schemas import CheckOut, ModelOut, ModelPage
 
 router = APIRouter(prefix="/v1", tags=["models"])
 
@@ -29,7 +30,7 @@ DOCUMENT_BODY: dict[str, Any] = {
 
 
 @router.get("/models")
-def list_models(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[ModelOut]:
+def list_models(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> ModelPage:
     """List models: built-in ones, then your own."""
     return models.list_models(session, cursor, limit)
 
@@ -41,7 +42,7 @@ def read_model(name: str, session: ReadSession) -> ModelOut:
 
 
 @router.post("/models", status_code=201, openapi_extra=DOCUMENT_BODY)
-async def add_model(request: Request, parts: PartsDep) -> ModelOut:
+async def add_model(request: Request, response: Response, parts: PartsDep) -> ModelOut:
     """Store your own model; a changed document becomes the next version of its name."""
     document = await _read_document(request)
     if not isinstance(document, dict):
@@ -51,7 +52,10 @@ async def add_model(request: Request, parts: PartsDep) -> ModelOut:
         with parts.database.write_session() as session:
             return models.add_model(session, document)
 
-    return await run_in_threadpool(store)
+    model = await run_in_threadpool(store)
+    name = quote(f"{model.name}@{model.version}", safe="@")
+    response.headers["Location"] = to_address(f"/v1/models/{name}")
+    return model
 
 
 @router.post("/models:check", openapi_extra=DOCUMENT_BODY)

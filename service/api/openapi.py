@@ -1,17 +1,24 @@
-"""Errors in the OpenAPI document: each operation has the statuses that its kind can answer.
+"""The OpenAPI document: errors, files, headers and examples of each operation.
 
 What can go wrong follows from the shape of an operation: its method, body, parameters and content.
-So no route lists its errors, and a new route has them all.
+So no route lists its errors, and a new route has them all. The same holds for what is sent besides
+JSON, and for headers. Examples are in `service.api.examples`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from http import HTTPStatus
+from threading import Lock
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.routing import APIRoute
+from pydantic import Field
 
+from service.api import examples
+from service.api.content import FILE_TYPE, MCAP_TYPE
 from service.api.problems import PROBLEM_TYPE
 from service.core import errors
-from service.core.errors import ServiceError
+from service.core.errors import InvalidRequest, ServiceError
 from service.core.wire import Answer, FaultOut
 
 Operation = Mapping[str, Any]
@@ -19,19 +26,21 @@ _Rule = Callable[[str, Operation], bool]
 _SAFE_METHODS = ("get", "head", "options")
 _FASTAPI_SCHEMAS = ("HTTPValidationError", "ValidationError")
 _PROBLEM_SCHEMA = "ProblemOut"
-_BINARY_TYPE = "application/x-mcap"
+_BINARY = {"type": "string", "format": "binary"}
+_SUCCESS = "Successful Response"
+"""FastAPI's description of an answer that has no other."""
 
 
 class ProblemOut(Answer):
-    """A problem document (RFC 9457). `type` is a path of the service that explains it."""
+    """A problem document (RFC 9457)."""
 
-    type: str
-    title: str
-    status: int
-    detail: str
-    instance: str
-    request_id: str
-    errors: tuple[FaultOut, ...] = ()
+    type: str = Field(description="path of the service that explains this kind of problem")
+    title: str = Field(description="kind of the problem in words")
+    status: int = Field(description="HTTP status of the answer")
+    detail: str = Field(description="what was wrong, what was found, and what would be right")
+    instance: str = Field(description="path of the request")
+    request_id: str = Field(description="id of the request, as in `X-Request-ID` and in the log")
+    errors: tuple[FaultOut, ...] = Field(default=(), description="every fault of the request")
 
 
 def _is_any(_method: str, _operation: Operation) -> bool:
@@ -47,19 +56,15 @@ def _has_body(_method: str, operation: Operation) -> bool:
 
 
 def _has_file(_method: str, operation: Operation) -> bool:
-    return _BINARY_TYPE in operation.get("requestBody", {}).get("content", {})
+    return FILE_TYPE in operation.get("requestBody", {}).get("content", {})
 
 
 def _gives_file(_method: str, operation: Operation) -> bool:
-    return any(_BINARY_TYPE in response.get("content", {}) for response in _answers(operation))
+    return any(MCAP_TYPE in response.get("content", {}) for response in _answers(operation))
 
 
 def _creates_job(_method: str, operation: Operation) -> bool:
     return "202" in operation["responses"]
-
-
-def _has_input(method: str, operation: Operation) -> bool:
-    return _has_body(method, operation) or bool(operation.get("parameters"))
 
 
 def _names_resource(method: str, operation: Operation) -> bool:
@@ -82,26 +87,56 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.UnsupportedMediaType, _has_body),
     (errors.UnsatisfiableRange, _gives_file),
     (errors.MisdirectedRequest, _is_any),
-    (errors.InvalidRequest, _has_input),
+    (errors.InvalidRequest, _is_any),  # each refuses unknown names in its query
     (errors.QuotaExceeded, _creates_job),
     (errors.Unavailable, _is_any),
 )
 """Each error, and which operations may answer with it."""
 
+HEADERS: Mapping[int, tuple[str, str]] = {
+    HTTPStatus.CREATED: ("Location", "path of what was stored"),
+    HTTPStatus.ACCEPTED: ("Location", "path of the job"),
+    HTTPStatus.TOO_MANY_REQUESTS: ("Retry-After", "when to try again, s"),
+    HTTPStatus.SERVICE_UNAVAILABLE: ("Retry-After", "when to try again, s"),
+}
+"""Header that each answer of a status has, with its meaning."""
+
+
+def get_route_name(route: APIRoute) -> str:
+    """Return the identifier of an operation: the name of its function, short and stable."""
+    return route.name
+
 
 class DocumentedApp(FastAPI):
-    """An application whose OpenAPI document has its errors."""
+    """An application whose OpenAPI document is the contract that it keeps."""
+
+    _lock = Lock()
 
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document."""
-        if self.openapi_schema is None:
-            document = super().openapi()
-            _add_problem_schema(document["components"]["schemas"])
-            for methods in document["paths"].values():
-                for method, operation in methods.items():
-                    _add_errors(method, operation)
+        """Return the OpenAPI document, which is built once."""
+        with self._lock:  # FastAPI publishes it before it is complete
+            if self.openapi_schema is None:
+                _complete_document(super().openapi())
         assert self.openapi_schema is not None
         return self.openapi_schema
+
+
+def _complete_document(document: dict[str, Any]) -> None:
+    """Add what FastAPI does not know to a document."""
+    _add_problem_schema(document["components"]["schemas"])
+    document["components"]["responses"] = _build_problem_answers()
+    for method, operation in list_operations(document):
+        operation["responses"].pop(str(InvalidRequest.status), None)  # FastAPI's own
+        _describe_answers(operation)
+        _describe_parameters(operation)
+        _add_examples(operation)
+        _add_errors(method, operation)
+
+
+def list_operations(document: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield method and operation of each operation of an OpenAPI document."""
+    for methods in document["paths"].values():
+        yield from methods.items()
 
 
 def _add_problem_schema(schemas: dict[str, Any]) -> None:
@@ -111,13 +146,58 @@ def _add_problem_schema(schemas: dict[str, Any]) -> None:
     schemas |= {**schema.pop("$defs"), _PROBLEM_SCHEMA: schema}
 
 
-def _add_errors(method: str, operation: dict[str, Any]) -> None:
+def _build_problem_answers() -> dict[str, Any]:
+    """Build the answer of each error, which all operations share."""
     reference = {"$ref": f"#/components/schemas/{_PROBLEM_SCHEMA}"}
+    answers: dict[str, Any] = {}
+    for error, _ in RULES:
+        example = {
+            "type": f"/problems/{error.kind}",
+            "title": error.title,
+            "status": error.status,
+            "detail": error.title,
+            "instance": "/v1/jobs",
+        }
+        content = {PROBLEM_TYPE: {"schema": reference, "example": example}}
+        answers[error.__name__] = {"description": error.title, "content": content}
+        answers[error.__name__] |= _describe_headers(error.status)
+    return answers
+
+
+def _add_errors(method: str, operation: dict[str, Any]) -> None:
     for error, applies in RULES:
-        code = str(error.status)
-        operation["responses"].pop(code, None)  # FastAPI's own 422 has another form
         if applies(method, operation):
-            operation["responses"][code] = {
-                "description": error.title,
-                "content": {PROBLEM_TYPE: {"schema": reference}},
-            }
+            reference = {"$ref": f"#/components/responses/{error.__name__}"}
+            operation["responses"][str(error.status)] = reference
+
+
+def _describe_headers(status: int) -> dict[str, Any]:
+    if status not in HEADERS:
+        return {}
+    name, meaning = HEADERS[status]
+    return {"headers": {name: {"description": meaning, "schema": {"type": "string"}}}}
+
+
+def _describe_answers(operation: dict[str, Any]) -> None:
+    """Describe what the function says of its answer, with headers and files."""
+    for code, answer in operation["responses"].items():
+        if answer["description"] == _SUCCESS:
+            answer["description"] = operation["summary"]
+        if MCAP_TYPE in answer.get("content", {}):
+            answer["content"][MCAP_TYPE]["schema"] = _BINARY
+        answer |= _describe_headers(int(code))
+
+
+def _describe_parameters(operation: dict[str, Any]) -> None:
+    for parameter in operation.get("parameters", ()):
+        name = parameter["name"]
+        known = examples.PARAMETERS.get(name)
+        if name == "name" and parameter["in"] == "path":
+            known = examples.NAMES.get(operation["operationId"])
+        if known is not None:
+            parameter["description"], parameter["example"] = known
+
+
+def _add_examples(operation: dict[str, Any]) -> None:
+    for kind, example in examples.BODIES.get(operation["operationId"], {}).items():
+        operation["requestBody"]["content"][kind]["example"] = example

@@ -1,23 +1,19 @@
-"""Routes of the pages, of their figures, and of the files that they load."""
+"""Routes of the pages, and of the files that they load."""
 
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
 
 from service.api.dependencies import Cursor, PartsDep, ReadSession
+from service.api.figures import csv_response
 from service.api.html import HtmlPage
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.states import JobState
-from service.figures.csv import to_csv
-from service.pages import figures as results
-from service.pages import pages, report
+from service.pages import pages
 from service.pages import render as assets
-from service.pages.figures import FigureChoice
 from service.pages.simulate import simulate_page as simulate
-from sysid.figures.plotly import Figure, apply_theme
-from sysid.identification.figures import FigureName
 
 router = APIRouter()
 
@@ -26,7 +22,6 @@ CACHE_FOREVER = "public, max-age=31536000, immutable"
 
 HIDDEN: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
 StateFilter = Annotated[JobState | None, Query()]
-FigureQuery = Annotated[FigureChoice, Query()]
 ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
 
 
@@ -79,7 +74,7 @@ def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
     query = dict(request.query_params)
     answer = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
     if answer.is_csv:
-        return _csv_response(answer.text, "simulation")
+        return csv_response(answer.text, "simulation")
     return HtmlPage(answer.text, answer.status)
 
 
@@ -125,59 +120,6 @@ def static_file(name: str, request: Request) -> Response:
     if asset.etag in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
     return Response(asset.content, media_type=asset.media_type, headers=headers)
-
-
-@router.get("/v1/runs/{run_id}/figures/{name}", tags=["runs"], response_class=JSONResponse)
-def run_figure(
-    run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: FigureQuery
-) -> Response:
-    """Draw a figure of a run as Plotly JSON, or export its numbers as CSV."""
-    return _figure_response(
-        results.load_run_figure(session, parts.store, run_id, name, choice), name, choice
-    )
-
-
-@router.get("/v1/jobs/{job_id}/figures/summary", tags=["jobs"], response_class=JSONResponse)
-def job_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
-    """Draw errors against the noise (Figure 15) as Plotly JSON, or export the numbers as CSV."""
-    return _figure_response(results.load_noise_figure(session, job_id, choice), "summary", choice)
-
-
-@router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], response_class=JSONResponse)
-def trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
-    """Draw estimates over a batch's label as Plotly JSON, or export the numbers as CSV."""
-    return _figure_response(results.load_trend_figure(session, job_id, choice), "trend", choice)
-
-
-@router.get(
-    "/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"], response_class=JSONResponse
-)
-def dataset_figure(
-    dataset_id: str, parts: PartsDep, session: ReadSession, choice: FigureQuery
-) -> Response:
-    """Draw the signals of a dataset as Plotly JSON, or export the numbers as CSV."""
-    figure = results.load_dataset_figure(session, parts.store, dataset_id, choice)
-    return _figure_response(figure, "signals", choice)
-
-
-@router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
-def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSession) -> Response:
-    """Export the job as one HTML file that needs no server: tables, figures, the exact request."""
-    text = report.render_job_report(session, parts.store, job_id, str(request.base_url))
-    # A file cannot say who may frame it: this directive works in a header only.
-    policy = f"{assets.security_policy()}; frame-ancestors 'none'"
-    return HTMLResponse(text, headers={"Content-Security-Policy": policy})
-
-
-def _figure_response(figure: Figure, name: str, choice: FigureChoice) -> Response:
-    if choice.format == "csv":
-        return _csv_response(to_csv(figure), name)
-    return JSONResponse(apply_theme(figure, choice.theme))
-
-
-def _csv_response(text: str, name: str) -> Response:
-    disposition = {"Content-Disposition": f'attachment; filename="{name}.csv"'}
-    return Response(text, media_type="text/csv", headers=disposition)
 
 
 def _plotly_response(request: Request) -> Response:

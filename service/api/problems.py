@@ -24,10 +24,11 @@ from service.core.errors import (
     UnsupportedMediaType,
     to_field_errors,
 )
+from service.core.root_path import to_address
 from service.core.temporary_files import FULL_DISK_ERRORS, FULL_DISK_MESSAGE
 from service.core.text_checks import LONE_SURROGATE
 from service.core.validation import describe_error, explain_errors, find_body_type
-from service.storage.errors import StorageError
+from service.storage.errors import InvalidCursor, StorageError
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 from sysid.core.errors import SysidError
 
@@ -68,7 +69,7 @@ def problem_response(
     if wants_html(request):
         return error_page(status, title, detail, errors, headers or {})
     content: dict[str, Any] = {
-        "type": f"/problems/{kind}",
+        "type": to_address(f"/problems/{kind}"),
         "title": title,
         "status": status,
         "detail": _shorten(detail, MAX_TOTAL_CHARACTERS if errors else MAX_DETAIL_CHARACTERS),
@@ -134,6 +135,8 @@ def _handle_storage_error(request: Request, error: Exception) -> Response:
         log.error("%s %s: %s", request.method, request.url.path, error)
     if error.status == Unavailable.status:
         return error_response(request, Unavailable(str(error)))
+    if isinstance(error, InvalidCursor):
+        return error_response(request, InvalidRequest.from_fault("?cursor", str(error)))
     kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     return problem_response(request, error.status, kind, title, str(error))
 

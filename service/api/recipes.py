@@ -4,7 +4,7 @@ from fastapi import APIRouter, Response, status
 
 from service.api.bodies import JsonRoute
 from service.api.dependencies import PartsDep
-from service.api.jobs import IdempotencyKeyHeader
+from service.api.jobs import IdempotencyKeyHeader, set_location
 from service.jobs.schemas import JobOut
 from service.sweeps import noise, reidentify
 from service.sweeps.schemas import NoiseSweepIn, ReidentifyIn
@@ -23,8 +23,7 @@ def submit_noise_sweep(
     job = noise.submit_noise_sweep(
         parts.database, parts.store, parts.settings, body, idempotency_key
     )
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return job
+    return set_location(job, response)
 
 
 @recipe_router.post("/reidentify", status_code=status.HTTP_202_ACCEPTED)
@@ -36,5 +35,4 @@ def submit_reidentification(
 ) -> JobOut:
     """Queue a warm-started run for each value of a label, with a trend over the label."""
     job = reidentify.submit_reidentification(parts.database, body, parts.settings, idempotency_key)
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return job
+    return set_location(job, response)

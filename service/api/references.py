@@ -4,9 +4,8 @@ from fastapi import APIRouter
 
 from service.api.bodies import JsonRoute
 from service.api.dependencies import Cursor, Limit, ReadSession, WriteSession
-from service.core.wire import Page
 from service.jobs import references
-from service.jobs.schemas import ReferenceIn, ReferenceOut
+from service.jobs.schemas import ReferenceIn, ReferenceOut, ReferencePage
 
 reference_router = APIRouter(prefix="/v1/references", tags=["references"], route_class=JsonRoute)
 
@@ -14,7 +13,7 @@ reference_router = APIRouter(prefix="/v1/references", tags=["references"], route
 @reference_router.get("")
 def list_references(
     session: ReadSession, cursor: Cursor = None, limit: Limit = 50
-) -> Page[ReferenceOut]:
+) -> ReferencePage:
     """List the current references by name."""
     return references.list_references(session, cursor, limit)
 

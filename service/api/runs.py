@@ -1,6 +1,6 @@
 """Routes of runs, including their comparison."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
@@ -16,12 +16,14 @@ from service.api.dependencies import MaxPoints, PartsDep, ReadSession
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
 from service.core.errors import NotFound
+from service.core.wire import FigureOut
 from service.figures.profiles import plot_profiles as profile_figure
 from service.jobs.stored_run import load_run
 from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
 from service.runs.schemas import (
     CompareIn,
     ComparisonOut,
+    ExportedModelOut,
     FreeRunIn,
     FreeRunOut,
     HistoryOut,
@@ -71,12 +73,27 @@ def read_residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> R
     return residuals.get_residuals(session, parts.store, run_id)
 
 
-@router.get("/{run_id}/export", response_class=Response)
+Format = Annotated[ExportFormat, Query(description="format of the file")]
+PadeOrder = Annotated[
+    int,
+    Query(ge=1, le=MAX_PADE_ORDER, description="order of the Padé approximation, for `control`"),
+]
+FigureTheme = Annotated[Theme, Query(description="light or dark colours of the figure")]
+EXPORT_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "model": ExportedModelOut,
+        "description": "The model as a file",
+        "content": {kind: {"schema": {"type": "string"}} for kind in exports.TEXT_TYPES},
+    }
+}
+
+
+@router.get("/{run_id}/export", response_class=Response, responses=EXPORT_ANSWERS)
 def export_model(
     run_id: str,
     session: ReadSession,
-    format: ExportFormat = "json",
-    pade_order: Annotated[int, Query(ge=1, le=MAX_PADE_ORDER)] = 3,
+    format: Format = "json",
+    pade_order: PadeOrder = 3,
 ) -> Response:
     """Export the identified model as text: json, python, c (C99), or control (python-control)."""
     model = exports.export_run(session, run_id, format, pade_order)
@@ -102,12 +119,12 @@ def validate_run(
 
 @router.post("/{run_id}:profile")
 def profile_run(
-    run_id: str, body: ProfileIn, parts: PartsDep, theme: Theme = "light"
+    run_id: str, body: ProfileIn, parts: PartsDep, theme: FigureTheme = "light"
 ) -> ProfilesOut:
     """Compute profile likelihoods of free parameters; the others are re-estimated at each value."""
     answer = profiles.compute_profiles(parts.database, parts.store, run_id, body)
     figure = apply_theme(profile_figure(answer.profiles, answer.threshold), theme)
-    return ProfilesOut(**dict(answer), figure=figure)
+    return ProfilesOut(**dict(answer), figure=FigureOut.model_validate(figure))
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)

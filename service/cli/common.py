@@ -80,7 +80,7 @@ Key = Annotated[
     str | None,
     typer.Option(
         "--key",
-        envvar="LAGID_KEY",
+        envvar=["LAGID_API_KEY", "LAGID_KEY"],
         help="API key.",
         show_default=False,
         rich_help_panel=SERVER_PANEL,
@@ -168,7 +168,7 @@ def print_error(message: str) -> None:
     _errors.print(f"lagid: {' '.join(message.split())}", markup=False)
 
 
-def check_succeeded(job: dict[str, Any]) -> None:
+def check_succeeded(job: Mapping[str, Any]) -> None:
     """End the command with the reason if a finished job did not succeed."""
     if job["state"] != "succeeded":
         reason = f": {job['error']}" if job["error"] else ""
@@ -214,7 +214,7 @@ def print_note(text: str) -> None:
         print_line(f"note: {text}")
 
 
-def print_job(job: dict[str, Any]) -> None:
+def print_job(job: Mapping[str, Any]) -> None:
     """Print a submitted job."""
     n_runs = job["progress"]["runs"]
     runs = f"{n_runs} runs, " if n_runs > 1 else ""
@@ -253,7 +253,7 @@ class Listing:
         Whether `more` is where counting stopped.
     """
 
-    entries: list[dict[str, Any]]
+    entries: Sequence[Mapping[str, Any]]
     more: int = 0
     has_more_than_counted: bool = False
 
@@ -266,7 +266,7 @@ class Listing:
 
 
 def fetch_listing(
-    fetch: Callable[[int | None], list[dict[str, Any]]], limit: int | None, as_json: bool
+    fetch: Callable[[int | None], Sequence[Mapping[str, Any]]], limit: int | None, as_json: bool
 ) -> Listing:
     """Fetch the entries of a list that ``--limit`` asks for.
 
@@ -289,7 +289,7 @@ def print_listing(
     listing: Listing,
     as_json: bool,
     headings: Sequence[str],
-    row: Callable[[dict[str, Any]], Sequence[object]],
+    row: Callable[[Mapping[str, Any]], Sequence[object]],
     *,
     empty: str,
 ) -> None:
@@ -317,12 +317,12 @@ def format_cell(value: object) -> str:
     return format_value(value).replace("[", "\\[")
 
 
-def format_estimate(estimate: dict[str, Any]) -> str:
+def format_estimate(estimate: Mapping[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
     return plain_estimate(estimate["value"], estimate["stderr"])
 
 
-def describe_status(estimate: dict[str, Any]) -> str:
+def describe_status(estimate: Mapping[str, Any]) -> str:
     """Describe the status of an estimate, with its reason if there is one."""
     return (
         f"{estimate['status']} ({estimate['reason']})"

@@ -1,7 +1,7 @@
 """`lagid datasets` and `lagid dataset …`."""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
@@ -239,7 +239,7 @@ def derive_dataset(
     _print_dataset(stored, as_json)
 
 
-def _find_dataset(client: "Client", name: str) -> dict[str, Any]:
+def _find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
     """Find a dataset by its id or name; end the command if none or several have it."""
     if name.startswith(DATASET_ID):
         return client.dataset(name)
@@ -272,7 +272,7 @@ def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
     return FieldOrigins(options) if file is None else file_origins(file, options)
 
 
-def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
+def _print_dataset(stored: Mapping[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(stored)
         return
@@ -289,7 +289,7 @@ def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
         print_note(warning)
 
 
-def _format_channels(dataset: dict[str, Any]) -> str:
+def _format_channels(dataset: Mapping[str, Any]) -> str:
     return ", ".join(
         append_unit(channel["name"], channel["unit"]) for channel in dataset["channels"]
     )

@@ -4,6 +4,7 @@ import os
 import shlex
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def _name_program() -> str:
     return "lagid" if shutil.which("lagid") else sys.argv[0]
 
 
-def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
+def _watch_job(client: Client, job: str, console: Console) -> Mapping[str, Any]:
     columns = (
         TextColumn("{task.description:>16}"),
         BarColumn(bar_width=40),
@@ -112,7 +113,7 @@ def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
     with Progress(*columns, console=console) as progress:
         bars: dict[str, TaskID] = {}
 
-        def show(state: dict[str, Any]) -> None:
+        def show(state: Mapping[str, Any]) -> None:
             for run in client.runs(job):
                 method = run["cell"]["/algorithm/method"]
                 if method not in bars:
@@ -127,7 +128,7 @@ def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
         return client.wait(job, progress=show)
 
 
-def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
+def _print_table(console: Console, runs: Mapping[str, Mapping[str, Any]]) -> None:
     table = Table(title="Example 1 (Eq. 13-16): estimates and the paper's Table 1")
     for heading in ("", "true", "paper, simple GA", "paper, proposed GA"):
         table.add_column(heading, justify="right")
@@ -154,7 +155,7 @@ def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
     )
 
 
-def _format_estimate(run: dict[str, Any], name: str) -> str:
+def _format_estimate(run: Mapping[str, Any], name: str) -> str:
     return format_estimate(next(p for p in run["parameters"] if p["name"] == name))
 
 

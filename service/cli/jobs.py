@@ -1,5 +1,6 @@
 """`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -211,7 +212,7 @@ def read_job(file: Path) -> dict[str, Any]:
     return body
 
 
-def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
+def print_runs(runs: Sequence[Mapping[str, Any]], rms_unit: str | None = None) -> None:
     """Print runs with their cells, fits and estimates; labels replace the ids of their data."""
     places = [run_coordinates(run) for run in runs]
     paths = list(dict.fromkeys(path for coordinates in places for path in coordinates))
@@ -247,7 +248,7 @@ def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
     print_table(headings, rows, empty="no runs")
 
 
-def _print_end(client: "Client", job: dict[str, Any], as_json: bool) -> None:
+def _print_end(client: "Client", job: Mapping[str, Any], as_json: bool) -> None:
     runs = client.runs(job["id"])
     if as_json:
         print_json({**job, "runs": runs})
@@ -269,7 +270,7 @@ def _find_latest_job(client: "Client") -> str:
     return str(jobs[0]["id"])
 
 
-def _format_progress(job: dict[str, Any]) -> str:
+def _format_progress(job: Mapping[str, Any]) -> str:
     """Format the count of finished runs; for several runs also how they ended."""
     done = job["progress"]
     text = f"{done['finished']}/{done['runs']}"
@@ -279,7 +280,7 @@ def _format_progress(job: dict[str, Any]) -> str:
     return f"{text}: {succeeded} succeeded, {done['failed']} failed"
 
 
-def _single_run_rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
+def _single_run_rms(job: Mapping[str, Any]) -> tuple[float | None, str | None]:
     """RMS and its unit for a job of one run; None for several, whose RMS are not comparable."""
     best = job["progress"]["best_rms"]
     if job["progress"]["runs"] != 1 or best is None:

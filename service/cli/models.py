@@ -1,5 +1,6 @@
 """`lagid models`: list, show, check and add models."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,12 +102,12 @@ def show_model(
 
     from sysid.models.catalogue import load
 
-    document: dict[str, Any]
+    document: Mapping[str, Any]
     if url is None or name in load.catalogue():
         document = dict(load.copy_catalogue_document(name))
     else:
         with connect_client(url, key) as client:
-            document = client.model(name)["document"]
+            document = client.model(name)["document"] or {}
     if as_json:
         print_json(document)
         return

@@ -5,6 +5,7 @@ accepts reference runs by name.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -164,7 +165,7 @@ def _field_origins(experiments: list[str]) -> FieldOrigins:
 
 
 def _print_outcome(
-    client: "Client", job: dict[str, Any], output: Path | None, *, as_json: bool
+    client: "Client", job: Mapping[str, Any], output: Path | None, *, as_json: bool
 ) -> None:
     trend = client.trend(job["id"])
     if as_json:
@@ -202,7 +203,7 @@ def _choose_label_value(
 
 
 def _accept_run(
-    client: "Client", job: dict[str, Any], name: str, label: str, x: float, *, quiet: bool
+    client: "Client", job: Mapping[str, Any], name: str, label: str, x: float, *, quiet: bool
 ) -> None:
     """Accept a run of the batch as the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
@@ -315,12 +316,12 @@ def accept_reference(
     _print_accepted(reference)
 
 
-def _print_accepted(reference: dict[str, Any]) -> None:
+def _print_accepted(reference: Mapping[str, Any]) -> None:
     before = f" (before: {reference['history'][0]['run']})" if reference["history"] else ""
     out.print(f"{reference['name']}: {reference['run']}{before}", markup=False)
 
 
-def _format_estimates(estimates: dict[str, Any]) -> str:
+def _format_estimates(estimates: Mapping[str, Any]) -> str:
     return ", ".join(
         f"{name} = {format_estimate(estimate)}" for name, estimate in estimates.items()
     )

@@ -4,6 +4,7 @@ The first lists the runs of a job and analyses single runs. The second writes th
 of a run for other programs.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -201,7 +202,7 @@ def compare_runs(
         print_note(note)
 
 
-def _print_step(metrics: dict[str, Any] | None) -> None:
+def _print_step(metrics: Mapping[str, Any] | None) -> None:
     if metrics is None:
         return
     if metrics["runs_away"]:
@@ -228,7 +229,9 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
 
 
 def _print_controller(
-    used: dict[str, Any] | None, tuning: dict[str, Any] | None, margins: dict[str, Any] | None
+    used: Mapping[str, Any] | None,
+    tuning: Mapping[str, Any] | None,
+    margins: Mapping[str, Any] | None,
 ) -> None:
     """Print the controller's settings, their tuning rule, and the stability margins."""
     if used is None:
@@ -257,7 +260,7 @@ def _print_controller(
         out.print(f"without limits: stable, {', '.join(shown)}", markup=False)
 
 
-def _test_row(test: dict[str, Any]) -> tuple[object, ...]:
+def _test_row(test: Mapping[str, Any]) -> tuple[object, ...]:
     reason = f": {test['reason']}" if test["reason"] else ""
     return (
         test["test"],
@@ -272,7 +275,9 @@ def _test_row(test: dict[str, Any]) -> tuple[object, ...]:
     )
 
 
-def _comparison_row(run: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
+def _comparison_row(
+    run: Mapping[str, Any], parameters: Sequence[Mapping[str, Any]]
+) -> tuple[object, ...]:
     values = [
         next(
             (format_estimate(value) for value in parameter["values"] if value["run"] == run["run"]),

@@ -1,5 +1,6 @@
 """`lagid sweep noise`: errors of the estimates under noise, as one job and one table."""
 
+from collections.abc import Mapping
 from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -197,7 +198,7 @@ def parse_sigma_grid(text: str) -> list[float]:
     return sigmas
 
 
-def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
+def build_sweep_tables(summary: Mapping[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
     """Build headings and rows of the tables of a noise sweep, a row for each σ and method.
 
     The first table has the runs and the error of the response. The others have the errors of the
@@ -254,7 +255,7 @@ def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[li
     return tables
 
 
-def _group_cells(group: dict[str, Any]) -> list[str]:
+def _group_cells(group: Mapping[str, Any]) -> list[str]:
     ended = group["succeeded"] + group["failed"]
     return [
         f"{ended}" if ended == group["runs"] else f"{ended}/{group['runs']}",
@@ -265,7 +266,7 @@ def _group_cells(group: dict[str, Any]) -> list[str]:
     ]
 
 
-def _error_cells(group: dict[str, Any], names: list[str]) -> list[str]:
+def _error_cells(group: Mapping[str, Any], names: list[str]) -> list[str]:
     by_name = {parameter["name"]: parameter for parameter in group["parameters"]}
     parameters = [by_name.get(name, {"error": None, "floor": None}) for name in names]
     return [
@@ -279,7 +280,7 @@ def _error_cells(group: dict[str, Any], names: list[str]) -> list[str]:
 
 
 def _print_sweep(
-    client: "Client", job: dict[str, Any], *, is_relative: bool, wait: bool, as_json: bool
+    client: "Client", job: Mapping[str, Any], *, is_relative: bool, wait: bool, as_json: bool
 ) -> None:
     if not wait:
         if as_json:
@@ -319,7 +320,7 @@ def _build_truth(
     }
 
 
-def _choose_source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
+def _choose_source(data: str | None, truth: Mapping[str, Any]) -> dict[str, Any]:
     present = {name: value for name, value in truth.items() if value}
     if (data is None) == (not present):
         fail_usage(

@@ -6,7 +6,7 @@ counts, groups and kinds of warnings. A trend is printed as tables: batch, laws,
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from service.cli.common import (
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 REUSE_NOTE = "this run was computed before; the result of {} is shown"
 
 
-def run_coordinates(run: dict[str, Any]) -> dict[str, object]:
+def run_coordinates(run: Mapping[str, Any]) -> dict[str, object]:
     """Return labels and axis values of a run; labels replace the ids of datasets."""
     labels = run["labels"]
     cell = {
@@ -43,7 +43,7 @@ def run_coordinates(run: dict[str, Any]) -> dict[str, object]:
     return {**labels, **cell}
 
 
-def print_run(run: dict[str, Any], as_json: bool) -> None:
+def print_run(run: Mapping[str, Any], as_json: bool) -> None:
     """Print the answer of `GET /v1/runs/{id}`."""
     if as_json:
         print_json(run)
@@ -75,7 +75,7 @@ def print_run(run: dict[str, Any], as_json: bool) -> None:
         print_note(warning)
 
 
-def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
+def print_reuse_note(job: Mapping[str, Any], runs: Sequence[Mapping[str, Any]], cure: str) -> None:
     """Print which results were computed by earlier jobs, and how to compute them again."""
     reused, n_runs = job["progress"]["reused"], job["progress"]["runs"]
     if not reused:
@@ -87,7 +87,7 @@ def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: 
     print_note(f"{text}. To compute again: {cure}")
 
 
-def _format_fit(run: dict[str, Any]) -> str:
+def _format_fit(run: Mapping[str, Any]) -> str:
     fit = run.get("fit_percent") or {}
     parts = [f"RMS {_format_rms(run, 'rms')}"]
     parts += [
@@ -101,7 +101,7 @@ def _format_fit(run: dict[str, Any]) -> str:
     return f"{', '.join(parts)}; {run['evaluations']} simulations{seconds}"
 
 
-def _format_rms(run: dict[str, Any], name: str) -> str:
+def _format_rms(run: Mapping[str, Any], name: str) -> str:
     unit = "standard deviations" if run["rms_unit"] == "σ" else run["rms_unit"]
     return f"{run[name]:.6g}{plain_unit(unit)}"
 
@@ -120,7 +120,9 @@ NUMBER_PATTERN = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 LOW_QUANTILE, MEDIAN, HIGH_QUANTILE = 0.05, 0.5, 0.95
 
 
-def print_run_summary(client: "Client", job: dict[str, Any], runs: list[dict[str, Any]]) -> None:
+def print_run_summary(
+    client: "Client", job: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]
+) -> None:
     """Print a summary of a job instead of its runs."""
     states = Counter(run["state"] for run in runs)
     counts = ", ".join(f"{count} {state}" for state, count in states.most_common())
@@ -130,7 +132,7 @@ def print_run_summary(client: "Client", job: dict[str, Any], runs: list[dict[str
     _print_warning_kinds([warning for run in runs for warning in run.get("warnings", [])])
 
 
-def _print_groups(client: "Client", job: dict[str, Any]) -> None:
+def _print_groups(client: "Client", job: Mapping[str, Any]) -> None:
     try:
         summary = client.summary(job["id"])
     except ProblemError as error:  # more groups than the server allows
@@ -161,7 +163,9 @@ def _print_groups(client: "Client", job: dict[str, Any]) -> None:
         print_line(f"… and {len(groups) - MAX_PRINTED} more groups")
 
 
-def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
+def _group_row(
+    group: Mapping[str, Any], units: dict[str, str], places: Sequence[int]
+) -> list[object]:
     values = {parameter["name"]: parameter["value"] for parameter in group["parameters"]}
     return [
         *group["key"].values(),
@@ -189,7 +193,7 @@ def _print_warning_kinds(warnings: list[str]) -> None:
         print_line(f"… and {len(kinds) - MAX_WARNING_KINDS} more kinds of notes")
 
 
-def print_trend(trend: dict[str, Any], origins: FieldOrigins) -> None:
+def print_trend(trend: Mapping[str, Any], origins: FieldOrigins) -> None:
     """Print the answer of `GET /v1/jobs/{id}/trend`; notes name the options of `origins`."""
     tables = build_tables(trend, PLAIN)
     headings = [

@@ -6,7 +6,7 @@ RMS, since RMS on different data or under different noise cannot be compared.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
+    from service.client.documents import JobDocument
 
 
 MAX_BARS = 12
@@ -34,11 +35,11 @@ BAR_COLUMNS = (
     TextColumn("{task.fields[state]}"),
     TimeElapsedColumn(),
 )
-Document = dict[str, Any]
+Document = Mapping[str, Any]
 Clock = Callable[[], float]
 
 
-def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
+def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> "JobDocument":
     """Show a job until it ends, unless told to be quiet; return its last state."""
     if quiet or err.quiet:
         return client.wait(job_id)

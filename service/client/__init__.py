@@ -2,13 +2,27 @@
 
 from typing import TYPE_CHECKING, Any
 
-from service.client.calls import ClientError, NotFinite, ProblemError, ServerUnreachable
+from service.client.calls import (
+    ClientError,
+    NotFinite,
+    ProblemError,
+    ServerUnreachable,
+    WaitTimeout,
+)
 
 if TYPE_CHECKING:
     from service.client.async_client import AsyncClient
     from service.client.client import Client
 
-__all__ = ["AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"]
+__all__ = [
+    "AsyncClient",
+    "Client",
+    "ClientError",
+    "NotFinite",
+    "ProblemError",
+    "ServerUnreachable",
+    "WaitTimeout",
+]
 
 
 def __getattr__(name: str) -> Any:

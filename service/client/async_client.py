@@ -4,12 +4,17 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import aclosing
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import httpx
 
 from service.client import calls
-from service.client.calls import Document, RestCall, ServerUnreachable
+from service.client.calls import Answer, Document, RestCall, ServerUnreachable
+from service.client.progress import show_progress
+from service.client.rows import Rows
+
+if TYPE_CHECKING:
+    from service.client import documents
 
 BLOCK_BYTES = 1 << 20
 """Size of the blocks in which a file is read."""
@@ -24,17 +29,19 @@ class AsyncClient:
 
     def __init__(
         self,
-        url: str = calls.DEFAULT_URL,
+        url: str | None = None,
         key: str | None = None,
         *,
+        timeout: float = calls.TIMEOUT_SECONDS,
         retries: int = calls.DEFAULT_RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self.url, self._retries = url.rstrip("/"), retries
+        self.url, self._retries = calls.choose_url(url), retries
+        self._has_answered = False
         self._http = httpx.AsyncClient(
             base_url=self.url,
-            headers=calls.make_auth_header(key),
-            timeout=calls.TIMEOUT_SECONDS,
+            headers=calls.make_auth_header(calls.choose_key(key)),
+            timeout=timeout,
             transport=transport,
         )
 
@@ -48,41 +55,73 @@ class AsyncClient:
         """Close the connections."""
         await self._http.aclose()
 
-    async def send(self, call: RestCall, *, stream: bool = False) -> httpx.Response:
+    async def send(self, call: RestCall[Any], *, stream: bool = False) -> httpx.Response:
         """Send one call and raise its errors. The caller reads and closes a stream."""
         pauses = calls.plan_pauses(call, self._retries)
         while True:
-            response = await self._send_once(call, stream)
-            pause = calls.choose_pause(response, pauses)
-            if pause is None:
-                return calls.raise_for_problem(response)
+            try:
+                response = await self._send_once(call, stream)
+            except httpx.TransportError as error:
+                pause = next(pauses, None) if self._is_lost(error) else None
+                if pause is None:
+                    raise ServerUnreachable(self.url, error) from error
+            else:
+                self._has_answered = True
+                pause = calls.choose_pause(response, pauses)
+                if pause is None:
+                    return calls.raise_for_problem(response)
             await asyncio.sleep(pause)
 
-    async def _send_once(self, call: RestCall, stream: bool) -> httpx.Response:
+    def _is_lost(self, error: httpx.TransportError) -> bool:
+        """Whether a connection broke, or a server that had answered before is away."""
+        if isinstance(error, httpx.ConnectError):
+            return self._has_answered
+        return not isinstance(error, httpx.TimeoutException)
+
+    async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
         request = self._http.build_request(**call.request(content, stream=stream))
-        try:
-            response = await self._http.send(request, stream=stream)
-            if not response.is_success:
-                await response.aread()
-        except httpx.TransportError as error:
-            raise ServerUnreachable(self.url, error) from error
+        response = await self._http.send(request, stream=stream)
+        if not response.is_success:
+            await response.aread()
         return response
 
-    async def _fetch_document(self, call: RestCall) -> Document:
-        document: Document = (await self.send(call)).json()
+    async def _fetch(self, call: RestCall[Answer]) -> Answer:
+        document: Answer = (await self.send(call)).json()
         return document
 
-    async def _iterate_items(
-        self, call: RestCall, at_most: int | None = None
-    ) -> AsyncIterator[Document]:
+    async def _iterate(
+        self, call: RestCall[Answer], at_most: int | None = None
+    ) -> AsyncIterator[Answer]:
         pages = calls.Paginator(call, at_most)
         while (page := pages.next_call()) is not None:
-            for item in pages.take_items(await self._fetch_document(page)):
+            for item in pages.take_items(await self._fetch(page)):
                 yield item
 
-    async def _fetch_list(self, call: RestCall, at_most: int | None = None) -> list[Document]:
-        return [item async for item in self._iterate_items(call, at_most)]
+    async def _fetch_list(self, call: RestCall[Answer], at_most: int | None = None) -> Rows[Answer]:
+        return Rows([item async for item in self._iterate(call, at_most)])
+
+    async def _download(self, call: RestCall[bytes]) -> AsyncIterator[bytes]:
+        stream = await self.send(call, stream=True)
+        async with aclosing(stream):
+            try:
+                async for piece in stream.aiter_bytes():
+                    yield piece
+            except httpx.TransportError as error:
+                raise ServerUnreachable(self.url, error) from error
+
+    # ---- the server
+    async def health(self) -> "documents.HealthDocument":
+        """Check that the web process answers."""
+        return await self._fetch(calls.HEALTH())
+
+    async def readiness(self) -> "documents.ReadyDocument":
+        """Check database, store and dispatcher; `ProblemError` says which of them is away."""
+        return await self._fetch(calls.READINESS())
+
+    async def metrics(self) -> str:
+        """Fetch the gauges in Prometheus' text format."""
+        return (await self.send(calls.METRICS())).text
 
     # ---- datasets
     async def add_dataset(
@@ -92,111 +131,120 @@ class AsyncClient:
         *,
         segments: str | None = None,
         sample_time: float | None = None,
-    ) -> Document:
+    ) -> "documents.DatasetDocument":
         """Store a recording from a file of any kind that is read, or from its bytes."""
-        return await self._fetch_document(calls.build_upload(source, name, segments, sample_time))
+        return await self._fetch(calls.build_upload(source, name, segments, sample_time))
 
-    async def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
+    async def simulate_dataset(self, body: Mapping[str, Any]) -> "documents.DatasetDocument":
         """Make a dataset from a model, its true parameters, inputs and noise."""
-        return await self._fetch_document(calls.SIMULATE_DATASET(json=body))
+        return await self._fetch(calls.SIMULATE_DATASET(json=body))
 
     async def derive(
         self, dataset: str, steps: list[Document], name: str | None = None
-    ) -> Document:
+    ) -> "documents.DatasetDocument":
         """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
         body = {"name": name, "steps": steps}
-        return await self._fetch_document(calls.DERIVE(dataset, json=body))
+        return await self._fetch(calls.DERIVE(dataset, json=body))
 
-    async def datasets(self, limit: int | None = None) -> list[Document]:
+    async def datasets(self, limit: int | None = None) -> "Rows[documents.DatasetDocument]":
         """List datasets, newest first: all, or at most `limit`."""
         return await self._fetch_list(calls.DATASETS(), limit)
 
-    async def dataset(self, name: str) -> Document:
+    def iterate_datasets(self) -> AsyncIterator["documents.DatasetDocument"]:
+        """Iterate over datasets, latest first, a page at a time."""
+        return self._iterate(calls.DATASETS())
+
+    async def dataset(self, name: str) -> "documents.DatasetDocument":
         """Fetch one dataset by its id."""
-        return await self._fetch_document(calls.DATASET(name))
+        return await self._fetch(calls.DATASET(name))
 
-    async def signals(self, dataset: str, max_points: int = 1000) -> Document:
+    async def signals(self, dataset: str, max_points: int = 1000) -> "documents.SignalsDocument":
         """Fetch the signals of a dataset, reduced to at most `max_points` points per channel."""
-        return await self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
+        return await self._fetch(calls.SIGNALS(dataset, max_points=max_points))
 
-    async def lineage(self, dataset: str) -> Document:
+    async def lineage(self, dataset: str) -> "documents.LineageDocument":
         """Fetch the lineage of a dataset: its sources, and everything made from it."""
-        return await self._fetch_document(calls.LINEAGE(dataset))
+        return await self._fetch(calls.LINEAGE(dataset))
 
     async def content(self, dataset: str) -> bytes:
         """Download a dataset as an MCAP file."""
         return (await self.send(calls.CONTENT(dataset))).content
 
-    async def download(self, dataset: str, format: str = "mcap") -> AsyncIterator[bytes]:
+    def download(self, dataset: str, format: str = "mcap") -> AsyncIterator[bytes]:
         """Download a dataset piece by piece: mcap or csv."""
-        stream = await self.send(calls.build_download(dataset, format), stream=True)
-        async with aclosing(stream):
-            async for piece in stream.aiter_bytes():
-                yield piece
+        return self._download(calls.build_download(dataset, format))
+
+    async def dataset_figure(self, dataset: str, **options: Any) -> "documents.FigureDocument":
+        """Draw the signals of a dataset, as Plotly JSON; `options` are those of the interface."""
+        return await self._fetch(calls.DATASET_FIGURE(dataset, **options))
 
     # ---- models
-    async def models(self, limit: int | None = None) -> list[Document]:
+    async def models(self, limit: int | None = None) -> "Rows[documents.ModelDocument]":
         """List the built-in models and those of users: all, or at most `limit`."""
         return await self._fetch_list(calls.MODELS(), limit)
 
-    async def model(self, name: str) -> Document:
+    def iterate_models(self) -> AsyncIterator["documents.ModelDocument"]:
+        """Iterate over the built-in models and those of users, a page at a time."""
+        return self._iterate(calls.MODELS())
+
+    async def model(self, name: str) -> "documents.ModelDocument":
         """Fetch one model with its document."""
-        return await self._fetch_document(calls.MODEL(name))
+        return await self._fetch(calls.MODEL(name))
 
-    async def add_model(self, document: Mapping[str, Any]) -> Document:
+    async def add_model(self, document: Mapping[str, Any]) -> "documents.ModelDocument":
         """Store a user model; a changed document becomes its next version."""
-        return await self._fetch_document(calls.ADD_MODEL(json=document))
+        return await self._fetch(calls.ADD_MODEL(json=document))
 
-    async def check_model(self, document: Mapping[str, Any]) -> Document:
+    async def check_model(self, document: Mapping[str, Any]) -> "documents.CheckDocument":
         """Check a model document; every error has its column."""
-        return await self._fetch_document(calls.CHECK_MODEL(json=document))
+        return await self._fetch(calls.CHECK_MODEL(json=document))
 
     # ---- jobs
     async def submit(
         self, job: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> Document:
+    ) -> "documents.JobDocument":
         """Queue a job."""
-        return await self._fetch_document(
-            calls.build_submission(calls.SUBMIT, job, idempotency_key)
-        )
+        return await self._fetch(calls.build_submission(calls.SUBMIT, job, idempotency_key))
 
     async def noise_sweep(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> Document:
+    ) -> "documents.JobDocument":
         """Queue a noise sweep: σ × replicates × methods as one job."""
-        return await self._fetch_document(
-            calls.build_submission(calls.NOISE_SWEEP, body, idempotency_key)
-        )
+        return await self._fetch(calls.build_submission(calls.NOISE_SWEEP, body, idempotency_key))
 
     async def reidentify(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
-    ) -> Document:
+    ) -> "documents.JobDocument":
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
-        return await self._fetch_document(
-            calls.build_submission(calls.REIDENTIFY, body, idempotency_key)
-        )
+        return await self._fetch(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
 
     async def jobs(
         self, limit: int | None = None, state: Sequence[str] | None = None
-    ) -> list[Document]:
+    ) -> "Rows[documents.JobDocument]":
         """List jobs, newest first: all, at most `limit`, or those in some states."""
         return await self._fetch_list(calls.JOBS(state=state), limit)
 
-    async def job(self, name: str) -> Document:
+    def iterate_jobs(
+        self, state: Sequence[str] | None = None
+    ) -> AsyncIterator["documents.JobDocument"]:
+        """Iterate over jobs, latest first: all, or those in some states, a page at a time."""
+        return self._iterate(calls.JOBS(state=state))
+
+    async def job(self, name: str) -> "documents.JobDocument":
         """Fetch one job with its state and progress."""
-        return await self._fetch_document(calls.JOB(name))
+        return await self._fetch(calls.JOB(name))
 
-    async def cancel(self, job: str) -> Document:
+    async def cancel(self, job: str) -> "documents.JobDocument":
         """Cancel a job; its results so far stay."""
-        return await self._fetch_document(calls.CANCEL(job))
+        return await self._fetch(calls.CANCEL(job))
 
-    async def resume(self, job: str) -> Document:
+    async def resume(self, job: str) -> "documents.JobDocument":
         """Queue a failed or cancelled job again, from where it stopped."""
-        return await self._fetch_document(calls.RESUME(job))
+        return await self._fetch(calls.RESUME(job))
 
-    async def clone(self, job: str) -> Document:
+    async def clone(self, job: str) -> "documents.JobDocument":
         """Queue the same request as a new job."""
-        return await self._fetch_document(calls.CLONE(job))
+        return await self._fetch(calls.CLONE(job))
 
     async def report(self, job: str) -> str:
         """Fetch the report of a job, as HTML."""
@@ -205,60 +253,108 @@ class AsyncClient:
     async def wait(
         self,
         job: str,
-        progress: Callable[[Document], object] | None = None,
+        progress: Callable[["documents.JobDocument"], object] | None = None,
         *,
         poll: float = calls.POLL_SECONDS,
-    ) -> Document:
-        """Wait until a job has ended; `progress` is called with its state at every poll."""
-        while True:
-            state = await self.job(job)
-            if progress is not None:
-                progress(state)
-            if state["state"] in calls.TERMINAL_STATES:
-                return state
-            await asyncio.sleep(poll)
+        timeout: float | None = None,
+        bar: bool = False,
+    ) -> "documents.JobDocument":
+        """Wait until a job has ended; `progress` is called with its state at every poll.
+
+        Parameters
+        ----------
+        poll : float
+            Time between two polls, s.
+        timeout : float, optional
+            Longest time to wait, s; by default without limit.
+        bar : bool
+            Whether a progress bar is shown on stderr.
+
+        Raises
+        ------
+        WaitTimeout
+            If the job has not ended in time.
+        """
+        limit = calls.WaitLimit(timeout)
+        with show_progress(job, is_shown=bar) as advance:
+            while True:
+                state = await self.job(job)
+                advance(state)
+                if progress is not None:
+                    progress(state)
+                if state["state"] in calls.TERMINAL_STATES:
+                    return state
+                await asyncio.sleep(limit.shorten(poll, state))
 
     async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
-        """Yield the events of a job until its end; `after` is the id of the last event received."""
-        parser = calls.EventParser()
-        stream = await self.send(calls.build_event_stream(job, after), stream=True)
-        async with aclosing(stream):
-            async for line in stream.aiter_lines():
-                for event in parser.feed_line(line):
-                    yield event
+        """Yield the events of a job until its end; `after` is the id of the last event received.
+
+        After a lost connection the stream is opened again, and continues with the next event.
+        """
+        events = calls.EventParser(after, self._retries)
+        while not events.is_over:
+            call = calls.build_event_stream(job, events.last)
+            stream = await self.send(call, stream=True)
+            async with aclosing(stream):
+                try:
+                    async for line in stream.aiter_lines():
+                        for event in events.feed_line(line):
+                            yield event
+                except httpx.TransportError as error:
+                    events.check_loss(ServerUnreachable(self.url, error))
+            if events.note_close(stream.status_code):
+                await asyncio.sleep(calls.FIRST_PAUSE_SECONDS)
 
     # ---- runs
     def runs(
         self, job: str, *, at_most: int | None = None, **filters: Any
-    ) -> AsyncIterator[Document]:
+    ) -> AsyncIterator["documents.RunDocument"]:
         """List all runs of a job, or the first `at_most` that pass the filters."""
-        return self._iterate_items(calls.RUNS(job, **filters), at_most)
+        return self._iterate(calls.RUNS(job, **filters), at_most)
 
-    async def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
+    def iterate_runs(self, job: str, **filters: Any) -> AsyncIterator["documents.RunDocument"]:
+        """Iterate over the runs of a job that pass the filters, a page at a time."""
+        return self._iterate(calls.RUNS(job, **filters))
+
+    async def summary(
+        self, job: str, by: Sequence[str] | None = None
+    ) -> "documents.SummaryDocument":
         """Fetch quantiles over the values of axes or labels, by default over all axes but seeds."""
-        return await self._fetch_document(calls.SUMMARY(job, by=by))
+        return await self._fetch(calls.SUMMARY(job, by=by))
 
-    async def trend(self, job: str) -> Document:
+    async def trend(self, job: str) -> "documents.TrendDocument":
         """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift."""
-        return await self._fetch_document(calls.TREND(job))
+        return await self._fetch(calls.TREND(job))
 
-    async def run(self, name: str) -> Document:
+    async def summary_figure(self, job: str, **options: Any) -> "documents.FigureDocument":
+        """Draw errors against the noise, as Plotly JSON; `options` are those of the interface."""
+        return await self._fetch(calls.SUMMARY_FIGURE(job, **options))
+
+    async def trend_figure(self, job: str, **options: Any) -> "documents.FigureDocument":
+        """Draw the estimates over the label, as Plotly JSON."""
+        return await self._fetch(calls.TREND_FIGURE(job, **options))
+
+    def download_runs(self, job: str) -> AsyncIterator[bytes]:
+        """Download the table of all runs of a job as CSV, piece by piece."""
+        return self._download(calls.RUNS_CSV(job))
+
+    async def run(self, name: str) -> "documents.RunDocument":
         """Fetch the result of one run."""
-        return await self._fetch_document(calls.RUN(name))
+        return await self._fetch(calls.RUN(name))
 
-    async def history(self, run: str) -> Document:
+    async def history(self, run: str) -> "documents.HistoryDocument":
         """Fetch the improvements of each island's champion."""
-        return await self._fetch_document(calls.HISTORY(run))
+        return await self._fetch(calls.HISTORY(run))
 
-    async def response(self, run: str, max_points: int = 1000) -> Document:
+    async def response(self, run: str, max_points: int = 1000) -> "documents.ResponseDocument":
         """Fetch the measured and simulated outputs."""
-        return await self._fetch_document(calls.RESPONSE(run, max_points=max_points))
+        return await self._fetch(calls.RESPONSE(run, max_points=max_points))
 
     async def simulate_run(
         self, run: str, body: Mapping[str, Any], max_points: int = 1000
-    ) -> Document:
+    ) -> "documents.RunSimulationDocument":
         """Simulate the identified model on a new input or under P, PI or PID control."""
-        return await self._fetch_document(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
+        return await self._fetch(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
 
     async def validate_run(
         self,
@@ -268,47 +364,61 @@ class AsyncClient:
         *,
         skip: int = 0,
         max_points: int = 1000,
-    ) -> Document:
+    ) -> "documents.FreeRunDocument":
         """Simulate the identified model on another recording: RMS and fit."""
         body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
-        return await self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
+        return await self._fetch(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
 
-    async def migrations(self, run: str) -> Document:
+    async def migrations(self, run: str) -> "documents.MigrationsDocument":
         """Fetch the migration log."""
-        return await self._fetch_document(calls.MIGRATIONS(run))
+        return await self._fetch(calls.MIGRATIONS(run))
 
-    async def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+    async def profile(
+        self, run: str, *parameters: str, points: int = 21
+    ) -> "documents.ProfilesDocument":
         """Compute the profile likelihood of some free parameters; of all if none is named."""
         body = {"parameters": parameters or None, "points": points}
-        return await self._fetch_document(calls.PROFILE(run, json=body))
+        return await self._fetch(calls.PROFILE(run, json=body))
 
-    async def residuals(self, run: str) -> Document:
+    async def residuals(self, run: str) -> "documents.ResidualsDocument":
         """Fetch the correlation functions of the residuals, their bands and tests."""
-        return await self._fetch_document(calls.RESIDUALS(run))
+        return await self._fetch(calls.RESIDUALS(run))
+
+    async def run_figure(self, run: str, name: str, **options: Any) -> "documents.FigureDocument":
+        """Draw a figure of a run, such as ``response`` or ``history``, as Plotly JSON."""
+        return await self._fetch(calls.RUN_FIGURE(run, name, **options))
+
+    def download_signals(self, run: str) -> AsyncIterator[bytes]:
+        """Download the fitted signals of a run as MCAP, piece by piece."""
+        return self._download(calls.RUN_SIGNALS(run))
 
     async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
         """Export the identified model as text: json, python, c or control."""
         return (await self.send(calls.EXPORT(run, format=format, pade_order=pade_order))).text
 
-    async def compare(self, *runs: str) -> Document:
+    async def compare(self, *runs: str) -> "documents.ComparisonDocument":
         """Compare runs on the same data, best first."""
-        return await self._fetch_document(calls.COMPARE(json={"runs": runs}))
+        return await self._fetch(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    async def references(self, limit: int | None = None) -> list[Document]:
+    async def references(self, limit: int | None = None) -> "Rows[documents.ReferenceDocument]":
         """List the references in use, by name: all, or at most `limit`."""
         return await self._fetch_list(calls.REFERENCES(), limit)
 
-    async def reference(self, name: str) -> Document:
+    def iterate_references(self) -> AsyncIterator["documents.ReferenceDocument"]:
+        """Iterate over the references in use, by name, a page at a time."""
+        return self._iterate(calls.REFERENCES())
+
+    async def reference(self, name: str) -> "documents.ReferenceDocument":
         """Fetch one reference with its history."""
-        return await self._fetch_document(calls.REFERENCE(name))
+        return await self._fetch(calls.REFERENCE(name))
 
     async def accept_reference(
         self, name: str, run: str, *, by: str | None = None, note: str | None = None
-    ) -> Document:
+    ) -> "documents.ReferenceDocument":
         """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
-        return await self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
+        return await self._fetch(calls.ACCEPT_REFERENCE(name, json=body))
 
 
 async def _read_blocks(path: Path) -> AsyncIterator[bytes]:

@@ -4,6 +4,8 @@ It also holds the errors of the clients, the pages of a list, the events of a jo
 """
 
 import json
+import os
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -11,7 +13,7 @@ from email.utils import parsedate_to_datetime
 from http import HTTPStatus
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -20,10 +22,16 @@ from service.core.states import JobState
 if TYPE_CHECKING:
     import httpx
 
+    from service.client import documents
+
 
 Document: TypeAlias = dict[str, Any]
+Answer = TypeVar("Answer")
+"""What a call is answered with; the items, if it is a list."""
 
 DEFAULT_URL = "http://127.0.0.1:8000"
+URL_VARIABLE = "LAGID_URL"
+KEY_VARIABLES = ("LAGID_API_KEY", "LAGID_KEY")
 TERMINAL_STATES = frozenset(state.value for state in JobState if state.is_terminal)
 FILE_TYPE = "application/octet-stream"  # the server recognises the kind by the bytes
 MCAP_TYPE = "application/x-mcap"
@@ -34,6 +42,17 @@ TIMEOUT_SECONDS = 60.0
 PAGE_SIZE = 500
 
 
+def choose_url(url: str | None) -> str:
+    """Return the address of the server: as given, else that of LAGID_URL, else the default."""
+    return (url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+
+
+def choose_key(key: str | None) -> str | None:
+    """Return the API key: as given, else that of LAGID_API_KEY, else none."""
+    given = (os.environ.get(name) for name in KEY_VARIABLES)
+    return key or next((value for value in given if value), None)
+
+
 def make_auth_header(key: str | None) -> dict[str, str]:
     """Make the header that carries an API key."""
     return {"Authorization": f"Bearer {key}"} if key else {}
@@ -42,7 +61,7 @@ def make_auth_header(key: str | None) -> dict[str, str]:
 class ClientError(Exception):
     """Base class of the errors that a client raises on purpose.
 
-    Subclasses: ProblemError, ServerUnreachable and NotFinite.
+    Subclasses: ProblemError, ServerUnreachable, WaitTimeout and NotFinite.
     """
 
 
@@ -76,6 +95,20 @@ class ServerUnreachable(ClientError):
         )
 
 
+class WaitTimeout(ClientError):
+    """A job has not ended in time; it goes on.
+
+    Attributes
+    ----------
+    job : dict
+        The last state of the job.
+    """
+
+    def __init__(self, job: "documents.JobDocument", seconds: float) -> None:
+        self.job = job
+        super().__init__(f"{job['id']} has not ended after {seconds:g} s; it is {job['state']}")
+
+
 class NotFinite(ClientError):
     """A body contains a number that JSON cannot represent; it was not sent.
 
@@ -93,8 +126,8 @@ class NotFinite(ClientError):
 
 
 @dataclass(frozen=True, slots=True)
-class RestCall:
-    """One request, not yet sent.
+class RestCall(Generic[Answer]):
+    """One request, not yet sent, and the type of its answer.
 
     Raises
     ------
@@ -132,17 +165,26 @@ def _check_finite(pointer: str, value: Any) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Endpoint:
-    """An endpoint: its method, and its path below ``/v1/`` with ``{}`` for each name."""
+class Endpoint(Generic[Answer]):
+    """An endpoint: its method, and its path with ``{}`` for each name, and the type of its answer.
+
+    A path without a slash at its begin lies below ``/v1/``. The type of a list is that of its
+    items.
+    """
 
     method: str
     path: str
 
-    def __call__(self, *names: str, json: Any = None, **params: Any) -> RestCall:
+    @property
+    def full_path(self) -> str:
+        """The path from the address of the server on."""
+        return self.path if self.path.startswith("/") else f"/v1/{self.path}"
+
+    def __call__(self, *names: str, json: Any = None, **params: Any) -> RestCall[Answer]:
         """Build the call for resources of these names; parameters that are None are left out."""
-        path = self.path.format(*(quote(name, safe="") for name in names))
+        path = self.full_path.format(*(quote(name, safe="") for name in names))
         query = {key: _to_query(value) for key, value in params.items() if value is not None}
-        return RestCall(self.method, f"/v1/{path}", query, json)
+        return RestCall(self.method, path, query, json)
 
 
 def _to_query(value: Any) -> Any:
@@ -150,52 +192,67 @@ def _to_query(value: Any) -> Any:
     return list(value) if is_list else value
 
 
-ADD_DATASET = Endpoint("POST", "datasets")
-SIMULATE_DATASET = Endpoint("POST", "datasets:simulate")
-DERIVE = Endpoint("POST", "datasets/{}:derive")
-DATASETS = Endpoint("GET", "datasets")
-DATASET = Endpoint("GET", "datasets/{}")
-SIGNALS = Endpoint("GET", "datasets/{}/signals")
-LINEAGE = Endpoint("GET", "datasets/{}/lineage")
-CONTENT = Endpoint("GET", "datasets/{}/content")
-CONTENT_CSV = Endpoint("GET", "datasets/{}/content.csv")
+ADD_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets")
+SIMULATE_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets:simulate")
+DERIVE: "Endpoint[documents.DatasetDocument]" = Endpoint("POST", "datasets/{}:derive")
+DATASETS: "Endpoint[documents.DatasetDocument]" = Endpoint("GET", "datasets")
+DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("GET", "datasets/{}")
+SIGNALS: "Endpoint[documents.SignalsDocument]" = Endpoint("GET", "datasets/{}/signals")
+LINEAGE: "Endpoint[documents.LineageDocument]" = Endpoint("GET", "datasets/{}/lineage")
+CONTENT: Endpoint[bytes] = Endpoint("GET", "datasets/{}/content")
+CONTENT_CSV: Endpoint[bytes] = Endpoint("GET", "datasets/{}/content.csv")
 
-MODELS = Endpoint("GET", "models")
-MODEL = Endpoint("GET", "models/{}")
-ADD_MODEL = Endpoint("POST", "models")
-CHECK_MODEL = Endpoint("POST", "models:check")
+MODELS: "Endpoint[documents.ModelDocument]" = Endpoint("GET", "models")
+MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("GET", "models/{}")
+ADD_MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("POST", "models")
+CHECK_MODEL: "Endpoint[documents.CheckDocument]" = Endpoint("POST", "models:check")
 
-SUBMIT = Endpoint("POST", "jobs")
-NOISE_SWEEP = Endpoint("POST", "recipes/noise-sweep")
-REIDENTIFY = Endpoint("POST", "recipes/reidentify")
-JOBS = Endpoint("GET", "jobs")
-JOB = Endpoint("GET", "jobs/{}")
-CANCEL = Endpoint("POST", "jobs/{}:cancel")
-RESUME = Endpoint("POST", "jobs/{}:resume")
-CLONE = Endpoint("POST", "jobs/{}:clone")
-EVENTS = Endpoint("GET", "jobs/{}/events")
-REPORT = Endpoint("GET", "jobs/{}/report")
-RUNS = Endpoint("GET", "jobs/{}/runs")
-SUMMARY = Endpoint("GET", "jobs/{}/summary")
-TREND = Endpoint("GET", "jobs/{}/trend")
+SUBMIT: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs")
+NOISE_SWEEP: "Endpoint[documents.JobDocument]" = Endpoint("POST", "recipes/noise-sweep")
+REIDENTIFY: "Endpoint[documents.JobDocument]" = Endpoint("POST", "recipes/reidentify")
+JOBS: "Endpoint[documents.JobDocument]" = Endpoint("GET", "jobs")
+JOB: "Endpoint[documents.JobDocument]" = Endpoint("GET", "jobs/{}")
+CANCEL: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:cancel")
+RESUME: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:resume")
+CLONE: "Endpoint[documents.JobDocument]" = Endpoint("POST", "jobs/{}:clone")
+EVENTS: Endpoint[bytes] = Endpoint("GET", "jobs/{}/events")
+REPORT: Endpoint[bytes] = Endpoint("GET", "jobs/{}/report")
+RUNS: "Endpoint[documents.RunDocument]" = Endpoint("GET", "jobs/{}/runs")
+SUMMARY: "Endpoint[documents.SummaryDocument]" = Endpoint("GET", "jobs/{}/summary")
+TREND: "Endpoint[documents.TrendDocument]" = Endpoint("GET", "jobs/{}/trend")
 
-RUN = Endpoint("GET", "runs/{}")
-HISTORY = Endpoint("GET", "runs/{}/history")
-RESPONSE = Endpoint("GET", "runs/{}/response")
-SIMULATE_RUN = Endpoint("POST", "runs/{}:simulate")
-VALIDATE_RUN = Endpoint("POST", "runs/{}:validate")
-MIGRATIONS = Endpoint("GET", "runs/{}/migrations")
-PROFILE = Endpoint("POST", "runs/{}:profile")
-RESIDUALS = Endpoint("GET", "runs/{}/residuals")
-EXPORT = Endpoint("GET", "runs/{}/export")
-COMPARE = Endpoint("POST", "runs:compare")
+RUN: "Endpoint[documents.RunDocument]" = Endpoint("GET", "runs/{}")
+HISTORY: "Endpoint[documents.HistoryDocument]" = Endpoint("GET", "runs/{}/history")
+RESPONSE: "Endpoint[documents.ResponseDocument]" = Endpoint("GET", "runs/{}/response")
+SIMULATE_RUN: "Endpoint[documents.RunSimulationDocument]" = Endpoint("POST", "runs/{}:simulate")
+VALIDATE_RUN: "Endpoint[documents.FreeRunDocument]" = Endpoint("POST", "runs/{}:validate")
+MIGRATIONS: "Endpoint[documents.MigrationsDocument]" = Endpoint("GET", "runs/{}/migrations")
+PROFILE: "Endpoint[documents.ProfilesDocument]" = Endpoint("POST", "runs/{}:profile")
+RESIDUALS: "Endpoint[documents.ResidualsDocument]" = Endpoint("GET", "runs/{}/residuals")
+EXPORT: Endpoint[bytes] = Endpoint("GET", "runs/{}/export")
+COMPARE: "Endpoint[documents.ComparisonDocument]" = Endpoint("POST", "runs:compare")
 
-REFERENCES = Endpoint("GET", "references")
-REFERENCE = Endpoint("GET", "references/{}")
-ACCEPT_REFERENCE = Endpoint("PUT", "references/{}")
+RUNS_CSV: Endpoint[bytes] = Endpoint("GET", "jobs/{}/runs.csv")
+SUMMARY_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/summary")
+TREND_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "jobs/{}/figures/trend")
+RUN_SIGNALS: Endpoint[bytes] = Endpoint("GET", "runs/{}/signals.mcap")
+RUN_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint("GET", "runs/{}/figures/{}")
+DATASET_FIGURE: "Endpoint[documents.FigureDocument]" = Endpoint(
+    "GET", "datasets/{}/figures/signals"
+)
+
+HEALTH: "Endpoint[documents.HealthDocument]" = Endpoint("GET", "/healthz")
+READINESS: "Endpoint[documents.ReadyDocument]" = Endpoint("GET", "/readyz")
+METRICS: Endpoint[bytes] = Endpoint("GET", "/metrics")
+
+REFERENCES: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references")
+REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references/{}")
+ACCEPT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PUT", "references/{}")
 
 
-def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> RestCall:
+def build_submission(
+    endpoint: Endpoint[Answer], body: Mapping[str, Any], key: str | None
+) -> RestCall[Answer]:
     """Build a call that queues a job; the same idempotency key again returns the same job.
 
     Without a key the call gets a random one, so that it can be repeated if no response came.
@@ -203,19 +260,19 @@ def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | Non
     return replace(endpoint(json=body), headers={IDEMPOTENCY_HEADER: key or uuid4().hex})
 
 
-def build_event_stream(job: str, after: str | None) -> RestCall:
+def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
     """Build the call for a job's events, or for those after an event."""
     return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
 
 
-def build_download(dataset: str, file_format: str) -> RestCall:
+def build_download(dataset: str, file_format: str) -> RestCall[bytes]:
     """Build the call that downloads a dataset as ``mcap`` or ``csv``."""
     return (CONTENT_CSV if file_format == "csv" else CONTENT)(dataset)
 
 
 def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
-) -> RestCall:
+) -> "RestCall[documents.DatasetDocument]":
     """Build the call that stores a file or bytes."""
     content = source if isinstance(source, bytes) else Path(source)
     kind = FILE_TYPE
@@ -226,15 +283,15 @@ def build_upload(
     return replace(call, content=content, headers={"content-type": kind})
 
 
-class Paginator:
+class Paginator(Generic[Answer]):
     """Reads a list page by page: `at_most` items, or all."""
 
-    def __init__(self, call: RestCall, at_most: int | None) -> None:
+    def __init__(self, call: RestCall[Answer], at_most: int | None) -> None:
         self._call, self._left, self._limit = call, at_most, min(at_most or PAGE_SIZE, PAGE_SIZE)
         self._cursor: str | None = None
         self._is_over = False
 
-    def next_call(self) -> RestCall | None:
+    def next_call(self) -> RestCall[Any] | None:
         """Return the call of the next page; None after the last page."""
         if self._is_over:
             return None
@@ -242,9 +299,9 @@ class Paginator:
         params = {**self._call.params, "limit": self._limit, **position}
         return replace(self._call, params=params)
 
-    def take_items(self, page: Document) -> list[Document]:
+    def take_items(self, page: Document) -> list[Answer]:
         """Return the items of a page and remember its cursor."""
-        items: list[Document] = page["items"][: self._left]
+        items: list[Answer] = page["items"][: self._left]
         if self._left is not None:
             self._left -= len(items)
         self._cursor = page["next"]
@@ -273,9 +330,19 @@ def raise_for_problem(response: "httpx.Response") -> "httpx.Response":
 
 
 class EventParser:
-    """Parses server-sent events line by line."""
+    """Parses server-sent events line by line, over one stream after the other.
 
-    def __init__(self) -> None:
+    Attributes
+    ----------
+    last : str or None
+        Id of the last event; the next stream begins after it.
+    is_over : bool
+        Whether there is no further event, or too many streams broke in succession.
+    """
+
+    def __init__(self, last: str | None, retries: int) -> None:
+        self.last, self.is_over = last, False
+        self._retries, self._losses = retries, 0
         self._fields: dict[str, str] = {}
 
     def feed_line(self, line: str) -> Iterator[Document]:
@@ -287,11 +354,23 @@ class EventParser:
             return
         fields, self._fields = self._fields, {}
         if "data" in fields:
-            yield {
-                "id": fields.get("id"),
-                "event": fields.get("event", "message"),
-                "data": json.loads(fields["data"]),
-            }
+            kind = fields.get("event", "message")
+            self.last, self._losses = fields.get("id"), 0
+            self.is_over = kind == "end"
+            yield {"id": self.last, "event": kind, "data": json.loads(fields["data"])}
+
+    def check_loss(self, error: ServerUnreachable) -> None:
+        """Raise the error of a broken stream if too many broke in succession."""
+        if self._losses >= self._retries:
+            raise error
+
+    def note_close(self, status: int) -> bool:
+        """Note the end of a stream; return whether another one may have further events."""
+        self._fields = {}
+        self._losses += 1
+        if status == HTTPStatus.NO_CONTENT or self._losses > self._retries:
+            self.is_over = True
+        return not self.is_over
 
 
 def _describe_fault(entry: Mapping[str, Any]) -> str:
@@ -304,10 +383,11 @@ FIRST_PAUSE_SECONDS = 0.5
 """Pause before the second attempt, if the server names none; it doubles with each attempt."""
 MAX_PAUSE_SECONDS = 30.0
 """Longest pause. If the server asks for a longer one, the call is not repeated."""
-REPEATABLE_METHODS = frozenset({"GET", "HEAD", "PUT"})
+REPEATABLE_METHODS = frozenset({"GET", "HEAD", "PUT", "DELETE"})
+TEMPORARY_STATUSES = (HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE)
 
 
-def plan_pauses(call: RestCall, retries: int) -> "Iterator[float]":
+def plan_pauses(call: RestCall[Any], retries: int) -> "Iterator[float]":
     """Yield the seconds to wait before each further attempt, if the server names none.
 
     A request that might be carried out twice has none: a POST without an idempotency key.
@@ -323,12 +403,12 @@ def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float
     Parameters
     ----------
     response : httpx.Response
-        Only status 503 is temporary. Its ``Retry-After`` sets the pause, in seconds or as a date
+        Status 429 and 503 are temporary. ``Retry-After`` sets the pause, in seconds or as a date
         (RFC 9110, section 10.2.3).
     pauses : iterator of float
         The remaining pauses of this call; one is taken.
     """
-    if response.status_code != HTTPStatus.SERVICE_UNAVAILABLE:
+    if response.status_code not in TEMPORARY_STATUSES:
         return None
     pause = next(pauses, None)
     if pause is None:
@@ -336,6 +416,28 @@ def choose_pause(response: "httpx.Response", pauses: "Iterator[float]") -> float
     requested = _parse_retry_after(response.headers.get("Retry-After"))
     pause = pause if requested is None else requested
     return pause if pause <= MAX_PAUSE_SECONDS else None
+
+
+class WaitLimit:
+    """The time until which a job is waited for."""
+
+    def __init__(self, seconds: float | None) -> None:
+        self._seconds, self._start = seconds, time.monotonic()
+
+    def shorten(self, pause: float, job: "documents.JobDocument") -> float:
+        """Return a pause that ends in time.
+
+        Raises
+        ------
+        WaitTimeout
+            If no time is left.
+        """
+        if self._seconds is None:
+            return pause
+        left = self._start + self._seconds - time.monotonic()
+        if left <= 0:
+            raise WaitTimeout(job, self._seconds)
+        return min(pause, left)
 
 
 def _parse_retry_after(header: str | None) -> float | None:

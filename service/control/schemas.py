@@ -20,9 +20,9 @@ class TransportIn(Body):
     Times are in s.
     """
 
-    gain: float = 1.0
-    time_constant: float = Field(default=0.0, ge=0)
-    delay: float = Field(default=0.0, ge=0)
+    gain: float = Field(default=1.0, description="gain of the transport")
+    time_constant: float = Field(default=0.0, ge=0, description="time constant, s")
+    delay: float = Field(default=0.0, ge=0, description="dead time, s")
 
 
 class TuningIn(Body):
@@ -32,9 +32,11 @@ class TuningIn(Body):
     time. A longer one gives a slower and more robust loop.
     """
 
-    rule: TuningRule = "simc"
-    controller: ControllerKind = "PI"
-    closed_loop_time_constant: float | None = Field(default=None, gt=0, examples=[0.5])
+    rule: TuningRule = Field(default="simc", description="tuning rule")
+    controller: ControllerKind = Field(default="PI", description="kind of the controller")
+    closed_loop_time_constant: float | None = Field(
+        default=None, gt=0, examples=[0.5], description="time constant of the closed loop (τ_c), s"
+    )
 
 
 class ControlIn(Body):
@@ -52,22 +54,40 @@ class ControlIn(Body):
     continuous. Around a recursion it acts once a step.
     """
 
-    input: str
-    output: str
-    gain: float | None = None
-    integral_time: float | None = Field(default=None, gt=0, examples=[1.5])
-    derivative_time: float = Field(default=0.0, ge=0)
-    derivative_filter: float = Field(default=10.0, gt=0)
-    derivative_on: DerivativeOn = "measurement"
-    setpoint_weight: float = 1.0
-    limit: float | None = Field(default=None, gt=0)
-    lower: float | None = None
-    upper: float | None = None
-    anti_windup: AntiWindup = "back-calculation"
-    tracking_time: float | None = Field(default=None, gt=0)
-    tuning: TuningIn | None = None
-    transport: TransportIn | None = None
-    reference: RunInputIn
+    input: str = Field(description="input of the model that the controller moves")
+    output: str = Field(description="output of the model that it controls")
+    gain: float | None = Field(
+        default=None, description="gain, in units of the input per unit of the output"
+    )
+    integral_time: float | None = Field(
+        default=None, gt=0, examples=[1.5], description="integral time, s; null: none"
+    )
+    derivative_time: float = Field(default=0.0, ge=0, description="derivative time, s")
+    derivative_filter: float = Field(
+        default=10.0, gt=0, description="ratio of the derivative time to that of its filter"
+    )
+    derivative_on: DerivativeOn = Field(
+        default="measurement", description="what the derivative acts on"
+    )
+    setpoint_weight: float = Field(
+        default=1.0, description="weight of the reference in the proportional part"
+    )
+    limit: float | None = Field(
+        default=None, gt=0, description="largest magnitude of the command, in the input's unit"
+    )
+    lower: float | None = Field(default=None, description="least command, in the input's unit")
+    upper: float | None = Field(default=None, description="largest command, in the input's unit")
+    anti_windup: AntiWindup = Field(
+        default="back-calculation", description="what happens to the integral at a limit"
+    )
+    tracking_time: float | None = Field(
+        default=None, gt=0, description="time that resets the integral at a limit, s"
+    )
+    tuning: TuningIn | None = Field(default=None, description="rule that chooses gain and times")
+    transport: TransportIn | None = Field(
+        default=None, description="transfer function between controller and plant"
+    )
+    reference: RunInputIn = Field(description="waveform of the reference")
 
 
 _EXAMPLE_CONTROL = {
@@ -89,13 +109,17 @@ class RunSimulationIn(Body):
     dataset.
     """
 
-    inputs: dict[str, RunInputIn] = Field(default={})
-    control: ControlIn | None = Field(default=None, examples=[_EXAMPLE_CONTROL])
-    parameters: dict[str, float] = Field(default={})
-    samples: int = Field(ge=2, le=MAX_SERIES_SAMPLES)
-    sample_time: SampleTime | None = None
-    store: bool = False
-    name: str | None = Field(default=None, max_length=200)
+    inputs: dict[str, RunInputIn] = Field(default={}, description="waveform of each input")
+    control: ControlIn | None = Field(
+        default=None, examples=[_EXAMPLE_CONTROL], description="controller of a closed loop"
+    )
+    parameters: dict[str, float] = Field(
+        default={}, description="values that replace estimates, in their units"
+    )
+    samples: int = Field(ge=2, le=MAX_SERIES_SAMPLES, description="number of samples")
+    sample_time: SampleTime | None = Field(default=None, description="sampling period, s")
+    store: bool = Field(default=False, description="whether the result is stored as a dataset")
+    name: str | None = Field(default=None, max_length=200, description="name of that dataset")
 
 
 class StepMetricsOut(Answer):
@@ -115,21 +139,28 @@ class StepMetricsOut(Answer):
     oscillation.
     """
 
-    output: str
-    unit: str
-    rise_time: Finite
-    overshoot_percent: Finite
-    overshoot_of_final_percent: Finite
-    settling_time: Finite
-    band: float
-    steady_error: Finite
-    final_value: Finite
-    runs_away: bool = False
-    is_settled: bool = True
-    iae: Finite = None
-    itae: Finite = None
-    swing: Finite = None
-    swing_period: Finite = None
+    output: str = Field(description="controlled output")
+    unit: str = Field(description="unit of the output")
+    rise_time: Finite = Field(description="time from 10 to 90 % of the change, s")
+    overshoot_percent: Finite = Field(description="overshoot over the reference, %")
+    overshoot_of_final_percent: Finite = Field(description="overshoot over the final value, %")
+    settling_time: Finite = Field(description="time when the output last enters the band, s")
+    band: float = Field(description="half width of the band, in `unit`")
+    steady_error: Finite = Field(description="reference minus final value, in `unit`")
+    final_value: Finite = Field(description="mean of the last tenth of the record, in `unit`")
+    runs_away: bool = Field(
+        default=False,
+        description="whether the output leaves the reference further and further behind",
+    )
+    is_settled: bool = Field(
+        default=True, description="whether the output stays in the band to the end"
+    )
+    iae: Finite = Field(default=None, description="integral of |e|, in `unit` times s")
+    itae: Finite = Field(default=None, description="integral of t |e|, in `unit` times s²")
+    swing: Finite = Field(
+        default=None, description="sustained oscillation, peak to peak, in `unit`"
+    )
+    swing_period: Finite = Field(default=None, description="period of that oscillation, s")
 
 
 class ControllerOut(Answer):
@@ -139,18 +170,20 @@ class ControllerOut(Answer):
     samples at a limit.
     """
 
-    gain: float
-    integral_time: float | None
-    derivative_time: float
-    derivative_filter: float
-    derivative_on: str
-    setpoint_weight: float
-    lower: float | None
-    upper: float | None
-    tracking_time: float | None
-    command_min: float
-    command_max: float
-    saturated_percent: float
+    gain: float = Field(description="gain, in units of the input per unit of the output")
+    integral_time: float | None = Field(description="integral time, s; null without integral")
+    derivative_time: float = Field(description="derivative time, s")
+    derivative_filter: float = Field(
+        description="ratio of the derivative time to that of its filter"
+    )
+    derivative_on: str = Field(description="what the derivative acts on")
+    setpoint_weight: float = Field(description="weight of the reference in the proportional part")
+    lower: float | None = Field(description="least command, in the input's unit")
+    upper: float | None = Field(description="largest command, in the input's unit")
+    tracking_time: float | None = Field(description="time that resets the integral at a limit, s")
+    command_min: float = Field(description="least command that occurred, in the input's unit")
+    command_max: float = Field(description="largest command that occurred, in the input's unit")
+    saturated_percent: float = Field(description="share of the samples at a limit, %")
 
 
 class TuningOut(Answer):
@@ -161,15 +194,21 @@ class TuningOut(Answer):
     and `process_gain` is per s.
     """
 
-    rule: str
-    controller: str
-    closed_loop_time_constant: float | None
-    process_gain: float
-    process_delay: float
-    process_time_constant: Finite
-    process_second_time_constant: float
-    formulas: list[str]
-    reference: str
+    rule: str = Field(description="tuning rule")
+    controller: str = Field(description="kind of the controller")
+    closed_loop_time_constant: float | None = Field(
+        description="time constant of the closed loop (τ_c), s"
+    )
+    process_gain: float = Field(description="gain of the process; per s if it integrates")
+    process_delay: float = Field(description="dead time of the process, s")
+    process_time_constant: Finite = Field(
+        description="time constant of the process, s; null if it integrates"
+    )
+    process_second_time_constant: float = Field(
+        description="second time constant of the process, s"
+    )
+    formulas: list[str] = Field(description="formulas of the rule with their values")
+    reference: str = Field(description="where the rule was published")
 
 
 class MarginsOut(Answer):
@@ -180,26 +219,30 @@ class MarginsOut(Answer):
     rad/s. `sensitivity_peak` (M_s) is usually 1.2 to 2.
     """
 
-    is_stable: bool
-    gain_margin: Finite
-    phase_margin: Finite
-    delay_margin: Finite
-    crossover_frequency: Finite
-    sensitivity_peak: Finite
+    is_stable: bool = Field(description="whether the loop is stable")
+    gain_margin: Finite = Field(description="gain margin, a factor")
+    phase_margin: Finite = Field(description="phase margin, degrees")
+    delay_margin: Finite = Field(description="delay margin, s")
+    crossover_frequency: Finite = Field(description="crossover frequency, rad/s")
+    sensitivity_peak: Finite = Field(description="largest sensitivity (M_s)")
 
 
 class RunSimulationOut(Answer):
     """Simulated signals of a run's model, reduced so that extremes stay visible."""
 
-    id: str
-    parameters: dict[str, float]
-    outputs: list[SeriesOut]
-    inputs: list[SeriesOut]
-    reference: SeriesOut | None = None
-    command: SeriesOut | None = None
-    metrics: StepMetricsOut | None = None
-    controller: ControllerOut | None = None
-    tuning: TuningOut | None = None
-    margins: MarginsOut | None = None
-    notes: list[str] = Field(default=[])
-    dataset: DatasetOut | None = None
+    id: str = Field(description="identifier of the run")
+    parameters: dict[str, float] = Field(description="values of the parameters, in their units")
+    outputs: list[SeriesOut] = Field(description="simulated outputs")
+    inputs: list[SeriesOut] = Field(description="inputs of the model")
+    reference: SeriesOut | None = Field(default=None, description="reference of the loop")
+    command: SeriesOut | None = Field(default=None, description="command of the controller")
+    metrics: StepMetricsOut | None = Field(default=None, description="metrics of the step response")
+    controller: ControllerOut | None = Field(default=None, description="controller that was used")
+    tuning: TuningOut | None = Field(
+        default=None, description="process and source of the tuning rule"
+    )
+    margins: MarginsOut | None = Field(default=None, description="stability of the loop")
+    notes: list[str] = Field(default=[], description="what was assumed")
+    dataset: DatasetOut | None = Field(
+        default=None, description="stored result; null if it was not stored"
+    )

@@ -25,6 +25,11 @@ def _split_names(value: Any) -> Any:
     return [name.strip().lower() for name in value.split(",") if name.strip()]
 
 
+def _strip_slash(value: Any) -> Any:
+    """Strip the slash at the end of a path."""
+    return value.rstrip("/") if isinstance(value, str) else value
+
+
 class Settings(BaseSettings):
     """Storage, address, limits and habits of the service.
 
@@ -54,6 +59,10 @@ class Settings(BaseSettings):
     authenticates."""
     allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
     """More host names that are answered, separated by commas, such as that of a reverse proxy."""
+    root_path: Annotated[
+        str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
+    ] = ""
+    """Path below which a reverse proxy publishes the service, such as `/lagid`."""
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     """Largest recording. A larger one is answered by 413."""
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)

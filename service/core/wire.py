@@ -2,7 +2,17 @@
 
 from typing import Annotated, Any, Generic, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    JsonValue,
+    TypeAdapter,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from service.core.documents import to_finite
 
@@ -38,6 +48,34 @@ class Answer(BaseModel):
         return cls.model_validate(attributes | fields)
 
 
+class DescribedBy:
+    """Annotation of a document that is sent as it was stored; its schema is that of a wire type.
+
+    Validation would cost time in every list, and refuse what an earlier version has stored.
+    """
+
+    def __init__(self, kind: Any) -> None:
+        self._kind = kind
+
+    def __get_pydantic_json_schema__(
+        self, _schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return handler(TypeAdapter(self._kind).core_schema)
+
+
+Cell = dict[str, JsonValue]
+"""Values of the axes of a sweep, by the pointers of the fields."""
+Labels = dict[str, float | int | str | bool | None]
+"""Labels of a cell by name."""
+
+
+class FigureOut(Answer):
+    """A figure of Plotly."""
+
+    data: list[dict[str, Any]] = Field(description="traces, as Plotly defines them")
+    layout: dict[str, Any] = Field(description="layout, as Plotly defines it")
+
+
 Finite = Annotated[float | None, BeforeValidator(to_finite)]
 """A number of a response; null if there is none or it is not finite."""
 
@@ -45,16 +83,22 @@ Finite = Annotated[float | None, BeforeValidator(to_finite)]
 class Page(Answer, Generic[Item]):
     """A part of a long list; `next` is the cursor of the following part, None at the end."""
 
-    items: list[Item]
-    next: str | None = None
+    items: list[Item] = Field(description="items of this page, in the order of the list")
+    next: str | None = Field(
+        default=None, description="cursor of the following page; null on the last one"
+    )
 
 
 class FaultOut(Answer):
     """One fault of a request."""
 
-    pointer: str
-    detail: str
-    column: int | None = None
+    pointer: str = Field(
+        description="JSON pointer into the body; `?name`: in the query; `{name}`: in the path"
+    )
+    detail: str = Field(description="what was wrong, what was found, and what would be right")
+    column: int | None = Field(
+        default=None, description="column inside the text of the field, from 1; for equations"
+    )
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -64,5 +108,9 @@ Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 class NoiseIn(Body):
     """Noise added to the measured outputs before fitting, for sensitivity studies."""
 
-    sigma: Sigma = 0.0
-    seed: Seed = 0
+    sigma: Sigma = Field(
+        default=0.0, description="standard deviation of the noise, in the unit of each output"
+    )
+    seed: Seed = Field(
+        default=0, description="seed of the noise; the same seed gives the same noise"
+    )

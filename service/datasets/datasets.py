@@ -16,10 +16,10 @@ from sqlalchemy.orm import Session
 from service.core import temporary_files
 from service.core.errors import DatasetNotFound, TooLarge
 from service.core.settings import Settings
-from service.core.wire import Page
 from service.datasets.recordings import load_recording
 from service.datasets.schemas import (
     DatasetOut,
+    DatasetPage,
     DeriveIn,
     LineageEdgeOut,
     LineageOut,
@@ -245,10 +245,10 @@ def _measure_history(recording: Recording) -> float:
     )
 
 
-def list_datasets(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
+def list_datasets(session: Session, cursor: str | None, limit: int) -> DatasetPage:
     """List datasets, latest first."""
     page = DatasetRepository(session).list_page(cursor=cursor, limit=limit)
-    return Page(items=[to_out(row) for row in page.items], next=page.next)
+    return DatasetPage(items=[to_out(row) for row in page.items], next=page.next)
 
 
 def read_signals(

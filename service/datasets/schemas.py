@@ -3,10 +3,10 @@
 from datetime import datetime
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from service.core.wire import Answer, Body, NoiseIn, Seed
+from service.core.wire import Answer, Body, DescribedBy, Labels, NoiseIn, Page, Seed
 from sysid.data.records import Hold
 
 MAX_SIMULATED_SAMPLES = 10_000_000
@@ -18,12 +18,12 @@ SampleTime = Annotated[float, Field(ge=1e-9, le=1e9)]
 class WaveInput(Body):
     """offset + amplitude · cos(omega·t + phase); `omega` in rad/s or `frequency` in Hz."""
 
-    kind: Literal["cosine", "sine"]
-    amplitude: float = 1.0
-    omega: float | None = Field(default=None, ge=0)
-    frequency: float | None = Field(default=None, ge=0)
-    phase: float = 0.0
-    offset: float = 0.0
+    kind: Literal["cosine", "sine"] = Field(description="cosine or sine")
+    amplitude: float = Field(default=1.0, description="amplitude, in the input's unit")
+    omega: float | None = Field(default=None, ge=0, description="angular frequency, rad/s")
+    frequency: float | None = Field(default=None, ge=0, description="frequency, Hz")
+    phase: float = Field(default=0.0, description="phase, rad")
+    offset: float = Field(default=0.0, description="mean value, in the input's unit")
 
     @model_validator(mode="after")
     def _check_frequency(self) -> Self:
@@ -35,35 +35,39 @@ class WaveInput(Body):
 class StepInput(Body):
     """`offset` before `time` (s), `offset` + `amplitude` from then on."""
 
-    kind: Literal["step"]
-    amplitude: float = 1.0
-    time: float = 0.0
-    offset: float = 0.0
+    kind: Literal["step"] = Field(description="a step")
+    amplitude: float = Field(default=1.0, description="height of the step, in the input's unit")
+    time: float = Field(default=0.0, description="time of the step, s")
+    offset: float = Field(default=0.0, description="value before the step, in the input's unit")
 
 
 class BinaryInput(Body):
     """A held random binary signal: ± `amplitude` around `offset`, drawn every `period` (s)."""
 
-    kind: Literal["binary"]
-    amplitude: float = 1.0
-    period: float = Field(gt=0)
-    offset: float = 0.0
-    seed: Seed = 0
+    kind: Literal["binary"] = Field(description="a random binary signal")
+    amplitude: float = Field(
+        default=1.0, description="distance from the offset, in the input's unit"
+    )
+    period: float = Field(gt=0, description="time between two draws, s")
+    offset: float = Field(default=0.0, description="mean value, in the input's unit")
+    seed: Seed = Field(default=0, description="seed of the draws")
 
 
 class ExpressionInput(Body):
     """An expression of ``t`` (s) in the model language, such as ``10*cos(5*t)``."""
 
-    kind: Literal["expression"]
-    expression: str = Field(max_length=4000)
+    kind: Literal["expression"] = Field(description="an expression")
+    expression: str = Field(
+        max_length=4000, description="expression of t in s, in the model language"
+    )
 
 
 class DatasetInput(Body):
     """A channel of a stored dataset."""
 
-    kind: Literal["dataset"]
-    dataset: str
-    channel: str
+    kind: Literal["dataset"] = Field(description="a recorded channel")
+    dataset: str = Field(description="identifier of a stored dataset")
+    channel: str = Field(description="name of the channel")
 
 
 InputIn = Annotated[
@@ -86,14 +90,26 @@ class SimulateIn(Body):
       (a seed: pressures are read by gauges with noise and 12 bit).
     """
 
-    name: str | None = Field(default=None, max_length=200)
-    model: Any = None
-    plant: Literal["actuator", "tube"] | None = None
-    parameters: dict[str, float] = Field(default={})
-    inputs: dict[str, InputIn] = Field(default={})
-    samples: int | None = Field(default=None, ge=2, le=MAX_SIMULATED_SAMPLES)
-    sample_time: SampleTime | None = None
-    noise: NoiseIn = NoiseIn()
+    name: str | None = Field(
+        default=None,
+        max_length=200,
+        description="name of the dataset; by default that of the model or plant",
+    )
+    model: Any = Field(
+        default=None, description="name of a model, `name@version`, or a whole model document"
+    )
+    plant: Literal["actuator", "tube"] | None = Field(
+        default=None, description="reference plant instead of a model"
+    )
+    parameters: dict[str, float] = Field(
+        default={}, description="true values by name, in the units of the model"
+    )
+    inputs: dict[str, InputIn] = Field(default={}, description="waveform of each input")
+    samples: int | None = Field(
+        default=None, ge=2, le=MAX_SIMULATED_SAMPLES, description="number of samples"
+    )
+    sample_time: SampleTime | None = Field(default=None, description="sampling period, s")
+    noise: NoiseIn = Field(default=NoiseIn(), description="noise that is added to the outputs")
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
@@ -105,8 +121,12 @@ class SimulateIn(Body):
 class DeriveIn(Body):
     """A dataset derived from another by steps; each is an object with one key, the step name."""
 
-    name: str | None = Field(default=None, max_length=200)
-    steps: list[dict[str, Any]] = Field(min_length=1, max_length=32)
+    name: str | None = Field(default=None, max_length=200, description="name of the new dataset")
+    steps: list[dict[str, Any]] = Field(
+        min_length=1,
+        max_length=32,
+        description="steps in order; each is an object with one key, the name of the step",
+    )
 
 
 class ChannelOut(Answer):
@@ -116,48 +136,79 @@ class ChannelOut(Answer):
     them.
     """
 
-    name: str
-    unit: str
-    hold: str
-    samples: int
-    start: float
-    stop: float
-    sample_time: float | None
-    missing: int
-    history_samples: int
-    history_start: float | None
+    name: str = Field(description="name of the channel")
+    unit: str = Field(description="unit of its values; empty if unknown")
+    hold: str = Field(description="how it is read between its samples")
+    samples: int = Field(description="number of samples")
+    start: float = Field(description="time of the first sample, s")
+    stop: float = Field(description="time of the last sample, s")
+    sample_time: float | None = Field(description="sampling period, s; null if irregular")
+    missing: int = Field(description="samples without a value")
+    history_samples: int = Field(description="samples before `start`")
+    history_start: float | None = Field(
+        description="time of the first of them, s; null if there is none"
+    )
+
+
+class SegmentOut(Answer):
+    """Part of a recording that is identified as a separate experiment."""
+
+    start: float = Field(description="time of its start, s")
+    stop: float = Field(description="time of its end, s")
+    origin: float | None = Field(description="time that its own time 0 is, s")
+    labels: Labels = Field(description="values of the label columns")
+
+
+class DatasetDetailsOut(Answer):
+    """How a dataset was made: the file, the simulation, or the steps."""
+
+    model_config = ConfigDict(extra="allow")
+
+    source: Any = Field(default=None, description="file that was read, and how")
+    steps: list[dict[str, Any]] | None = Field(default=None, description="steps of a derivation")
+    known_before: float | None = Field(
+        default=None, description="recorded time before the start, s"
+    )
 
 
 class DatasetOut(Answer):
     """A stored recording."""
 
-    id: str
-    name: str
-    kind: str
-    sha256: str
-    size_bytes: int
-    channels: list[ChannelOut]
-    samples: int
-    duration: float
-    sample_time: float | None
+    id: str = Field(description="identifier, `ds_…`")
+    name: str = Field(description="name of the dataset")
+    kind: str = Field(description="how it was made: upload, simulate or derive")
+    sha256: str = Field(description="SHA-256 of the stored MCAP file, in hexadecimal")
+    size_bytes: int = Field(description="size of the stored MCAP file, bytes")
+    channels: list[ChannelOut] = Field(description="channels of the recording")
+    samples: int = Field(description="samples of the longest channel")
+    duration: float = Field(description="time from the first to the last sample, s")
+    sample_time: float | None = Field(
+        description="sampling period of all channels, s; null if irregular"
+    )
     started_at: str | None = Field(
         default=None,
         description="time 0 s on the clock that recorded, ISO 8601; without a zone it is local",
     )
-    segments: list[dict[str, Any]]
-    warnings: list[str]
-    details: dict[str, Any]
-    created_at: datetime
+    segments: list[SegmentOut] = Field(
+        description="parts that are identified as separate experiments"
+    )
+    warnings: list[str] = Field(description="what was guessed or is doubtful")
+    details: Annotated[Any, DescribedBy(DatasetDetailsOut)] = Field(description="how it was made")
+    created_at: datetime = Field(description="time of the upload, UTC")
+
+
+class DatasetPage(Page[DatasetOut]):
+    """Datasets, latest first."""
 
 
 class SeriesOut(Answer):
     """One line of a plot, with at most the requested number of points."""
 
-    name: str
-    unit: str
-    times: list[float]
-    values: list[float | None]
-    samples: int
+    name: str = Field(description="name of the signal")
+    unit: str = Field(description="unit of the values")
+    times: list[float] = Field(description="times, s")
+    values: list[float | None] = Field(description="values, in `unit`; null where there is none")
+    samples: int = Field(description="samples before the reduction")
 
 
 class SignalsOut(Answer):
@@ -166,24 +217,26 @@ class SignalsOut(Answer):
     `history` has their samples from before the start of the record.
     """
 
-    id: str
-    channels: list[SeriesOut]
-    history: list[SeriesOut] = Field(default=[])
+    id: str = Field(description="identifier of the dataset")
+    channels: list[SeriesOut] = Field(description="samples of each channel")
+    history: list[SeriesOut] = Field(
+        default=[], description="samples from before the start of the record"
+    )
 
 
 class LineageEdgeOut(Answer):
     """`child` was made from `parent`."""
 
-    parent: str
-    child: str
-    relation: str
+    parent: str = Field(description="identifier of the source")
+    child: str = Field(description="identifier of what was made from it")
+    relation: str = Field(description="how it was made")
 
 
 class LineageOut(Answer):
     """Everything that a dataset was made from, and everything made from it."""
 
-    id: str
-    edges: list[LineageEdgeOut]
+    id: str = Field(description="identifier of the dataset")
+    edges: list[LineageEdgeOut] = Field(description="all steps to it and from it")
 
 
 MAX_SERIES_SAMPLES = 1_000_000
@@ -192,10 +245,14 @@ MAX_SERIES_SAMPLES = 1_000_000
 class SeriesInput(Body):
     """Samples in the request; before the first and after the last sample the value is constant."""
 
-    kind: Literal["series"]
-    times: list[float] = Field(min_length=1, max_length=MAX_SERIES_SAMPLES)
-    values: list[float] = Field(min_length=1, max_length=MAX_SERIES_SAMPLES)
-    hold: Hold = "first"
+    kind: Literal["series"] = Field(description="samples in the request")
+    times: list[float] = Field(
+        min_length=1, max_length=MAX_SERIES_SAMPLES, description="times, s, ascending"
+    )
+    values: list[float] = Field(
+        min_length=1, max_length=MAX_SERIES_SAMPLES, description="values, in the input's unit"
+    )
+    hold: Hold = Field(default="first", description="how it is read between its samples")
 
     @model_validator(mode="after")
     def _as_many(self) -> Self:

@@ -4,13 +4,18 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
-from service.core.wire import Page
-from service.jobs.schemas import REFERENCE_PREFIX, RUN_PREFIX, ReferenceIn, ReferenceOut
+from service.jobs.schemas import (
+    REFERENCE_PREFIX,
+    RUN_PREFIX,
+    ReferenceIn,
+    ReferenceOut,
+    ReferencePage,
+)
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
 from service.repositories.references import CurrentReference, ReferenceRepository
 from service.repositories.runs import RunRepository
-from service.storage.errors import RowNotFound
+from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
 
@@ -45,10 +50,12 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
     )
 
 
-def list_references(session: Session, cursor: str | None, limit: int) -> Page[ReferenceOut]:
-    """List the references in use, by name."""
+def list_references(session: Session, cursor: str | None, limit: int) -> ReferencePage:
+    """List the references in use, by name; a cursor is the last name of the previous page."""
+    if cursor is not None and _find_name_fault(cursor) is not None:
+        raise InvalidCursor(cursor)
     page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
-    return Page(
+    return ReferencePage(
         items=[_to_reference_out(reference, []) for reference in page.items], next=page.next
     )
 
@@ -77,19 +84,24 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
 
 def _check_name(name: str) -> None:
     """Refuse names that look like a run's id or like parts of a path."""
+    requirement = _find_name_fault(name)
+    if requirement is not None:
+        raise InvalidRequest.from_fault(
+            "{name}", f"the name in the path is {name!r:.120}; need {requirement}"
+        )
+
+
+def _find_name_fault(name: str) -> str | None:
+    """Return what a name of a reference must be, if this one is not; else None."""
     if not 1 <= len(name) <= MAX_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        requirement = f"1 to {MAX_NAME_CHARACTERS} printable characters without outer blanks"
-    elif name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
-        requirement = (
+        return f"1 to {MAX_NAME_CHARACTERS} printable characters without outer blanks"
+    if name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
+        return (
             f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"
         )
-    elif "/" in name or not name.strip("."):
-        requirement = "one without '/', and not of dots only"
-    else:
-        return
-    raise InvalidRequest.from_fault(
-        "{name}", f"the name in the path is {name!r:.120}; need {requirement}"
-    )
+    if "/" in name or not name.strip("."):
+        return "one without '/', and not of dots only"
+    return None
 
 
 def _check_model(session: Session, name: str, run: Run) -> None:

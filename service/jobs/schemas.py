@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.states import StateName
-from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed
+from service.core.wire import Answer, Body, DescribedBy, Labels, NoiseIn, Page, Pointer, Seed
 from sysid.core.settings import (
     MAX_BITS,
     MAX_EVALUATIONS,
@@ -46,18 +46,33 @@ MutationSchedule = Annotated[
 class ParameterIn(Body):
     """Changes of one parameter of the model."""
 
-    lower: float | None = None
-    upper: float | None = None
-    scale: ParameterScale | None = None
-    fixed: float | None = None
-    tied: str | None = Field(default=None, max_length=1000)
+    lower: float | None = Field(default=None, description="lower bound, in the parameter's unit")
+    upper: float | None = Field(default=None, description="upper bound, in the parameter's unit")
+    scale: ParameterScale | None = Field(
+        default=None, description="scale on which the search moves"
+    )
+    fixed: float | None = Field(
+        default=None, description="value at which the parameter is held, in its unit"
+    )
+    tied: str | None = Field(
+        default=None,
+        max_length=1000,
+        description="expression of other parameters that gives the value",
+    )
 
 
 class ValidationIn(Body):
     """Validation data: other datasets, or the last fraction of each record."""
 
-    datasets: list[str] | None = Field(default=None, min_length=1)
-    fraction: float | None = Field(default=None, gt=0, lt=1)
+    datasets: list[str] | None = Field(
+        default=None, min_length=1, description="datasets that are compared, but not fitted"
+    )
+    fraction: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="last part of each record that is compared, but not fitted",
+    )
 
     @model_validator(mode="after")
     def _check_one_source(self) -> Self:
@@ -73,25 +88,51 @@ class LossIn(Body):
     are coloured and the model integrates (initial errors persist), else white.
     """
 
-    kind: LossKind = LOSS.kind
-    scale: float = Field(default=LOSS.scale, gt=0)
-    noise_model: NoiseModel = LOSS.noise_model
+    kind: LossKind = Field(
+        default=LOSS.kind, description="squares, or soft-l1 where there are outliers"
+    )
+    scale: float = Field(
+        default=LOSS.scale,
+        gt=0,
+        description="residual beyond which soft-l1 grows linearly, in the output's unit",
+    )
+    noise_model: NoiseModel = Field(
+        default=LOSS.noise_model, description="noise model of the estimates"
+    )
 
 
 class SequenceIn(Body):
     """The sequence search."""
 
-    kind: SequenceKind = SEARCH.sequence.kind
-    beta: float = Field(default=SEARCH.sequence.beta, gt=0, lt=1)
-    relative: bool = SEARCH.sequence.relative
+    kind: SequenceKind = Field(
+        default=SEARCH.sequence.kind, description="kind of the sequence search"
+    )
+    beta: float = Field(
+        default=SEARCH.sequence.beta,
+        gt=0,
+        lt=1,
+        description="first step, as a share of the value or of the range",
+    )
+    relative: bool = Field(
+        default=SEARCH.sequence.relative, description="whether steps are relative to the value"
+    )
 
 
 class MigrationIn(Body):
     """Exchange between islands."""
 
-    every: PositiveCount = SEARCH.migration.every
-    topology: TopologyName = SEARCH.migration.topology
-    migrants: int = Field(default=SEARCH.migration.migrants, ge=0, le=MAX_INDIVIDUALS)
+    every: PositiveCount = Field(
+        default=SEARCH.migration.every, description="generations between two migrations"
+    )
+    topology: TopologyName = Field(
+        default=SEARCH.migration.topology, description="which islands send to which"
+    )
+    migrants: int = Field(
+        default=SEARCH.migration.migrants,
+        ge=0,
+        le=MAX_INDIVIDUALS,
+        description="individuals that each island sends",
+    )
 
 
 class StopIn(Body):
@@ -104,36 +145,81 @@ class StopIn(Body):
     nearby, `settled` of either kind and nearly all restarts must agree. Null disables it.
     """
 
-    evaluations: EvaluationLimit | None = SEARCH.stop.evaluations
-    seconds: float | None = Field(default=SEARCH.stop.seconds, gt=0)
-    rms: float | None = Field(default=SEARCH.stop.rms, gt=0)
-    settled: int | None = Field(default=SEARCH.stop.settled, ge=1, le=1_000_000)
+    evaluations: EvaluationLimit | None = Field(
+        default=SEARCH.stop.evaluations, description="most evaluations of a run"
+    )
+    seconds: float | None = Field(
+        default=SEARCH.stop.seconds, gt=0, description="most compute time of a run, s"
+    )
+    rms: float | None = Field(
+        default=SEARCH.stop.rms,
+        gt=0,
+        description="RMS error at which a run stops, in the output's unit",
+    )
+    settled: int | None = Field(
+        default=SEARCH.stop.settled,
+        ge=1,
+        le=1_000_000,
+        description="further confirmations of the best individual; null: never stop for them",
+    )
 
 
 class IslandIn(Body):
     """Settings in which one island differs."""
 
-    method: SearchMethod | None = None
-    bits: Bits | None = None
-    mutation: MutationSchedule | None = None
+    method: SearchMethod | None = Field(default=None, description="method of this island")
+    bits: Bits | None = Field(default=None, description="bits of each parameter")
+    mutation: MutationSchedule | None = Field(
+        default=None,
+        description="mutation rate from a generation on, as pairs of generation and rate",
+    )
 
 
 class AlgorithmIn(Body):
     """Settings of the search."""
 
-    method: SearchMethod = SEARCH.method
-    population: int = Field(default=SEARCH.population, ge=MIN_POPULATION, le=MAX_INDIVIDUALS)
-    generations: int = Field(default=SEARCH.generations, ge=1, le=10_000_000)
-    bits: Bits = SEARCH.bits
-    selection_rate: float = Field(default=SEARCH.selection_rate, gt=0, lt=1)
-    mutation: MutationSchedule = Field(default=[*SEARCH.mutation])
-    stagnation: PositiveCount = SEARCH.stagnation
-    sequence: SequenceIn = SequenceIn()
-    islands: int | list[IslandIn] | None = None
-    migration: MigrationIn = MigrationIn()
-    refine: bool = SEARCH.refine
-    safe_limit: float | None = Field(default=SEARCH.safe_limit, gt=0)
-    stop: StopIn = StopIn()
+    method: SearchMethod = Field(default=SEARCH.method, description="method of the search")
+    population: int = Field(
+        default=SEARCH.population,
+        ge=MIN_POPULATION,
+        le=MAX_INDIVIDUALS,
+        description="individuals over all islands",
+    )
+    generations: int = Field(
+        default=SEARCH.generations, ge=1, le=10_000_000, description="most generations"
+    )
+    bits: Bits = Field(default=SEARCH.bits, description="bits of each parameter in the chromosome")
+    selection_rate: float = Field(
+        default=SEARCH.selection_rate,
+        gt=0,
+        lt=1,
+        description="share of the population that survives",
+    )
+    mutation: MutationSchedule = Field(
+        default=[*SEARCH.mutation],
+        description="mutation rate from a generation on, as pairs of generation and rate",
+    )
+    stagnation: PositiveCount = Field(
+        default=SEARCH.stagnation,
+        description="generations without a better champion until the sequence search begins",
+    )
+    sequence: SequenceIn = Field(
+        default=SequenceIn(), description="settings of the sequence search"
+    )
+    islands: int | list[IslandIn] | None = Field(
+        default=None,
+        description="number of islands, or settings of each; null: chosen by the method",
+    )
+    migration: MigrationIn = Field(default=MigrationIn(), description="exchange between islands")
+    refine: bool = Field(
+        default=SEARCH.refine, description="whether least squares continues from the champions"
+    )
+    safe_limit: float | None = Field(
+        default=SEARCH.safe_limit,
+        gt=0,
+        description="magnitude of a signal beyond which a simulation counts as unstable",
+    )
+    stop: StopIn = Field(default=StopIn(), description="further end conditions")
 
 
 MAX_AXIS_VALUES = 1_000_000
@@ -148,12 +234,27 @@ class SweepAxisIn(Body):
     name step together; all others are crossed. `labels` belong to the values, one each.
     """
 
-    path: Pointer
-    values: list[Any] | None = Field(default=None, min_length=1, max_length=MAX_AXIS_VALUES)
-    range: list[WholeNumber] | None = Field(default=None, min_length=2, max_length=3)
-    log: tuple[float, float, int] | None = None
-    zip: str | None = Field(default=None, max_length=100)
-    labels: list[AxisLabels] | None = Field(default=None, max_length=MAX_AXIS_VALUES)
+    path: Pointer = Field(description="JSON pointer to the field of the job that changes")
+    values: list[Any] | None = Field(
+        default=None, min_length=1, max_length=MAX_AXIS_VALUES, description="values of the field"
+    )
+    range: list[WholeNumber] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=3,
+        description="whole numbers: start, stop[, step], without stop",
+    )
+    log: tuple[float, float, int] | None = Field(
+        default=None, description="start, stop and count of values with equal ratios"
+    )
+    zip: str | None = Field(
+        default=None, max_length=100, description="axes of this name step together"
+    )
+    labels: list[AxisLabels] | None = Field(
+        default=None,
+        max_length=MAX_AXIS_VALUES,
+        description="labels of each value, such as a length",
+    )
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
@@ -170,7 +271,9 @@ class SweepAxisIn(Body):
 class SweepIn(Body):
     """Sweep: the crossed axes give one run per cell."""
 
-    axes: list[SweepAxisIn] = Field(default=[], max_length=16)
+    axes: list[SweepAxisIn] = Field(
+        default=[], max_length=16, description="axes, which are crossed"
+    )
 
 
 PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX = "previous", "reference:", "run_"
@@ -219,10 +322,21 @@ class TrendIn(Body):
     `reference:` and a name) to compare the batch with.
     """
 
-    x: str = Field(min_length=1, max_length=64)
-    parameters: list[str] = Field(default=[], max_length=100)
-    predict: list[TrendX] = Field(default=[], max_length=100)
-    reference: Annotated[str, Field(max_length=300), AfterValidator(_check_reference)] | None = None
+    x: str = Field(
+        min_length=1, max_length=64, description="name of the label that is the abscissa"
+    )
+    parameters: list[str] = Field(
+        default=[], max_length=100, description="parameters to analyse; empty: all free ones"
+    )
+    predict: list[TrendX] = Field(
+        default=[], max_length=100, description="values of x to predict at, in the label's unit"
+    )
+    reference: Annotated[str, Field(max_length=300), AfterValidator(_check_reference)] | None = (
+        Field(
+            default=None,
+            description="run to compare the batch with: `run_…`, or `reference:` and a name",
+        )
+    )
 
 
 def check_model_reference(value: Any) -> Any:
@@ -238,17 +352,37 @@ def check_model_reference(value: Any) -> Any:
 class IdentificationIn(Body):
     """Fields common to a job and to the recipes that make jobs: the model, and how to fit it."""
 
-    name: str | None = Field(default=None, max_length=200)
-    model: Annotated[Any, AfterValidator(check_model_reference)]
-    channels: dict[str, str] = Field(default={})
-    hold: dict[str, HoldSetting] = Field(default={})
-    parameters: dict[str, ParameterIn] = Field(default={})
-    prediction: PredictionKind = "simulation"
-    loss: LossIn = LossIn()
-    weights: dict[str, float] | None = None
-    skip: int = Field(default=0, ge=0)
-    algorithm: AlgorithmIn = AlgorithmIn()
-    priority: int = Field(default=0, ge=-100, le=100)
+    name: str | None = Field(
+        default=None, max_length=200, description="name of the job; by default model and dataset"
+    )
+    model: Annotated[Any, AfterValidator(check_model_reference)] = Field(
+        description="name of a model, `name@version`, or a whole model document"
+    )
+    channels: dict[str, str] = Field(
+        default={},
+        description="recorded channel of each signal of the model; equal names need no entry",
+    )
+    hold: dict[str, HoldSetting] = Field(
+        default={}, description="how each input is read between its samples"
+    )
+    parameters: dict[str, ParameterIn] = Field(
+        default={}, description="changes of the model's parameters by name"
+    )
+    prediction: PredictionKind = Field(
+        default="simulation", description="from its own past (simulation) or from the measured past"
+    )
+    loss: LossIn = Field(default=LossIn(), description="loss function")
+    weights: dict[str, float] | None = Field(
+        default=None,
+        description="weight of each output; by default one over its standard deviation",
+    )
+    skip: int = Field(
+        default=0, ge=0, description="samples at the start of each output that are not scored"
+    )
+    algorithm: AlgorithmIn = Field(default=AlgorithmIn(), description="settings of the search")
+    priority: int = Field(
+        default=0, ge=-100, le=100, description="jobs of higher priority come first"
+    )
     reuse: bool = Field(
         default=True, description="take over results of earlier runs with the same specification"
     )
@@ -268,15 +402,26 @@ class IdentificationIn(Body):
 class JobIn(IdentificationIn):
     """Job: model, data, and how to identify."""
 
-    datasets: list[str] = Field(min_length=1, max_length=1000)
-    validation: ValidationIn | None = None
-    noise: NoiseIn = NoiseIn()
-    seed: Seed = 1
-    sweep: SweepIn = SweepIn()
-    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (
-        None
+    datasets: list[str] = Field(
+        min_length=1,
+        max_length=1000,
+        description="datasets by name or id, fitted together as several experiments",
     )
-    trend: TrendIn | None = None
+    validation: ValidationIn | None = Field(
+        default=None, description="data that are compared, but not fitted"
+    )
+    noise: NoiseIn = Field(default=NoiseIn(), description="noise that is added before fitting")
+    seed: Seed = Field(
+        default=1, description="seed of the search; the same seed gives the same bits"
+    )
+    sweep: SweepIn = Field(default=SweepIn(), description="fields that change from run to run")
+    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (
+        Field(
+            default=None,
+            description="where runs begin: `previous`, a run, or `reference:` and a name",
+        )
+    )
+    trend: TrendIn | None = Field(default=None, description="trend of the estimates over a label")
     posterior: bool = Field(
         default=False, description="sample the posterior distribution of the free parameters"
     )
@@ -294,72 +439,95 @@ class JobIn(IdentificationIn):
 class ProgressOut(Answer):
     """Progress of a job."""
 
-    runs: int
-    finished: int
-    failed: int
+    runs: int = Field(description="runs of the job")
+    finished: int = Field(description="runs that have ended, failed ones included")
+    failed: int = Field(description="runs that failed")
     reused: int = Field(default=0, description="runs taken over from earlier runs")
     best_rms: float | None = Field(
         default=None,
         description="of the best run. Not comparable between runs on other data or noise",
     )
-    evaluations: int = 0
-    generation: int = 0
-    seconds_left: float | None = None
+    evaluations: int = Field(default=0, description="simulations so far, over all runs")
+    generation: int = Field(default=0, description="generations so far of the run that is furthest")
+    seconds_left: float | None = Field(
+        default=None, description="estimated time to the end, s; null if unknown"
+    )
 
 
 class JobOut(Answer):
     """A job and its state."""
 
-    id: str
-    name: str
-    state: StateName
-    cancel_requested: bool = False
-    created_at: datetime
-    started_at: datetime | None = None
-    finished_at: datetime | None = None
+    id: str = Field(description="identifier, `job_…`")
+    name: str = Field(description="name of the job")
+    state: StateName = Field(description="state of the job")
+    cancel_requested: bool = Field(
+        default=False, description="whether it was asked to stop, and has not yet"
+    )
+    created_at: datetime = Field(description="time of the submission, UTC")
+    started_at: datetime | None = Field(default=None, description="time of the first start, UTC")
+    finished_at: datetime | None = Field(default=None, description="time of the end, UTC")
     seconds: float | None = Field(
         default=None,
         description="wall time from the first start to the end, or to now; null while queued",
     )
     attempt: int = Field(description="number of starts, resumptions included")
-    error: str | None = None
-    model: str
-    priority: int
-    progress: ProgressOut
+    error: str | None = Field(default=None, description="why the job failed; null if it did not")
+    model: str = Field(description="name of the model")
+    priority: int = Field(description="jobs of higher priority come first")
+    progress: ProgressOut = Field(description="progress of its runs")
     rms_unit: str | None = Field(
         default=None, description="unit of the best RMS; σ for several weighted outputs"
     )
-    request: dict[str, Any] | None = None
+    request: Annotated[Any, DescribedBy(JobIn | None)] = Field(
+        default=None, description="the request with every default; null in lists"
+    )
+
+
+class JobPage(Page[JobOut]):
+    """Jobs, latest first."""
 
 
 class ReferenceIn(Body):
     """Acceptance of a run as a reference; `by` and `note` are stored with it."""
 
-    run: str = Field(max_length=100)
-    by: str | None = Field(default=None, max_length=200)
-    note: str | None = Field(default=None, max_length=2000)
+    run: str = Field(max_length=100, description="id of the accepted run, which succeeded")
+    by: str | None = Field(default=None, max_length=200, description="who accepts it")
+    note: str | None = Field(default=None, max_length=2000, description="why it was accepted")
 
 
 class AcceptanceOut(Answer):
     """One acceptance."""
 
-    run: str
-    by: str | None = None
-    note: str | None = None
-    at: datetime
+    run: str = Field(description="id of the accepted run")
+    by: str | None = Field(default=None, description="who accepted it")
+    note: str | None = Field(default=None, description="why it was accepted")
+    at: datetime = Field(description="time of the acceptance, UTC")
+
+
+class ReferenceValueOut(Answer):
+    """Estimate of one parameter of a reference."""
+
+    value: float | None = Field(description="estimate, in the parameter's unit")
+    stderr: float | None = Field(description="standard error, in the parameter's unit")
 
 
 class ReferenceOut(Answer):
     """Reference: the run in use, its estimates, and earlier acceptances."""
 
-    name: str
-    run: str
-    job: str
-    by: str | None = None
-    note: str | None = None
-    at: datetime
-    labels: dict[str, Any] = Field(default={})
-    estimates: dict[str, dict[str, float | None]] = Field(default={})
+    name: str = Field(description="name of the reference")
+    run: str = Field(description="id of the run in use")
+    job: str = Field(description="id of its job")
+    by: str | None = Field(default=None, description="who accepted it")
+    note: str | None = Field(default=None, description="why it was accepted")
+    at: datetime = Field(description="time of the acceptance, UTC")
+    labels: Labels = Field(default={}, description="labels of the run")
+    estimates: dict[str, ReferenceValueOut] = Field(
+        default={}, description="estimates by parameter, each in the parameter's unit"
+    )
     history: list[AcceptanceOut] = Field(
         default=[], description="the previous acceptances (at most 1,000), latest first"
     )
+
+
+class ReferencePage(Page[ReferenceOut]):
+    """References in use, by name."""

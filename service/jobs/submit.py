@@ -13,11 +13,10 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
-from service.core.wire import Page
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
-from service.jobs.schemas import JobIn, JobOut, ProgressOut
+from service.jobs.schemas import JobIn, JobOut, JobPage, ProgressOut
 from service.jobs.stored_cells import (
     CELLS_AT_SUBMISSION,
     build_stored_cells,
@@ -199,13 +198,11 @@ def measure_seconds(job: Job, now: datetime) -> float | None:
     return max(((job.finished_at or now) - job.started_at).total_seconds(), 0.0)
 
 
-def list_jobs(
-    session: Session, cursor: str | None, limit: int, states: list[JobState]
-) -> Page[JobOut]:
+def list_jobs(session: Session, cursor: str | None, limit: int, states: list[JobState]) -> JobPage:
     """List jobs, latest first."""
     page = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
     items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in page.items]
-    return Page(items=items, next=page.next)
+    return JobPage(items=items, next=page.next)
 
 
 def _choose_name(checker: JobChecker, spec: Mapping[str, Any]) -> str:

@@ -11,9 +11,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, NotFound
-from service.core.wire import Page
 from service.models.catalogue import list_catalogue, to_builtin_out, to_model_out
-from service.models.schemas import ModelOut
+from service.models.schemas import ModelOut, ModelPage
 from service.repositories.models import ModelRepository
 from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
@@ -23,11 +22,11 @@ from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
 
 
-def list_models(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
+def list_models(session: Session, cursor: str | None, limit: int) -> ModelPage:
     """List the built-in models (first page), then all versions of user models, latest first."""
     stored = ModelRepository(session).list_page(cursor=cursor, limit=limit)
     built_in = [] if cursor else list_catalogue()
-    return Page(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
+    return ModelPage(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
 
 
 def get_model(session: Session, reference: str) -> ModelOut:

@@ -1,5 +1,6 @@
 """List the operations of the REST interface from its OpenAPI document, for the page /docs."""
 
+import json
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ class ApiOperation(NamedTuple):
     body: str
     fields: tuple[ApiField, ...]
     answers: tuple[tuple[str, str], ...]
+    example: str
 
 
 def list_operations(document: Mapping[str, Any]) -> tuple[ApiOperation, ...]:
@@ -62,15 +64,22 @@ def _to_operation(
         body=_describe_schema(schema) if schema else "",
         fields=tuple(_iterate_fields(document, schema)),
         answers=tuple(
-            (code, response["description"]) for code, response in item["responses"].items()
+            (code, _follow(document, response)["description"])
+            for code, response in item["responses"].items()
         ),
+        example=_format_example(content),
     )
 
 
+def _format_example(content: Mapping[str, Any]) -> str:
+    """Format the first example of a body; empty if there is none."""
+    examples = (entry["example"] for entry in content.values() if "example" in entry)
+    example = next(examples, "")
+    return example if isinstance(example, str) else json.dumps(example, indent=2)
+
+
 def _iterate_fields(document: Mapping[str, Any], schema: Mapping[str, Any]) -> Iterator[ApiField]:
-    target = schema
-    if "$ref" in schema:
-        target = document["components"]["schemas"][schema["$ref"].rpartition("/")[2]]
+    target = _follow(document, schema)
     required = target.get("required", ())
     for name, field in target.get("properties", {}).items():
         yield ApiField(
@@ -80,6 +89,15 @@ def _iterate_fields(document: Mapping[str, Any], schema: Mapping[str, Any]) -> I
             _format_default(field),
             field.get("description", ""),
         )
+
+
+def _follow(document: Mapping[str, Any], value: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a value refers to, or the value."""
+    if "$ref" not in value:
+        return value
+    _, _, kind, name = value["$ref"].split("/")
+    target: Mapping[str, Any] = document["components"][kind][name]
+    return target
 
 
 def _describe_schema(schema: Mapping[str, Any]) -> str:

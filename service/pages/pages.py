@@ -9,6 +9,7 @@ from urllib.parse import urlencode
 import yaml
 from sqlalchemy.orm import Session
 
+from service.core.root_path import to_address
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, noise_sweep_height
@@ -302,7 +303,8 @@ def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]
 
 def _object_href(name: str) -> str:
     kind = name.partition("_")[0]
-    return {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/") + name
+    folder = {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/")
+    return to_address(folder + name)
 
 
 def _encode_query(values: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from service.core.root_path import get_root_path, to_address
 from service.core.text import TEMPLATE_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
@@ -78,7 +79,9 @@ def template_environment() -> Environment:
     environment.filters.update(TEMPLATE_FILTERS)
     environment.globals["default_algorithm"] = GeneticAlgorithm()
     environment.globals.update(
-        static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_file_name()}"
+        root=get_root_path,
+        static=lambda name: to_address(f"/static/{name}"),
+        plotly=lambda: to_address(f"/static/{plotly_file_name()}"),
     )
     return environment
 

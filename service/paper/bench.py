@@ -59,7 +59,7 @@ class StudyBench:
     quick: bool
     say: Callable[[str], object]
 
-    def run_job(self, body: Document) -> list[dict[str, Any]]:
+    def run_job(self, body: Document) -> Sequence[Mapping[str, Any]]:
         """Submit one job and wait for its runs.
 
         Raises

@@ -50,7 +50,7 @@ def model_document(recursion: Mapping[str, Any], kind: str) -> dict[str, Any]:
 def build_section(bench: StudyBench, exact: str) -> Section:
     """Build the section for both kinds of noise; `exact` is the dataset without noise."""
     draws = 3 if bench.quick else 8
-    recursion = bench.client.model(EXAMPLE_1.recursion)["document"]
+    recursion = bench.client.model(EXAMPLE_1.recursion)["document"] or {}
     bench.say("paper Figure 15: records with noise inside the equation")
     noise = bench.client.simulate_dataset(
         {

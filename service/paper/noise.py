@@ -1,6 +1,6 @@
 """Figure 15: identification under noise, one job of σ × replicates × methods."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -61,7 +61,7 @@ def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
 
 
 def group_replicates(
-    runs: Sequence[dict[str, Any]], field: str
+    runs: Sequence[Mapping[str, Any]], field: str
 ) -> dict[str, list[ReplicateErrors]]:
     """Compute quantiles of one result field over the replicates, by method and σ."""
     groups: dict[str, list[ReplicateErrors]] = {}

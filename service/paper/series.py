@@ -77,7 +77,7 @@ def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[flo
         }
     )
     series = bench.client.signals(dataset["id"])["channels"][0]
-    return series["times"], series["values"]
+    return series["times"], [value for value in series["values"] if value is not None]
 
 
 def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) -> list[Plot]:

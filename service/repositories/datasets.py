@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from service.repositories.lineage import LineageRepository, Relation
 from service.storage.columns import Document, utc_now
 from service.storage.errors import RowNotFound
-from service.storage.statements import RowPage, make_page, new_id
+from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
 from service.storage.tables import DEFAULT_PROJECT, Dataset
 
 
@@ -104,7 +104,7 @@ class DatasetRepository:
             .limit(limit + 1)
         )
         if cursor is not None:
-            query = query.where(Dataset.id < cursor)
+            query = query.where(Dataset.id < check_id_cursor(cursor, "ds"))
         rows = self._session.scalars(query).all()
         return make_page(rows, limit, (dataset.id for dataset in rows))
 

@@ -12,7 +12,13 @@ from service.core.states import OPEN_STATES, JobState
 from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
-from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
+from service.storage.statements import (
+    RETURNING_OPTIONS,
+    RowPage,
+    check_id_cursor,
+    make_page,
+    new_id,
+)
 from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
@@ -104,7 +110,7 @@ class JobRepository:
         """List jobs, latest first. The pages do not shift while new jobs arrive."""
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
-            query = query.where(Job.id < cursor)
+            query = query.where(Job.id < check_id_cursor(cursor, "job"))
         rows: Sequence[Job]
         if states:  # each by itself, so that an index has them in order
             found = [

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from service.storage.columns import Document, to_json, utc_now
 from service.storage.errors import RowNotFound
-from service.storage.statements import RowPage, make_page, new_id
+from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
 from service.storage.tables import DEFAULT_PROJECT, ModelVersion
 
 _MAX_TRIES = 20
@@ -61,7 +61,7 @@ class ModelRepository:
             .limit(limit + 1)
         )
         if cursor is not None:
-            query = query.where(ModelVersion.id < cursor)
+            query = query.where(ModelVersion.id < check_id_cursor(cursor, "mdl"))
         rows = self._session.scalars(query).all()
         return make_page(rows, limit, (model.id for model in rows))
 

@@ -27,6 +27,9 @@ _MEDIA_TYPES: Mapping[ExportFormat, tuple[str, str]] = {
     "control": ("text/x-python", "_control.py"),
 }
 
+TEXT_TYPES = sorted({kind for kind, _ in _MEDIA_TYPES.values()} - {"application/json"})
+"""Media types of the formats that are source code."""
+
 
 class ExportFile(NamedTuple):
     """File with its text, media type and name."""

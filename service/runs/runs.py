@@ -10,13 +10,19 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.json_pointer import build_run_body
 from service.core.states import JobState
-from service.core.wire import Page
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import WrittenProgress, read_written_progress
 from service.repositories.runs import RunOrder, RunRepository
-from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, MigrationsOut, RunOut
+from service.runs.schemas import (
+    HistoryOut,
+    ImprovementOut,
+    MigrantOut,
+    MigrationsOut,
+    RunOut,
+    RunPage,
+)
 from service.storage.tables import Job, Run
 from sysid.models.parameters import Parameter
 
@@ -36,7 +42,7 @@ class RunQuery:
 
 def list_runs(
     session: Session, job_id: str, cursor: str | None, limit: int, choice: RunQuery
-) -> Page[RunOut]:
+) -> RunPage:
     """List the runs of a job."""
     job = JobRepository(session).get(job_id)
     page = RunRepository(session).list_page(
@@ -51,7 +57,7 @@ def list_runs(
     )
     progress = read_written_progress(session, [run.id for run in page.items if run.result is None])
     items = [_leave_out_samples(to_run_out(run, job, progress.get(run.id))) for run in page.items]
-    return Page(items=items, next=page.next)
+    return RunPage(items=items, next=page.next)
 
 
 def get_run(session: Session, run_id: str) -> RunOut:
@@ -101,10 +107,9 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
 
 def _leave_out_samples(run: RunOut) -> RunOut:
     """Leave out the samples of the posterior, which a list of runs would repeat for each."""
-    posterior = (run.model_extra or {}).get("posterior")
-    if not posterior:
+    if not run.posterior:
         return run
-    kept = {name: value for name, value in posterior.items() if name != "samples"}
+    kept = {name: value for name, value in run.posterior.items() if name != "samples"}
     return run.model_copy(update={"posterior": kept})
 
 

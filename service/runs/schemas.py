@@ -6,105 +6,187 @@ The names in results are those of the numerical core.
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from service.core.states import StateName
-from service.core.wire import Answer, Body, Finite
+from service.core.wire import (
+    Answer,
+    Body,
+    Cell,
+    DescribedBy,
+    FigureOut,
+    Finite,
+    Labels,
+    Page,
+)
 from service.datasets.schemas import SeriesOut
+from service.models.schemas import ModelDocumentOut
+from service.runs.result_schemas import (
+    AgreementsOut,
+    CriteriaOut,
+    EstimateOut,
+    FitOut,
+    IdentifiabilityOut,
+    InputHoldOut,
+    IslandOut,
+    KnownBeforeOut,
+    MatrixOut,
+    OnsetDelayOut,
+    PosteriorOut,
+    ResidualTestOut,
+    ResidualVerdictOut,
+    SearchOut,
+    SelectedTermOut,
+)
 
 
 class RunOut(Answer):
     """One identification: its cell of the sweep, progress, and result.
 
-    The fields of the result document (estimates, fit, islands, warnings …) are added once it
-    exists. See the contract in the documentation of the interface.
+    What belongs to the result is null until it exists.
     """
 
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    id: str
-    job: str
-    number: int
-    cell: dict[str, Any]
-    labels: dict[str, Any]
-    state: StateName
-    valid: bool | None = None
-    rms: float | None = None
-    rms_unit: str | None = Field(
-        default=None, description="given for a single run; σ for several weighted outputs"
-    )
-    evaluations: int = 0
-    generations: int = 0
-    seconds: float | None = None
-    progress: float
-    error: str | None = None
+    id: str = Field(description="identifier, `run_…`")
+    job: str = Field(description="identifier of its job")
+    number: int = Field(description="number in the job, from 0")
+    cell: Cell = Field(description="values of the sweep's axes, by their pointers")
+    labels: Labels = Field(description="labels of the cell, such as a length")
+    state: StateName = Field(description="state of the run")
+    progress: float = Field(description="share that is done, from 0 to 1")
+    error: str | None = Field(default=None, description="why the run failed; null if it did not")
     reused_from: str | None = Field(
         default=None, description="the earlier run with the same specification"
     )
-    created_at: datetime
-    started_at: datetime | None = None
-    finished_at: datetime | None = None
-    parameters: list[dict[str, Any]] = Field(default=[])
+    created_at: datetime = Field(description="time when the run was made, UTC")
+    started_at: datetime | None = Field(default=None, description="time of the start, UTC")
+    finished_at: datetime | None = Field(default=None, description="time of the end, UTC")
+    has_signals: bool = Field(default=False, description="whether its fitted signals can be read")
+    rms_unit: str | None = Field(
+        default=None, description="given for a single run; σ for several weighted outputs"
+    )
+    rms: float | None = Field(
+        default=None, description="RMS error so far, in the output's unit, or in σ if weighted"
+    )
+    evaluations: int = Field(default=0, description="simulations so far")
+    generations: int = Field(default=0, description="generations so far")
+    seconds: float | None = Field(default=None, description="compute time, s")
+    valid: bool | None = Field(
+        default=None, description="whether the model can be simulated with the estimates"
+    )
+    parameters: Annotated[Any, DescribedBy(list[EstimateOut])] = Field(
+        default=[], description="estimates with their errors"
+    )
+    rms_validation: float | None = Field(
+        default=None, description="RMS error on the validation data, in the unit of `rms`"
+    )
+    rms_noise_free: float | None = Field(
+        default=None, description="RMS error against the record without the added noise"
+    )
+    fit_percent: Annotated[Any, DescribedBy(FitOut | None)] = Field(
+        default=None, description="fit to both kinds of data"
+    )
+    agreement: Annotated[Any, DescribedBy(AgreementsOut | None)] = Field(
+        default=None, description="agreement of each output of each record"
+    )
+    islands: Annotated[Any, DescribedBy(list[IslandOut] | None)] = Field(
+        default=None, description="champion of each island"
+    )
+    identifiability: Annotated[Any, DescribedBy(IdentifiabilityOut | None)] = Field(
+        default=None, description="what the data can tell apart"
+    )
+    criteria: Annotated[Any, DescribedBy(CriteriaOut | None)] = Field(
+        default=None, description="information criteria"
+    )
+    correlation: Annotated[Any, DescribedBy(MatrixOut | None)] = Field(
+        default=None, description="correlation of the estimates; null without errors"
+    )
+    noise_sd: float | None = Field(
+        default=None, description="standard deviation of the residuals, weighted"
+    )
+    noise_colour: str | None = Field(
+        default=None, description="colour of the residuals that the errors assume"
+    )
+    noise_model: str | None = Field(default=None, description="noise model of the estimates")
+    correlation_times: dict[str, float] | None = Field(
+        default=None, description="correlation time of each output's noise, s"
+    )
+    residual_tests: Annotated[Any, DescribedBy(ResidualVerdictOut | None)] = Field(
+        default=None, description="tests of the residuals; empty if none were made"
+    )
+    onset_delays: Annotated[Any, DescribedBy(list[OnsetDelayOut] | None)] = Field(
+        default=None, description="delay between the start of an input's and an output's change"
+    )
+    data_bounds: list[str] | None = Field(
+        default=None, description="parameters whose bounds follow the data"
+    )
+    input_hold: Annotated[Any, DescribedBy(list[InputHoldOut] | None)] = Field(
+        default=None, description="how each input is read between its samples"
+    )
+    known_before: Annotated[Any, DescribedBy(KnownBeforeOut | None)] = Field(
+        default=None, description="recorded time before the start of each record"
+    )
+    search: Annotated[Any, DescribedBy(SearchOut | None)] = Field(
+        default=None, description="whether the search settled, and the minima that were found"
+    )
+    posterior: Annotated[Any, DescribedBy(PosteriorOut | None)] = Field(
+        default=None, description="samples of the posterior; null if not requested"
+    )
+    warnings: list[str] = Field(default=[], description="what limits the result")
+    substeps: int | None = Field(default=None, description="integration steps in one grid step")
+    selection: Annotated[Any, DescribedBy(list[SelectedTermOut] | None)] = Field(
+        default=None, description="selected terms; empty if none were to be selected"
+    )
+
+
+class RunPage(Page[RunOut]):
+    """Runs of a job."""
 
 
 class ImprovementOut(Answer):
     """A better champion of one island."""
 
-    generation: int
-    evaluations: int
-    rms: float
-    phase: str
-    parameters: list[float]
+    generation: int = Field(description="generation of the island")
+    evaluations: int = Field(description="simulations of the island so far")
+    rms: float = Field(description="RMS error, in the unit of the run's `rms`")
+    phase: str = Field(description="part of the search that found it")
+    parameters: list[float] = Field(description="values in the order of `names`, in their units")
 
 
 class HistoryOut(Answer):
     """Improvements of every island; `names` are those of the columns of `parameters`."""
 
-    id: str
-    names: list[str]
-    islands: list[list[ImprovementOut]]
+    id: str = Field(description="identifier of the run")
+    names: list[str] = Field(description="free parameters, in the order of `parameters`")
+    islands: list[list[ImprovementOut]] = Field(description="improvements of each island, in order")
 
 
 class ExperimentOut(Answer):
     """Measured and simulated outputs of one experiment."""
 
-    name: str
-    measured: list[SeriesOut]
-    simulated: list[SeriesOut]
+    name: str = Field(description="name of the record")
+    measured: list[SeriesOut] = Field(description="measured outputs")
+    simulated: list[SeriesOut] = Field(description="simulated outputs")
 
 
 class ResponseOut(Answer):
     """Measured against simulated, experiment by experiment."""
 
-    id: str
-    experiments: list[ExperimentOut]
+    id: str = Field(description="identifier of the run")
+    experiments: list[ExperimentOut] = Field(description="records of the run")
 
 
-class CorrelationOut(Answer):
+class CorrelationOut(ResidualTestOut):
     """Correlation function of residuals with its bands, and its test.
 
     `input` is null for the autocorrelation. `lags` are in periods of `period` seconds. If `period`
     is null, they are in samples of irregular times. Bands are symmetric about zero.
     """
 
-    experiment: int
-    output: str
-    test: Literal["whiteness", "independence"]
-    input: str | None
-    outcome: Literal["passed", "failed", "not tested"]
-    reason: str
-    samples: int
-    lags_tested: int
-    inside95: float | None
-    inside99: float | None
-    statistic: float | None
-    degrees: float | None
-    p: float | None
-    period: float | None
-    lags: list[float]
-    values: list[float]
-    band95: list[float]
-    band99: list[float]
+    period: float | None = Field(description="time between two lags, s; null for irregular times")
+    lags: list[float] = Field(description="lags, in periods or samples")
+    values: list[float] = Field(description="correlation at each lag, from -1 to 1")
+    band95: list[float] = Field(description="half width of the 95 % band at each lag")
+    band99: list[float] = Field(description="half width of the 99 % band at each lag")
 
 
 class ResidualsOut(Answer):
@@ -114,37 +196,44 @@ class ResidualsOut(Answer):
     nothing could be tested. `note` says what could not be read.
     """
 
-    id: str
-    data: Literal["estimation", "validation"]
-    passed: bool | None
-    level: float
-    note: str
-    tests: list[CorrelationOut]
+    id: str = Field(description="identifier of the run")
+    data: Literal["estimation", "validation"] = Field(description="data of the residuals")
+    passed: bool | None = Field(
+        description="whether all tests passed; null if nothing could be tested"
+    )
+    level: float = Field(description="probability that a true model fails at least one test")
+    note: str = Field(description="what could not be read; empty if nothing")
+    tests: list[CorrelationOut] = Field(description="tests with their correlation functions")
 
 
 class MigrantOut(Answer):
     """One line of the migration log."""
 
-    epoch: int
-    source: int
-    destination: int
-    fitness: float
+    epoch: int = Field(description="number of the migration, from 0")
+    source: int = Field(description="island that sent it, from 0")
+    destination: int = Field(description="island that received it, from 0")
+    fitness: float = Field(description="fitness of the individual; smaller is better")
 
 
 class MigrationsOut(Answer):
     """The migration log of a run."""
 
-    id: str
-    migrants: list[MigrantOut]
+    id: str = Field(description="identifier of the run")
+    migrants: list[MigrantOut] = Field(description="migrants in order")
 
 
 class ProfileIn(Body):
     """Free parameters to profile, and the approximate number of values of each."""
 
     parameters: list[Annotated[str, Field(max_length=200)]] | None = Field(
-        default=None, min_length=1, max_length=64
+        default=None,
+        min_length=1,
+        max_length=64,
+        description="free parameters to profile; null: all",
     )
-    points: int = Field(default=21, ge=3, le=101)
+    points: int = Field(
+        default=21, ge=3, le=101, description="approximate number of values of each"
+    )
 
 
 class ProfileOut(Answer):
@@ -155,67 +244,106 @@ class ProfileOut(Answer):
     parameters, estimated again at each of `values`.
     """
 
-    name: str
-    unit: str
-    estimate: float
-    interval95: tuple[float | None, float | None]
-    values: list[float]
-    ratio: list[Finite]
-    rms: list[Finite]
-    others: dict[str, list[float]]
-    evaluations: int
+    name: str = Field(description="name of the parameter")
+    unit: str = Field(description="unit of its values")
+    estimate: float = Field(description="estimate of the run")
+    interval95: tuple[float | None, float | None] = Field(
+        description="95 % interval by the likelihood ratio; an end is null if it is not reached"
+    )
+    values: list[float] = Field(description="values of the parameter, in its unit")
+    ratio: list[Finite] = Field(description="likelihood ratio n ln(S(v)/S₀) at each value")
+    rms: list[Finite] = Field(description="RMS error at each value, in the unit of the run's `rms`")
+    others: dict[str, list[float]] = Field(
+        description="the other free parameters at each value, in their units"
+    )
+    evaluations: int = Field(description="simulations of this profile")
 
 
 class RunProfilesOut(Answer):
     """Profiles of a run, and the likelihood ratio at the ends of their intervals."""
 
-    id: str
-    threshold: float
-    profiles: list[ProfileOut]
+    id: str = Field(description="identifier of the run")
+    threshold: float = Field(description="likelihood ratio at the ends of the intervals")
+    profiles: list[ProfileOut] = Field(description="profile of each parameter")
 
 
 class ProfilesOut(RunProfilesOut):
     """Profiles of a run, and their figure as Plotly JSON."""
 
-    figure: dict[str, Any]
+    figure: FigureOut = Field(description="figure of the profiles, as Plotly JSON")
+
+
+class ExportedValueOut(Answer):
+    """Value of a parameter or initial state."""
+
+    name: str = Field(description="name of the parameter, or of the initial state as ``x(0)``")
+    value: float = Field(description="value, in `unit`")
+    unit: str = Field(description="unit of value and standard error")
+    stderr: float | None = Field(description="standard error, in `unit`; null without one")
+    status: str = Field(description="status of the estimate")
+
+
+class ExportedDataOut(Answer):
+    """Sampling of the data."""
+
+    sample_time: float | None = Field(description="sampling period, s; null if irregular")
+    hold: dict[str, str] = Field(description="how each input was read between its samples")
+
+
+class ExportedModelOut(Answer):
+    """Identified model, from which it can be built and simulated again."""
+
+    format: str = Field(description="name and version of this format")
+    lagid: str | None = Field(description="version of lagid that wrote it")
+    model: Annotated[Any, DescribedBy(ModelDocumentOut)] = Field(description="model document")
+    values: list[ExportedValueOut] = Field(description="parameters and initial states")
+    covariance: MatrixOut | None = Field(description="covariance of the free parameters")
+    data: ExportedDataOut = Field(description="sampling of the data")
+    provenance: dict[str, Any] = Field(description="run, job and data of the values")
 
 
 class CompareIn(Body):
     """Runs to compare: at least two, of any jobs, fitted to the same data."""
 
-    runs: list[str] = Field(min_length=2, max_length=50)
+    runs: list[str] = Field(min_length=2, max_length=50, description="ids of the runs")
 
 
 class ComparedRunOut(Answer):
     """Candidate of a comparison; `parameters` counts the free ones. Low AIC and BIC are better."""
 
-    run: str
-    job: str
-    number: int
-    model: str
-    title: str
-    cell: dict[str, Any]
-    parameters: int
-    samples: int
-    rms: float | None
-    rms_validation: float | None
-    fit_estimation: float | None
-    fit_validation: float | None
-    aic: float | None
-    bic: float | None
-    residuals_passed: bool | None
-    residuals_data: str | None
-    evaluations: int
+    run: str = Field(description="identifier of the run")
+    job: str = Field(description="identifier of its job")
+    number: int = Field(description="number of the run in its job, from 0")
+    model: str = Field(description="name of the model")
+    title: str = Field(description="title of the model")
+    cell: Cell = Field(description="values of the sweep's axes, by their pointers")
+    parameters: int = Field(description="number of free parameters")
+    samples: int = Field(description="scored samples")
+    rms: float | None = Field(description="RMS error on the estimation data, in `unit`")
+    rms_validation: float | None = Field(description="RMS error on the validation data, in `unit`")
+    fit_estimation: float | None = Field(description="fit to the estimation data, %")
+    fit_validation: float | None = Field(description="fit to the validation data, %")
+    aic: float | None = Field(description="Akaike's information criterion")
+    bic: float | None = Field(description="Schwarz's information criterion")
+    residuals_passed: bool | None = Field(
+        description="whether the residual tests passed; null if not tested"
+    )
+    residuals_data: str | None = Field(description="data of the residual tests")
+    evaluations: int = Field(description="simulations of the search")
 
 
 class ComparedValueOut(Answer):
     """Estimate of a parameter by one run; `stderr` and `interval95` are null without errors."""
 
-    run: str
-    value: float
-    stderr: float | None
-    interval95: list[float] | None
-    status: str
+    run: str = Field(description="identifier of the run")
+    value: float = Field(description="estimate, in the parameter's unit")
+    stderr: float | None = Field(
+        description="standard error, in the parameter's unit; null without one"
+    )
+    interval95: list[float] | None = Field(
+        description="95 % interval, in the parameter's unit; null without errors"
+    )
+    status: str = Field(description="status of the estimate")
 
 
 class ComparedParameterOut(Answer):
@@ -225,11 +353,13 @@ class ComparedParameterOut(Answer):
     one.
     """
 
-    name: str
-    unit: str
-    values: list[ComparedValueOut]
-    differs: bool | None
-    note: str
+    name: str = Field(description="name of the parameter")
+    unit: str = Field(description="unit of its values")
+    values: list[ComparedValueOut] = Field(description="estimate of each run that has it")
+    differs: bool | None = Field(
+        description="whether two 95 % intervals do not overlap; null if fewer than two have one"
+    )
+    note: str = Field(description="what limits the comparison; empty if nothing")
 
 
 class ComparisonOut(Answer):
@@ -238,10 +368,12 @@ class ComparisonOut(Answer):
     `notes` say which parameters depend on the model, and which figures do not compare.
     """
 
-    unit: str
-    runs: list[ComparedRunOut]
-    parameters: list[ComparedParameterOut]
-    notes: list[str]
+    unit: str = Field(description="unit of each RMS")
+    runs: list[ComparedRunOut] = Field(description="runs, the best first")
+    parameters: list[ComparedParameterOut] = Field(
+        description="parameters that at least two runs have"
+    )
+    notes: list[str] = Field(description="what does not compare")
 
 
 class FreeRunIn(Body):
@@ -251,20 +383,24 @@ class FreeRunIn(Body):
     first `skip` samples of every output are not scored.
     """
 
-    dataset: str
-    channels: dict[str, str] = Field(default={})
-    skip: int = Field(default=0, ge=0)
+    dataset: str = Field(description="identifier of a stored dataset")
+    channels: dict[str, str] = Field(
+        default={}, description="recorded channel of each signal that differs from the run's job"
+    )
+    skip: int = Field(
+        default=0, ge=0, description="samples at the start of each output that are not scored"
+    )
 
 
 class AgreementOut(Answer):
     """Fit of one output of one experiment (counted from 1); null if the output does not vary."""
 
-    experiment: int
-    output: str
-    unit: str
-    samples: int
-    rms: float
-    fit_percent: Finite
+    experiment: int = Field(description="record, from 1")
+    output: str = Field(description="output of the model")
+    unit: str = Field(description="unit of the RMS")
+    samples: int = Field(description="scored samples")
+    rms: float = Field(description="RMS error, in `unit`")
+    fit_percent: Finite = Field(description="fit, %; null if the output does not vary")
 
 
 class FreeRunOut(Answer):
@@ -275,11 +411,13 @@ class FreeRunOut(Answer):
     estimated on it.
     """
 
-    id: str
-    dataset: str
-    unit: str
-    rms: float
-    fit_percent: Finite
-    agreement: list[AgreementOut]
-    starts: dict[str, float]
-    experiments: list[ExperimentOut]
+    id: str = Field(description="identifier of the run")
+    dataset: str = Field(description="identifier of the dataset")
+    unit: str = Field(description="unit of the RMS")
+    rms: float = Field(description="RMS error, in `unit`")
+    fit_percent: Finite = Field(description="fit, %")
+    agreement: list[AgreementOut] = Field(description="agreement of each output of each record")
+    starts: dict[str, float] = Field(
+        description="initial states that were estimated on the recording, in their units"
+    )
+    experiments: list[ExperimentOut] = Field(description="measured and simulated outputs")

@@ -18,6 +18,7 @@ from sqlalchemy import update as update_of
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
+from service.storage.errors import InvalidCursor
 from service.storage.tables import Base
 
 if TYPE_CHECKING:
@@ -183,6 +184,20 @@ def new_ids(prefix: IdPrefix, n: int) -> list[str]:
         f"{heads[number >> _TAIL_BITS]}{_PAIRS[number >> 10 & 1023]}{_PAIRS[number & 1023]}"
         for number in numbers
     ]
+
+
+def check_id_cursor(cursor: str, prefix: IdPrefix) -> str:
+    """Check that a cursor may be the identifier of a row, as `make_page` gave it.
+
+    Raises
+    ------
+    InvalidCursor
+        If it has another form.
+    """
+    head, _, tail = cursor.partition("_")
+    if head != prefix or not 1 <= len(tail) <= _LENGTH or not set(tail) <= set(_ALPHABET):
+        raise InvalidCursor(cursor)
+    return cursor
 
 
 def _encode_base32(number: int) -> str:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from service.core.wire import Answer, Body, Seed, Sigma
+from service.core.wire import Answer, Body, Cell, Seed, Sigma
 from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
@@ -26,10 +26,12 @@ def _check_distinct(values: list[Any]) -> list[Any]:
 class TruthIn(Body):
     """Parameters and inputs of the noise-free record, as in ``POST /v1/datasets:simulate``."""
 
-    parameters: dict[str, float]
-    inputs: dict[str, InputIn] = Field(default={})
-    samples: int = Field(ge=2, le=MAX_SIMULATED_SAMPLES)
-    sample_time: SampleTime
+    parameters: dict[str, float] = Field(
+        description="true values by name, in the units of the model"
+    )
+    inputs: dict[str, InputIn] = Field(default={}, description="waveform of each input")
+    samples: int = Field(ge=2, le=MAX_SIMULATED_SAMPLES, description="number of samples")
+    sample_time: SampleTime = Field(description="sampling period, s")
 
 
 class NoiseSweepIn(IdentificationIn):
@@ -42,17 +44,28 @@ class NoiseSweepIn(IdentificationIn):
     With `relative`, σ is in standard deviations of the output. The other fields are those of a job.
     """
 
-    truth: TruthIn | None = None
-    datasets: list[str] | None = Field(default=None, min_length=1, max_length=1000)
+    truth: TruthIn | None = Field(default=None, description="record to simulate, without noise")
+    datasets: list[str] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=1000,
+        description="stored datasets instead, by name or id",
+    )
     sigma: Annotated[
         list[Sigma], Field(min_length=1, max_length=100_000), AfterValidator(_check_distinct)
-    ]
-    relative: bool = False
-    replicates: int = Field(default=20, ge=1, lt=MAX_REPLICATES)
-    methods: Annotated[list[SearchMethod], AfterValidator(_check_distinct)] = Field(
-        default=["simple", "improved"], min_length=1
+    ] = Field(description="noise levels, in the output's unit")
+    relative: bool = Field(
+        default=False, description="whether `sigma` is in standard deviations of the output"
     )
-    seed: int = Field(default=1, ge=0, lt=2**32)
+    replicates: int = Field(
+        default=20, ge=1, lt=MAX_REPLICATES, description="runs for each level and method"
+    )
+    methods: Annotated[list[SearchMethod], AfterValidator(_check_distinct)] = Field(
+        default=["simple", "improved"], min_length=1, description="methods to compare"
+    )
+    seed: int = Field(
+        default=1, ge=0, lt=2**32, description="seed from which those of all runs follow"
+    )
 
     @model_validator(mode="after")
     def _check_one_source(self) -> Self:
@@ -72,8 +85,10 @@ class NoiseSweepIn(IdentificationIn):
 class BatchEntryIn(Body):
     """Measurements at one value of the label. The `datasets` are fitted together as one run."""
 
-    x: TrendX
-    datasets: list[str] = Field(min_length=1, max_length=1000)
+    x: TrendX = Field(description="value of the label")
+    datasets: list[str] = Field(
+        min_length=1, max_length=1000, description="datasets by name or id, fitted together"
+    )
 
 
 class ReidentifyIn(IdentificationIn):
@@ -88,14 +103,31 @@ class ReidentifyIn(IdentificationIn):
     of x to predict at. The other fields are those of a job.
     """
 
-    label: str = Field(min_length=1, max_length=64)
-    batch: list[BatchEntryIn] = Field(min_length=1, max_length=5000)
-    reference: str | None = Field(default=None, min_length=1, max_length=200)
-    warm_start: Literal["reference", "previous", "none"] | None = None
-    trend_parameters: list[str] = Field(default=[], max_length=100)
-    predict: list[TrendX] = Field(default=[], max_length=100)
-    validation: ValidationIn | None = None
-    seed: Seed = 1
+    label: str = Field(
+        min_length=1, max_length=64, description="name of the label, such as length_m"
+    )
+    batch: list[BatchEntryIn] = Field(
+        min_length=1, max_length=5000, description="measurements of each value of the label"
+    )
+    reference: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=200,
+        description="run, or name of an accepted reference, to compare with",
+    )
+    warm_start: Literal["reference", "previous", "none"] | None = Field(
+        default=None, description="where each run begins"
+    )
+    trend_parameters: list[str] = Field(
+        default=[], max_length=100, description="parameters of the trend; empty: all free ones"
+    )
+    predict: list[TrendX] = Field(
+        default=[], max_length=100, description="values of the label to predict at"
+    )
+    validation: ValidationIn | None = Field(
+        default=None, description="data that are compared, but not fitted"
+    )
+    seed: Seed = Field(default=1, description="seed of the search")
 
     @property
     def job_fields(self) -> dict[str, Any]:
@@ -106,8 +138,8 @@ class ReidentifyIn(IdentificationIn):
 class ParameterSummaryOut(Answer):
     """Summary of one parameter over the runs of a group, in its unit."""
 
-    name: str
-    unit: str
+    name: str = Field(description="name of the parameter")
+    unit: str = Field(description="unit of its values")
     value: list[float] = Field(description="quantiles of the estimates")
     stderr: float | None = Field(
         description="median standard error: the Cramér–Rao bound where runs reach the optimum"
@@ -124,10 +156,10 @@ class ParameterSummaryOut(Answer):
 class GroupOut(Answer):
     """Summary of the runs with the same values of the grouping keys."""
 
-    key: dict[str, Any]
-    runs: int
-    succeeded: int
-    failed: int
+    key: Cell = Field(description="values of the grouping axes and labels")
+    runs: int = Field(description="runs of the group")
+    succeeded: int = Field(description="runs that succeeded")
+    failed: int = Field(description="runs that failed")
     success_rate: float = Field(description="fraction of finished runs that gave a valid model")
     sigma: float | None = Field(
         default=None, description="of the added noise, if all runs have the same"
@@ -141,8 +173,10 @@ class GroupOut(Answer):
     rms_floor: float | None = Field(
         default=None, description="RMS of estimates at the Cramér–Rao bound: σ√(r/n)"
     )
-    fit_percent: dict[str, list[float] | None]
-    parameters: list[ParameterSummaryOut]
+    fit_percent: dict[str, list[float] | None] = Field(
+        description="quantiles of the fit, %, by data"
+    )
+    parameters: list[ParameterSummaryOut] = Field(description="summary of each parameter")
 
 
 class ErrorReferenceOut(Answer):
@@ -152,12 +186,12 @@ class ErrorReferenceOut(Answer):
     `run`, the best valid run at the least noise `sigma`.
     """
 
-    cell: dict[str, Any]
-    kind: Literal["truth", "estimate"] | None
-    run: str | None
-    sigma: float | None
-    parameters: dict[str, float]
-    note: str
+    cell: Cell = Field(description="axis values of these runs")
+    kind: Literal["truth", "estimate"] | None = Field(description="origin of the values")
+    run: str | None = Field(description="run of the estimate; null for the truth")
+    sigma: float | None = Field(description="noise level of that run")
+    parameters: dict[str, float] = Field(description="reference values by name, in their units")
+    note: str = Field(description="why there are none, or what they mean")
 
 
 class SummaryOut(Answer):
@@ -166,14 +200,16 @@ class SummaryOut(Answer):
     References and floors are added when a job with noise has ended.
     """
 
-    job: str
-    by: list[str]
-    quantiles: list[float]
-    groups: list[GroupOut]
-    runs: int = 0
+    job: str = Field(description="identifier of the job")
+    by: list[str] = Field(description="grouping axes and labels")
+    quantiles: list[float] = Field(description="probabilities of all quantiles")
+    groups: list[GroupOut] = Field(description="summary of each group")
+    runs: int = Field(default=0, description="runs of the job")
     reused: int = Field(default=0, description="runs taken over from earlier runs")
     rms_unit: str | None = Field(
         default=None, description="unit of each RMS; σ for several weighted outputs"
     )
-    references: list[ErrorReferenceOut] = Field(default=[])
+    references: list[ErrorReferenceOut] = Field(
+        default=[], description="reference values of the errors"
+    )
     notes: list[str] = Field(default=[], description="what the numbers mean")

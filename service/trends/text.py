@@ -3,7 +3,7 @@
 All functions take the document of ``GET /v1/jobs/{id}/trend``.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sysid.core.text import (
@@ -16,7 +16,7 @@ from sysid.core.text import (
     plain_unit,
 )
 
-QuantityDocument = dict[str, Any]
+QuantityDocument = Mapping[str, Any]
 
 USUAL_STATUSES = ("identified", "group", "measured", "not measured")
 """Statuses that need no attention."""
@@ -81,7 +81,7 @@ class TrendTables(NamedTuple):
     reasons: Sequence[tuple[str, str]]
 
 
-def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
+def build_tables(trend: Mapping[str, Any], style: Style) -> TrendTables:
     """Build the tables of a trend. Quantities without any value are left out."""
     shown: list[QuantityDocument] = [
         quantity
@@ -114,7 +114,7 @@ def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
 
 
 def _label_row(
-    label_runs: dict[str, Any], quantities: list[QuantityDocument], style: Style
+    label_runs: Mapping[str, Any], quantities: list[QuantityDocument], style: Style
 ) -> PlaceRow:
     points = [
         next((p for p in quantity["points"] if p["x"] == label_runs["x"]), None)
@@ -134,7 +134,7 @@ def _label_row(
 
 
 def _prediction_row(
-    quantity: QuantityDocument, prediction: dict[str, Any], style: Style
+    quantity: QuantityDocument, prediction: Mapping[str, Any], style: Style
 ) -> PredictionRow:
     name, x = str(quantity["name"]), style.label(prediction["x"])
     if prediction["value"] is None or prediction["lower"] is None:
@@ -145,7 +145,7 @@ def _prediction_row(
     return PredictionRow(name, x, style.number(prediction["value"]) + unit, interval + unit, remark)
 
 
-def list_flags(label_runs: dict[str, Any], quantities: list[QuantityDocument]) -> list[str]:
+def list_flags(label_runs: Mapping[str, Any], quantities: list[QuantityDocument]) -> list[str]:
     """List the findings that need attention in the runs of one label."""
     flags = []
     for quantity in quantities:
@@ -156,7 +156,7 @@ def list_flags(label_runs: dict[str, Any], quantities: list[QuantityDocument]) -
     return flags + [text.partition(":")[0].partition(" (")[0] for text in separable]
 
 
-def _list_point_flags(point: dict[str, Any]) -> list[str]:
+def _list_point_flags(point: Mapping[str, Any]) -> list[str]:
     flags = [word for word in point["status"].split(", ") if word not in USUAL_STATUSES]
     if point["is_outlier"]:
         flags.append(f"outlier (p = {point['p_value']:.2g})")
@@ -182,20 +182,20 @@ def format_limits(quantities: list[QuantityDocument]) -> str:
     return f"drift is flagged where z, in standard errors, exceeds {text}" if text else ""
 
 
-def format_reference(trend: dict[str, Any]) -> str:
+def format_reference(trend: Mapping[str, Any]) -> str:
     """Format the reference: ``'tube' (length_m = 40)``; empty without names and label."""
     names = ", ".join(f"{name!r}" for name in trend["reference_names"])
     label = "" if trend["reference_x"] is None else f"{trend['x']} = {trend['reference_x']:g}"
     return " ".join(filter(None, (names, f"({label})" if label else "")))
 
 
-def format_span(span: dict[str, Any]) -> str:
+def format_span(span: Mapping[str, Any]) -> str:
     """Format the range of an output, with the channel's name if it has no unit."""
     unit = plain_unit(span["unit"]) or f" ({span['channel']})"
     return f"{span['lower']:.6g} to {span['upper']:.6g}{unit}"
 
 
-def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
+def format_law(name: str, law: Mapping[str, Any], x: str, style: Style) -> str:
     """Format a law with its coefficients and their standard errors."""
     coefficients = {
         coefficient["name"]: f"({style.estimate(coefficient['value'], coefficient['stderr'])})"
@@ -206,7 +206,7 @@ def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
     return f"{name} = {text}"
 
 
-def list_notes(trend: dict[str, Any]) -> list[str]:
+def list_notes(trend: Mapping[str, Any]) -> list[str]:
     """List all notes on the numbers."""
     notes = [
         f"{quantity['name']}: {text}"

@@ -1,5 +1,6 @@
 // The form of a re-identification: recordings with labels, and one POST to /v1/recipes/reidentify.
 
+import { address } from './live.js';
 import { readOverrides, withFaults, onSubmit } from './fields.js';
 import { readAlgorithm, readChannels, loadChosenModel, drawChannels, parseNumber, parseNumbers } from './recipes.js';
 
@@ -69,6 +70,6 @@ form.addEventListener('input', () => {
   updateChannels();
   showRunCount();
 });
-onSubmit(form, '/v1/recipes/reidentify', buildBody);
+onSubmit(form, address('/v1/recipes/reidentify'), buildBody);
 showRunCount();
 withFaults(form, loadModel)();

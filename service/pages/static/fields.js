@@ -1,6 +1,6 @@
 // Shared by all forms: the table of bounds, submission, and faults next to their fields.
 
-import { Problem, makeElement, post } from './live.js';
+import { Problem, address, makeElement, post } from './live.js';
 
 const COLUMNS = ['lower', 'upper', 'fixed'];
 const rows = document.getElementById('parameters');
@@ -129,7 +129,7 @@ export function onSubmit(form, url, buildBody, isReady = async () => true) {
         return;
       }
       const job = await post(url, buildBody());
-      location.assign(`/jobs/${encodeURIComponent(job.id)}`);
+      location.assign(address(`/jobs/${encodeURIComponent(job.id)}`));
     } catch (error) {
       if (!(error instanceof Problem)) throw error;
       showState(form, '');

@@ -1,6 +1,6 @@
 // New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
 
-import { Problem, ask, makeElement, keepLatest } from './live.js';
+import { Problem, address, ask, makeElement, keepLatest } from './live.js';
 import * as forms from './fields.js';
 import { clearFaults, fillTable, readOverrides } from './fields.js';
 
@@ -22,7 +22,7 @@ async function start() {
 }
 
 async function fill() {
-  const [datasets, models] = await Promise.all([ask('/v1/datasets?limit=200'), ask('/v1/models')]);
+  const [datasets, models] = await Promise.all([ask(address('/v1/datasets?limit=200')), ask(address('/v1/models'))]);
   for (const { name, id } of datasets.items) {
     field('dataset').append(new Option(name, id));
     field('validation').append(new Option(`recording ${name}`, id));
@@ -37,7 +37,7 @@ async function fill() {
 
 /** Fill the form from an earlier job. Settings without a field are sent unchanged. */
 async function fillFrom(job) {
-  const { request, name } = await ask(`/v1/jobs/${encodeURIComponent(job)}`);
+  const { request, name } = await ask(address(`/v1/jobs/${encodeURIComponent(job)}`));
   const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
   state.extra = request;
   set('name', name);
@@ -64,7 +64,7 @@ async function fillFrom(job) {
     await showListedModel(request.parameters);
   } else {
     field('source').value = 'own';
-    const text = await ask(`/pages/jobs/${encodeURIComponent(job)}/model.yaml`);
+    const text = await ask(address(`/pages/jobs/${encodeURIComponent(job)}/model.yaml`));
     state.cloned = { text, model: request.model };
     await showOwnModel(text, request.parameters);
   }
@@ -73,14 +73,14 @@ async function fillFrom(job) {
 
 async function selectDataset(id) {
   if (![...field('dataset').options].some((option) => option.value === id)) {
-    const dataset = await ask(`/v1/datasets/${encodeURIComponent(id)}`);
+    const dataset = await ask(address(`/v1/datasets/${encodeURIComponent(id)}`));
     field('dataset').append(new Option(dataset.name, dataset.id));
   }
   field('dataset').value = id;
   await showDataset();
 }
 
-const fetchDataset = keepLatest(async (id) => ({ dataset: id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null }));
+const fetchDataset = keepLatest(async (id) => ({ dataset: id ? await ask(address(`/v1/datasets/${encodeURIComponent(id)}`)) : null }));
 
 async function showDataset() {
   const answer = await fetchDataset(field('dataset').value);
@@ -101,7 +101,7 @@ async function upload() {
     const options = new URLSearchParams({ name: file.name });
     const period = field('upload-period').value;
     if (period) options.set('sample_time', period);
-    const stored = await ask(`/v1/datasets?${options}`, {
+    const stored = await ask(address(`/v1/datasets?${options}`), {
       method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     });
     await selectDataset(stored.id);
@@ -120,7 +120,7 @@ const askModel = keepLatest((question) => question());
 /** Show a model of the list. Its text becomes editable with "own equations". */
 async function showListedModel(changes) {
   const name = encodeURIComponent(field('model').value);
-  const answers = await askModel(() => Promise.all([ask(`/v1/models/${name}`), ask(`/pages/models/${name}.yaml`)]));
+  const answers = await askModel(() => Promise.all([ask(address(`/v1/models/${name}`)), ask(address(`/pages/models/${name}.yaml`))]));
   if (!answers) return;
   const [model, text] = answers;
   field('equations').value = text;
@@ -139,7 +139,7 @@ async function showOwnModel(text, changes) {
 async function checkModel(changes) {
   const text = field('equations').value;
   const result = await askModel(() =>
-    ask('/v1/models:check', { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
+    ask(address('/v1/models:check'), { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
   if (!result) return null;
   showVerdict(result);
   if (result.valid) applyModel(result.normal_form, changes);
@@ -294,7 +294,7 @@ field('equations').addEventListener('input', () => {
   document.getElementById('check').replaceChildren(makeElement('span', 'checking…', 'muted'));
 });
 field('equations').addEventListener('input', debounce(withFaults(() => checkModel()), 300));
-forms.onSubmit(form, '/v1/jobs', buildBody, isReady);
+forms.onSubmit(form, address('/v1/jobs'), buildBody, isReady);
 panel.addEventListener('toggle', withFaults(() => panel.open && start()));
 addEventListener('hashchange', openPanel);
 openPanel();

@@ -1,7 +1,7 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
 import { start, setQuery, listPlots, drawProfiles, redraw, watch } from './figures.js';
-import { Problem, post, put, refresh, throttle } from './live.js';
+import { Problem, address, post, put, refresh, throttle } from './live.js';
 
 const { job, runs } = document.getElementById('job').dataset;
 const isOpen = () => document.querySelector('[data-live="chip"]').dataset.open === '1';
@@ -26,7 +26,7 @@ const renew = throttle(async () => {
 
 function listen() {
   if (!isOpen() || (stream && stream.readyState !== EventSource.CLOSED)) return; // a finished job opens no stream
-  const opened = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
+  const opened = new EventSource(address(`/v1/jobs/${encodeURIComponent(job)}/events`));
   stream = opened;
   // A resumed job's stream repeats its earlier end. The page decides whether the job is over.
   for (const kind of ['message', 'state', 'progress', 'log', 'end']) opened.addEventListener(kind, renew);
@@ -55,7 +55,7 @@ async function act(button) {
   fault.textContent = '';
   button.disabled = true;
   try {
-    await post(`/v1/jobs/${encodeURIComponent(job)}:${button.dataset.act}`);
+    await post(address(`/v1/jobs/${encodeURIComponent(job)}:${button.dataset.act}`));
     await refresh();
     watch();
     listen();
@@ -72,7 +72,7 @@ document.addEventListener('submit', async (event) => {
   const { run, name } = event.target.elements;
   const status = event.target.querySelector('[data-accepted]');
   try {
-    const reference = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
+    const reference = await put(address(`/v1/references/${encodeURIComponent(name.value)}`), { run: run.value });
     const before = reference.history[0];
     status.textContent = `The reference ${reference.name} is now ${reference.run}. `
       + (before ? `Before: ${before.run}.` : 'It is the first of this name.');

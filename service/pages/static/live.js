@@ -61,6 +61,9 @@ export function throttle(work, interval) {
   };
 }
 
+/** The address of a path of the service, which may lie under a prefix behind a proxy. */
+export const address = (path) => new URL(`..${path}`, import.meta.url).href;
+
 /** Send a request. A refusal becomes a Problem with the document's title, detail and errors. */
 export async function ask(url, options = {}) {
   let answer;

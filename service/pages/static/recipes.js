@@ -1,9 +1,9 @@
 // Shared by the forms of recipes (noise sweep, re-identification): models, channels, numbers.
 
-import { ask, makeElement, keepLatest } from './live.js';
+import { address, ask, makeElement, keepLatest } from './live.js';
 import { fillTable } from './fields.js';
 
-const fetchModel = keepLatest((name) => ask(`/v1/models/${encodeURIComponent(name)}`));
+const fetchModel = keepLatest((name) => ask(address(`/v1/models/${encodeURIComponent(name)}`)));
 
 /**
  * Load the chosen model and fill its table of bounds. Return its document, or null if another

@@ -1,6 +1,6 @@
 // The form of a noise sweep: how many runs it makes, and one POST to /v1/recipes/noise-sweep.
 
-import { makeElement } from './live.js';
+import { address, makeElement } from './live.js';
 import { readOverrides, withFaults, onSubmit } from './fields.js';
 import { readAlgorithm, readChannels, loadChosenModel, drawChannels, listInputs, parseNumber, parseNumbers } from './recipes.js';
 
@@ -101,7 +101,7 @@ field('dataset').addEventListener('change', () => {
 });
 for (const button of field('source')) button.addEventListener('change', drawSource);
 form.addEventListener('input', showRunCount);
-onSubmit(form, '/v1/recipes/noise-sweep', buildBody);
+onSubmit(form, address('/v1/recipes/noise-sweep'), buildBody);
 const wanted = new URLSearchParams(location.search).get('dataset');
 if (wanted && [...field('dataset').options].some((option) => option.value === wanted)) {
   field('dataset').value = wanted;

@@ -27,6 +27,8 @@ def test_the_page_shows_the_fields_of_a_job_with_their_defaults(client: TestClie
     job = page[page.index("POST /v1/jobs<") :]
     assert re.search(r"<code>prediction</code></td><td>simulation \| one-step</td>", job)
     assert re.search(r"<code>datasets</code> \(required\)</td><td>list of string", job)
+    assert "<summary>Example</summary><pre>{" in job
+    assert "&#34;model&#34;: &#34;fopdt&#34;" in job
 
 
 def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:

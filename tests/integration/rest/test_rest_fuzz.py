@@ -38,7 +38,7 @@ def test_every_answer_has_a_status_of_the_openapi_document(
 @pytest.mark.parametrize(
     ("method", "path", "statuses"),
     [
-        ("get", "/healthz", {421, 503}),
+        ("get", "/healthz", {421, 422, 503}),
         ("get", "/v1/jobs/{job_id}", {404, 409, 421, 422, 503}),
         ("post", "/v1/jobs", {403, 404, 409, 413, 415, 421, 422, 429, 503}),
         ("post", "/v1/jobs/{job_id}:cancel", {403, 404, 409, 421, 422, 503}),
@@ -53,8 +53,10 @@ def test_an_operation_has_the_errors_of_its_kind_as_problem_documents(
     answers = document["paths"][path][method]["responses"]
     errors = {int(code): answer for code, answer in answers.items() if int(code) >= 400}
     assert set(errors) == statuses
-    for answer in errors.values():
-        reference = {"$ref": "#/components/schemas/ProblemOut"}
-        assert answer["content"] == {PROBLEM: {"schema": reference}}
+    for status, answer in errors.items():
+        problem = document["components"]["responses"][answer["$ref"].rpartition("/")[2]]
+        content = problem["content"][PROBLEM]
+        assert content["schema"] == {"$ref": "#/components/schemas/ProblemOut"}
+        assert content["example"]["status"] == status
     assert "errors" in document["components"]["schemas"]["ProblemOut"]["properties"]
     assert "HTTPValidationError" not in document["components"]["schemas"]

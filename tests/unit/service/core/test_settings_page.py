@@ -14,6 +14,14 @@ def test_every_setting_is_described_in_sentences() -> None:
 
 
 def test_defaults_are_written_as_one_sets_them() -> None:
-    defaults = {"a": None, "b": (), "c": True, "d": 2.0, "e": "text", "max_bytes": 3 * 2**20}
+    defaults = {
+        "a": None,
+        "b": (),
+        "c": True,
+        "d": 2.0,
+        "e": "text",
+        "f": "",
+        "max_bytes": 3 * 2**20,
+    }
     written = [format_default(name, value) for name, value in defaults.items()]
-    assert written == ["none", "none", "`true`", "2", "`text`", "3145728 (3 MiB)"]
+    assert written == ["none", "none", "`true`", "2", "`x`", "none", "3145728 (3 MiB)"]

@@ -1,0 +1,60 @@
+"""The pages in Chromium below the path of a proxy: forms, figures and events work there too."""
+
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from playwright.sync_api import Page, expect
+
+from service.api.app import create_app
+from tests.e2e.filled import Filled, copy_filled
+from tests.rest import settings_of
+from tests.serving import serve_in_thread
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Filled]:
+    folder = tmp_path_factory.mktemp("prefix")
+    return folder, copy_filled(folder)
+
+
+@pytest.fixture(scope="module")
+def address(filled: tuple[Path, Filled]) -> Iterator[str]:
+    """A server with the service below a path, and nothing beside it: all else is not found."""
+    inner = create_app(settings_of(filled[0], poll_seconds=0.05))
+
+    @asynccontextmanager
+    async def run(_: FastAPI) -> AsyncIterator[None]:
+        async with inner.router.lifespan_context(inner):
+            yield
+
+    outer = FastAPI(lifespan=run, openapi_url=None)
+    outer.mount("/tools/lagid", inner)
+    with serve_in_thread(outer) as url:
+        try:
+            yield f"{url}/tools/lagid"
+        finally:
+            inner.state.parts.stopping.set()
+
+
+def test_pages_work_below_the_path_of_a_proxy(
+    address: str, filled: tuple[Path, Filled], page: Page
+) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{address}/jobs/{filled[1].finished}")
+    page.locator('[data-figure="history"]').scroll_into_view_if_needed()
+    page.wait_for_selector('[data-figure="history"] .main-svg')
+    page.get_by_role("link", name="Clone").click()
+    models = page.locator('select[name="model"] option')
+    expect(models.filter(has_text="tube").first).to_be_attached()
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(f"{address}/jobs/job_*")
+    expect(page.locator(".chip").first).to_have_text("queued")
+    page.get_by_role("button", name="Cancel").click()  # its event refreshes the page
+    expect(page.locator(".chip").first).to_have_text("cancelled")
+    assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []
