@@ -24,4 +24,4 @@ def test_defaults_are_written_as_one_sets_them() -> None:
         "max_bytes": 3 * 2**20,
     }
     written = [format_default(name, value) for name, value in defaults.items()]
-    assert written == ["none", "none", "`true`", "2", "`x`", "none", "3145728 (3 MiB)"]
+    assert written == ["none", "none", "`true`", "2", "`text`", "none", "3145728 (3 MiB)"]
