@@ -12,7 +12,9 @@ import subprocess
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,6 +161,59 @@ def start_another(target: Target) -> str:
     return f"exit {done.returncode}"
 
 
+def guess_keys(target: Target) -> str:
+    """Ask a web process with keys 600 times with wrong ones, and with a right one meanwhile."""
+    environment = {**target.stand.environment, "LAGID_AUTH": "keys", "LAGID_PORT": "0"}
+    made = subprocess.run(
+        [*build_child_command("service.cli.main", "key", "create", "attack")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    token = made.stdout.strip()
+    web = subprocess.Popen(
+        [*build_child_command("service.cli.main", "serve", "--no-dispatcher")],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert web.stdout is not None
+        url = next(
+            re.findall(r"serves (\S+)/ ", line)[0] for line in web.stdout if "serves" in line
+        )
+        _wait_until_up(url)
+        wrong = [f"{token[:-4]}{n:04x}" for n in range(600) if not token.endswith(f"{n:04x}")]
+        with ThreadPoolExecutor(100) as pool:
+            asked = [pool.submit(_ask_with_key, url, guess) for guess in wrong]
+            times = []
+            for _ in range(10):
+                begun = time.monotonic()
+                assert _ask_with_key(url, token) == httpx.codes.OK
+                times.append(time.monotonic() - begun)
+            counts = Counter(future.result() for future in asked)
+    finally:
+        web.terminate()
+        web.wait()
+    others = len(wrong) - counts[401] - counts[503]
+    return f"{counts[401]}×401, {counts[503]}×503, {others} others; right {sorted(times)[5]:.2f} s"
+
+
+def _ask_with_key(url: str, key: str) -> int:
+    headers = {"Authorization": f"Bearer {key}"}
+    return httpx.get(f"{url}/v1/jobs", headers=headers, timeout=TIMEOUT).status_code
+
+
+def _wait_until_up(url: str) -> None:
+    for _ in range(600):
+        with suppress(httpx.TransportError):
+            httpx.get(f"{url}/healthz", timeout=TIMEOUT)
+            return
+        time.sleep(0.1)
+    raise TimeoutError("the web process with keys did not start")
+
+
 def look_at_folders(target: Target) -> str:
     """Look at the folders as another user would: data, database, Ray."""
     data = target.stand.folder
@@ -278,6 +333,7 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "CSV of 100,000 columns": (upload(_table(100_000, 3)), "422"),
     "CSV with a line of 60 MB": (upload(b't,u\n0,"' + b"x" * 60 * MEGABYTE), "422"),
     "second service on the folder": (start_another, "exit 1"),
+    "600 wrong keys, and a right one": (guess_keys, ".*, 0 others; .*"),
     "folders of another user": (look_at_folders, "open to others: 0"),
 }
 

@@ -71,7 +71,13 @@ def store_csv(
     server: TestClient, content: bytes, name: str = "steps", segments: Sequence[str] = ()
 ) -> str:
     """Store a recording as its upload does, without the process that reads uploads: 0.3 s each."""
-    parts = parts_of(server)
+    return store_csv_in(parts_of(server), content, name, segments)
+
+
+def store_csv_in(
+    parts: Parts, content: bytes, name: str = "steps", segments: Sequence[str] = ()
+) -> str:
+    """The same for the project that these parts show."""
     source = {
         "sha256": sha256(content).hexdigest(),
         "format": "csv",

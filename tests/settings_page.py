@@ -27,6 +27,8 @@ def format_default(name: str, value: Any) -> str:
     """Write a default as a user would set it; bytes with their unit."""
     if value in (None, (), ""):
         return "none"
+    if isinstance(value, tuple):
+        return f"`{','.join(value)}`"
     if name.endswith("_bytes"):
         size, unit = next((value // size, unit) for size, unit in UNITS if value % size == 0)
         return f"{value} ({size} {unit})"

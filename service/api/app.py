@@ -7,8 +7,10 @@ from importlib.metadata import version
 from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from service.api import (
+    access,
     datasets,
     events,
     figures,
@@ -21,9 +23,10 @@ from service.api import (
     references,
     runs,
 )
+from service.api.access_check import AccessCheck
 from service.api.content import MCAP_TYPE
 from service.api.dependencies import Parts
-from service.api.html import PROTECTIVE_HEADERS
+from service.api.html import PRIVATE_HEADERS, PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
 from service.api.openapi import DocumentedApp, get_route_name
 from service.api.query_names import check_query_names
@@ -60,6 +63,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    if chosen.auth_mode != "off":
+        app.add_middleware(ResponseHeaders, headers=PRIVATE_HEADERS)
+    app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(chosen.proxy_addresses))
+    app.add_middleware(AccessCheck, settings=chosen)  # it sees the address of the peer itself
     app.add_middleware(OriginCheck, settings=chosen)
     app.add_middleware(ResponseHeaders, headers=PROTECTIVE_HEADERS)
     app.add_middleware(
@@ -82,6 +89,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         runs.comparison_router,
         runs.router,
         figures.router,
+        access.router,
         pages.router,
     ):
         app.include_router(router)
@@ -96,7 +104,7 @@ def open_parts(settings: Settings) -> Parts:
     Misconfigured
         If the data folder is not writable.
     """
-    return Parts(settings, *open_storage(settings))
+    return Parts.build(settings, *open_storage(settings))
 
 
 def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]

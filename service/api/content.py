@@ -156,7 +156,7 @@ def preflight_response() -> Response:
     headers = {
         **CROSS_ORIGIN,
         "Access-Control-Allow-Methods": "GET, HEAD",
-        "Access-Control-Allow-Headers": "Range, If-None-Match",
+        "Access-Control-Allow-Headers": "Authorization, Range, If-None-Match",
         "Access-Control-Max-Age": "86400",
     }
     return Response(status_code=204, headers=headers)

@@ -2,48 +2,74 @@
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from threading import Event
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
 from sqlalchemy.orm import Session
 
+from service.access.callers import Caller
 from service.api.event_feed import EventFeed
+from service.api.failure_delay import FailureDelay
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
-from service.storage.sessions import Database
+from service.storage.sessions import Database, SessionOwner
 
 
 @dataclass(frozen=True)
 class Parts:
     """The service's parts, one of each per process.
 
-    `stopping` is set as soon as the process is asked to end. Open event streams then close.
+    Attributes
+    ----------
+    database : Database
+        For a request, that of its caller: it shows the caller's project alone.
+    stopping : Event
+        Set as soon as the process is asked to end. Open event streams then close.
+    upload_places : Semaphore
+        Places of the uploads that are received and read at once.
+    feed : EventFeed
+        The events of all jobs that have a stream.
+    failures : FailureDelay
+        Delays the answers to wrong keys.
     """
 
     settings: Settings
     database: Database
     store: ObjectStore
-    stopping: Event = field(default_factory=Event)
+    stopping: Event
+    upload_places: asyncio.Semaphore
+    feed: EventFeed
+    failures: FailureDelay = field(default_factory=FailureDelay)
 
-    @cached_property
-    def upload_places(self) -> asyncio.Semaphore:
-        """Places of the uploads that are received and read at once."""
-        return asyncio.Semaphore(self.settings.max_uploads)
+    @classmethod
+    def build(cls, settings: Settings, database: Database, store: ObjectStore) -> "Parts":
+        """Build the parts of a process."""
+        stopping = Event()
+        feed = EventFeed(database, stopping, settings.poll_seconds, settings.max_streams)
+        return cls(
+            settings, database, store, stopping, asyncio.Semaphore(settings.max_uploads), feed
+        )
 
-    @cached_property
-    def feed(self) -> EventFeed:
-        """The events of all jobs that have a stream."""
-        settings = self.settings
-        return EventFeed(self.database, self.stopping, settings.poll_seconds, settings.max_streams)
+    def open_for(self, owner: SessionOwner) -> "Parts":
+        """Return the same parts for requests of an owner."""
+        return replace(self, database=self.database.open_for(owner))
 
 
-def get_parts(request: Request) -> Parts:
-    """Return the parts of this process."""
+def get_caller(request: Request) -> Caller:
+    """Return who sends the request; `service.api.access_check` has found it."""
+    caller: Caller = request.state.caller
+    return caller
+
+
+CallerDep = Annotated[Caller, Depends(get_caller)]
+
+
+def get_parts(request: Request, caller: CallerDep) -> Parts:
+    """Return the parts of this process for the caller."""
     parts: Parts = request.app.state.parts
-    return parts
+    return parts.open_for(caller.to_owner(request.state.request_id))
 
 
 PartsDep = Annotated[Parts, Depends(get_parts)]

@@ -18,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 
 from service.core.errors import ServiceBusy
 from service.repositories.events import EventRepository, JobHead
-from service.repositories.jobs import JobRepository
+from service.storage.errors import RowNotFound
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 from service.storage.sessions import Database
 from service.storage.tables import Event
@@ -90,6 +90,8 @@ class EventFeed:
 
     async def read_after(self, job_id: str, last: int) -> EventBatch:
         """Read the events after a number; streams that ask for the same share one reading.
+
+        The caller checks who may see the job.
 
         Raises
         ------
@@ -177,13 +179,15 @@ class EventFeed:
     def _read_batch(self, job_id: str, last: int) -> EventBatch:
         """Read newer events, and whether the job has ended, in one transaction."""
         with self._database.read_session() as session:
-            state = JobRepository(session).get_state(job_id)
+            head = EventRepository(session).read_heads([job_id]).get(job_id)
+            if head is None:
+                raise RowNotFound("job", job_id)
             events = EventRepository(session).list_after(job_id, last, MAX_BATCH_EVENTS)
         return EventBatch(
             "".join(map(_format_event, events)),
             events[-1].id if events else last,
             len(events) == MAX_BATCH_EVENTS,
-            state.is_terminal,
+            head.is_over,
         )
 
 

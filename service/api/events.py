@@ -1,18 +1,23 @@
 """Stream the events of a job (server-sent events), read from the events table."""
 
 import asyncio
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager
+from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Header, Request
 from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
+from service.api.access_check import is_still_admitted
 from service.api.dependencies import Parts, PartsDep
 from service.api.event_feed import EventBatch
 from service.core.errors import InvalidRequest
 from service.core.text_checks import MANY, parse_digits
+from service.repositories.jobs import JobRepository
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -55,19 +60,36 @@ LastEventId = Annotated[
 
 @router.get("/{job_id}/events", response_class=EventStreamResponse, responses=ENDED)
 async def stream_events(
-    job_id: str, parts: PartsDep, last_event_id: LastEventId = None
+    job_id: str, request: Request, parts: PartsDep, last_event_id: LastEventId = None
 ) -> Response:
     """Stream events as they happen: state, progress, log, end. Continues after `Last-Event-ID`."""
     last = _parse_event_id(last_event_id)
+    await run_in_threadpool(_check_job, parts, job_id)
     batch = await parts.feed.read_after(job_id, last)
     if batch.is_over and not batch.text:
         return Response(status_code=204)  # an EventSource then does not reconnect
-    return EventStreamResponse(_stream_events(parts, job_id, last), parts.feed.watch_job(job_id))
+    check = partial(is_still_admitted, request, parts)
+    return EventStreamResponse(
+        _stream_events(parts, job_id, last, check), parts.feed.watch_job(job_id)
+    )
 
 
-async def _stream_events(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
+def _check_job(parts: Parts, job_id: str) -> None:
+    """Check that the caller may see a job: the feed serves those of all projects."""
+    with parts.database.read_session() as session:
+        JobRepository(session).get_state(job_id)
+
+
+async def _stream_events(
+    parts: Parts, job_id: str, last: int, is_admitted: Callable[[], bool]
+) -> AsyncIterator[str]:
     yield "retry: 1000\n\n"
+    checked_at = time.monotonic()
     while not parts.stopping.is_set():
+        if time.monotonic() - checked_at >= KEEP_ALIVE_S:  # its key may have been revoked
+            if not await run_in_threadpool(is_admitted):
+                return
+            checked_at = time.monotonic()
         batch = await _read_if_possible(parts, job_id, last)
         last = batch.last
         if batch.text:

@@ -22,6 +22,12 @@ router = APIRouter(tags=["health"])
 PROBLEM_KINDS = {
     "foreign-origin": "A page of another origin sent a request that changes something. "
     "Use the service's own pages, or a program.",
+    "out-of-scope": "The API key is valid, but does not allow this request. Use a key with the "
+    "scope that the message names.",
+    "quota": "The project stores as many bytes, or made as many evaluations in a day, as it may. "
+    "Retry-After says when to try again. `GET /v1/access` shows limits and use.",
+    "unauthorized": "The request has no valid API key. Send `Authorization: Bearer lagid_…`, or "
+    "sign in at /sign-in.",
     "conflict": "The current state of the job does not allow this request.",
     "internal": "An unexpected error occurred. The server's log has the details.",
     "invalid": "The body or a query value is invalid. `errors` lists every fault. "

@@ -16,6 +16,8 @@ PROTECTIVE_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 """Headers of every answer: no guessed media type, and no use inside pages of other origins."""
+PRIVATE_HEADERS = {"Cache-Control": "private, no-cache"}
+"""Headers of every answer where keys are asked for: no cache gives it to another caller."""
 # Scripts and data come from this server only. Plotly styles its own elements, hence the inline
 # styles. It writes pictures for download through blob: and data: addresses.
 PAGE_HEADERS = {

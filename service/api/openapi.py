@@ -5,7 +5,7 @@ So no route lists its errors, and a new route has them all. The same holds for w
 JSON, and for headers. Examples are in `service.api.examples`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from http import HTTPStatus
 from threading import Lock
 from typing import Any
@@ -14,7 +14,9 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from pydantic import Field
 
+from service.access.scopes import find_needed_scope
 from service.api import examples
+from service.api.access_check import COOKIE
 from service.api.content import FILE_TYPE, MCAP_TYPE
 from service.api.problems import PROBLEM_TYPE
 from service.core import errors
@@ -29,6 +31,23 @@ _PROBLEM_SCHEMA = "ProblemOut"
 _BINARY = {"type": "string", "format": "binary"}
 _SUCCESS = "Successful Response"
 """FastAPI's description of an answer that has no other."""
+
+
+SECURITY_SCHEMES: dict[str, Any] = {
+    "key": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "An API key, `lagid_…`, with the scope that the operation names. Nothing is "
+        "needed where the service has keys off.",
+    },
+    "session": {
+        "type": "apiKey",
+        "in": "cookie",
+        "name": COOKIE,
+        "description": "The session of a browser that signed in at `/sign-in`.",
+    },
+}
+"""How a request shows who sends it; one of them is enough."""
 
 
 class ProblemOut(Answer):
@@ -63,10 +82,6 @@ def _gives_file(_method: str, operation: Operation) -> bool:
     return any(MCAP_TYPE in response.get("content", {}) for response in _answers(operation))
 
 
-def _creates_job(_method: str, operation: Operation) -> bool:
-    return "202" in operation["responses"]
-
-
 def _names_resource(method: str, operation: Operation) -> bool:
     return _has_body(method, operation) or any(
         parameter["in"] == "path" for parameter in operation.get("parameters", ())
@@ -77,8 +92,19 @@ def _answers(operation: Operation) -> list[Mapping[str, Any]]:
     return list(operation["responses"].values())
 
 
+def _needs_key(_method: str, operation: Operation) -> bool:
+    return bool(operation["security"])
+
+
+def _adds_rows(method: str, operation: Operation) -> bool:
+    is_writing = {"key": ["write"]} in operation["security"]
+    return is_writing and (_has_body(method, operation) or "202" in operation["responses"])
+
+
 RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
+    (errors.Unauthorized, _needs_key),
     (errors.ForeignOrigin, _is_unsafe),
+    (errors.OutOfScope, _needs_key),
     (errors.NotFound, _names_resource),
     (errors.StalledRequest, _has_file),
     (errors.Conflict, _names_resource),
@@ -88,7 +114,7 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.UnsatisfiableRange, _gives_file),
     (errors.MisdirectedRequest, _is_any),
     (errors.InvalidRequest, _is_any),  # each refuses unknown names in its query
-    (errors.QuotaExceeded, _creates_job),
+    (errors.QuotaExceeded, _adds_rows),
     (errors.Unavailable, _is_any),
 )
 """Each error, and which operations may answer with it."""
@@ -124,13 +150,17 @@ class DocumentedApp(FastAPI):
 def _complete_document(document: dict[str, Any]) -> None:
     """Add what FastAPI does not know to a document."""
     _add_problem_schema(document["components"]["schemas"])
-    document["components"]["responses"] = _build_problem_answers()
-    for method, operation in list_operations(document):
-        operation["responses"].pop(str(InvalidRequest.status), None)  # FastAPI's own
-        _describe_answers(operation)
-        _describe_parameters(operation)
-        _add_examples(operation)
-        _add_errors(method, operation)
+    document["components"]["securitySchemes"] = SECURITY_SCHEMES
+    shared: dict[str, Any] = {}
+    document["components"]["responses"] = shared
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            operation["responses"].pop(str(InvalidRequest.status), None)  # FastAPI's own
+            _describe_answers(operation)
+            _describe_parameters(operation)
+            _add_examples(operation)
+            _add_security(method, path, operation)
+            _add_errors(method, operation, shared)
 
 
 def list_operations(document: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -146,29 +176,35 @@ def _add_problem_schema(schemas: dict[str, Any]) -> None:
     schemas |= {**schema.pop("$defs"), _PROBLEM_SCHEMA: schema}
 
 
-def _build_problem_answers() -> dict[str, Any]:
-    """Build the answer of each error, which all operations share."""
-    reference = {"$ref": f"#/components/schemas/{_PROBLEM_SCHEMA}"}
-    answers: dict[str, Any] = {}
-    for error, _ in RULES:
-        example = {
-            "type": f"/problems/{error.kind}",
-            "title": error.title,
-            "status": error.status,
-            "detail": error.title,
-            "instance": "/v1/jobs",
-        }
-        content = {PROBLEM_TYPE: {"schema": reference, "example": example}}
-        answers[error.__name__] = {"description": error.title, "content": content}
-        answers[error.__name__] |= _describe_headers(error.status)
-    return answers
+def _add_security(method: str, path: str, operation: dict[str, Any]) -> None:
+    scope = find_needed_scope(method.upper(), path)
+    operation["security"] = [{name: [scope]} for name in SECURITY_SCHEMES] if scope else []
 
 
-def _add_errors(method: str, operation: dict[str, Any]) -> None:
+def _add_errors(method: str, operation: dict[str, Any], shared: dict[str, Any]) -> None:
+    """Add the answer of each error. Operations share it; errors of one status are one answer."""
+    by_status: dict[int, list[type[ServiceError]]] = {}
     for error, applies in RULES:
         if applies(method, operation):
-            reference = {"$ref": f"#/components/responses/{error.__name__}"}
-            operation["responses"][str(error.status)] = reference
+            by_status.setdefault(error.status, []).append(error)
+    for status, errors_of_status in by_status.items():
+        name = "Or".join(error.__name__ for error in errors_of_status)
+        shared.setdefault(name, _build_problem_answer(errors_of_status))
+        operation["responses"][str(int(status))] = {"$ref": f"#/components/responses/{name}"}
+
+
+def _build_problem_answer(errors_of_status: Sequence[type[ServiceError]]) -> dict[str, Any]:
+    first, title = errors_of_status[0], "; ".join(error.title for error in errors_of_status)
+    example = {
+        "type": f"/problems/{first.kind}",
+        "title": first.title,
+        "status": first.status,
+        "detail": first.title,
+        "instance": "/v1/jobs",
+    }
+    reference = {"$ref": f"#/components/schemas/{_PROBLEM_SCHEMA}"}
+    content = {PROBLEM_TYPE: {"schema": reference, "example": example}}
+    return {"description": title, "content": content, **_describe_headers(first.status)}
 
 
 def _describe_headers(status: int) -> dict[str, Any]:

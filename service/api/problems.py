@@ -124,6 +124,19 @@ def error_response(request: Request, error: ServiceError) -> Response:
     )
 
 
+def answer_error(request: Request, error: Exception) -> Response:
+    """Answer with the document that an error has in a route, for middleware around all routes.
+
+    An error that no handler knows is raised again.
+    """
+    handlers = request.app.exception_handlers
+    for kind in type(error).__mro__[:-2]:  # not that of all other errors
+        if kind in handlers:
+            response: Response = handlers[kind](request, error)
+            return response
+    raise error
+
+
 def _handle_service_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, ServiceError)
     return error_response(request, error)

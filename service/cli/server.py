@@ -50,6 +50,7 @@ def serve(
     settings = load_settings(host=host, port=port, data_dir=data_dir, cpus=cpus)
     settings.check_exposure()
     _prepare_data_folder(settings)
+    _check_access(settings)
     with (
         _lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
         open_listener(settings.host, settings.port) as listener,
@@ -180,13 +181,21 @@ def _run_server(
         log_config=None,  # its loggers pass their lines on to ours
         log_level="warning",
         access_log=False,
+        proxy_headers=False,  # the application believes them, of the proxies in its settings
         timeout_graceful_shutdown=SHUTDOWN_SECONDS,
     )
     Server(config).run(sockets=[listener])
 
 
 def _check_storage(settings: "Settings") -> None:
-    """Open the database and the object store once, so that a failure prints one line.
+    """Open the database and the object store once, so that a failure prints one line."""
+    with _open_checked_storage(settings):
+        pass
+
+
+@contextmanager
+def _open_checked_storage(settings: "Settings") -> Iterator["Database"]:
+    """Open the database and the object store.
 
     Raises
     ------
@@ -205,7 +214,38 @@ def _check_storage(settings: "Settings") -> None:
             f"the database cannot be opened: {reason}. Check that its server runs and that "
             "LAGID_DATABASE_URL is right."
         ) from None
-    database.dispose()
+    try:
+        yield database
+    finally:
+        database.dispose()
+
+
+def _check_access(settings: "Settings") -> None:
+    """Refuse to ask for keys while there is none, and to let in users of no project.
+
+    Raises
+    ------
+    Misconfigured
+        With what to do.
+    """
+    if settings.auth_mode == "off":
+        return
+    from service.repositories.keys import KeyRepository
+    from service.repositories.projects import ProjectRepository
+    from service.storage.errors import RowNotFound
+
+    with _open_checked_storage(settings) as database, database.read_session() as session:
+        if settings.auth_mode == "proxy":
+            try:
+                ProjectRepository(session).get(settings.proxy_project)
+            except RowNotFound as error:
+                raise Misconfigured(f"LAGID_PROXY_PROJECT: {error}") from None
+        elif not KeyRepository(session, None).has_valid():
+            raise Misconfigured(
+                f"requests to {settings.host} need an API key, and there is none. Create one with "
+                "`lagid key create NAME` on this data folder, or serve on 127.0.0.1 without keys. "
+                "LAGID_ALLOW_OPEN_HOST=true lets everybody in."
+            )
 
 
 def _exit_on_signals() -> None:

@@ -245,6 +245,9 @@ HEALTH: "Endpoint[documents.HealthDocument]" = Endpoint("GET", "/healthz")
 READINESS: "Endpoint[documents.ReadyDocument]" = Endpoint("GET", "/readyz")
 METRICS: Endpoint[bytes] = Endpoint("GET", "/metrics")
 
+ACCESS: "Endpoint[documents.AccessDocument]" = Endpoint("GET", "access")
+AUDIT: "Endpoint[documents.AuditEntryDocument]" = Endpoint("GET", "audit")
+
 REFERENCES: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references")
 REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references/{}")
 ACCEPT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PUT", "references/{}")

@@ -199,6 +199,19 @@ class Client:
         """Draw the signals of a dataset, as Plotly JSON; `options` are those of the interface."""
         return self._fetch(calls.DATASET_FIGURE(dataset, **options))
 
+    # ---- access
+    def access(self) -> "documents.AccessDocument":
+        """Fetch who asks: project and scopes, with the project's limits and use."""
+        return self._fetch(calls.ACCESS())
+
+    def audit(self, limit: int | None = None) -> "Rows[documents.AuditEntryDocument]":
+        """List who did what in the project, latest first: all, or at most `limit`."""
+        return self._fetch_list(calls.AUDIT(), limit)
+
+    def iterate_audit(self) -> Iterator["documents.AuditEntryDocument"]:
+        """Iterate over who did what in the project, latest first, a page at a time."""
+        return self._iterate(calls.AUDIT())
+
     # ---- models
     def models(self, limit: int | None = None) -> "Rows[documents.ModelDocument]":
         """List the built-in models and those of users: all, or at most `limit`."""

@@ -23,6 +23,23 @@ class AcceptanceDocument(TypedDict):
     """time of the acceptance, UTC"""
 
 
+class AccessDocument(TypedDict):
+    """Who asks, in which project, and what it may do."""
+
+    actor: str
+    """who sends the request: a key, a user of the proxy, or `loopback`"""
+    project: str
+    """id of the project"""
+    project_name: str
+    """name of the project"""
+    scopes: list[str]
+    """what the caller may do: read, write, admin"""
+    limits: LimitsDocument
+    """limits of the project"""
+    used: UseDocument
+    """what the project uses of them"""
+
+
 class AgreementDocument(TypedDict):
     """Fit of one output of one experiment (counted from 1); null if the output does not vary."""
 
@@ -78,6 +95,32 @@ class AlgorithmInDocument(TypedDict):
     """magnitude of a signal beyond which a simulation counts as unstable"""
     stop: NotRequired[StopInDocument]
     """further end conditions"""
+
+
+class AuditEntryDocument(TypedDict):
+    """One action: who did what to which object."""
+
+    id: int
+    """number of the entry; later ones are larger"""
+    at: str
+    """when it was done, UTC"""
+    actor: str
+    """who did it, as in `GET /v1/access`"""
+    action: str
+    """what was done, such as `job.submit`"""
+    object_id: str | None
+    """id of what was changed"""
+    request_id: str | None
+    """id of the request that did it"""
+
+
+class AuditPageDocument(TypedDict):
+    """Entries of the audit log, latest first."""
+
+    items: list[AuditEntryDocument]
+    """items of this page, in the order of the list"""
+    next: NotRequired[str | None]
+    """cursor of the following page; null on the last one"""
 
 
 class BatchLabelDocument(TypedDict):
@@ -781,6 +824,19 @@ class LawPointDocument(TypedDict):
     """upper end of the 95 % interval, in the quantity's unit"""
     is_outside: bool
     """whether x is outside the measured range"""
+
+
+class LimitsDocument(TypedDict):
+    """Limits of a project; null where there is none."""
+
+    max_open_jobs: int
+    """most jobs that wait or run"""
+    max_open_runs: int
+    """most runs of these jobs that have not ended"""
+    max_stored_bytes: int | None
+    """most bytes of recordings"""
+    max_daily_evaluations: int | None
+    """most simulations of jobs that ran in the last 24 hours"""
 
 
 class LineageEdgeDocument(TypedDict):
@@ -1676,6 +1732,19 @@ class TuningDocument(TypedDict):
     """formulas of the rule with their values"""
     reference: str
     """where the rule was published"""
+
+
+class UseDocument(TypedDict):
+    """What a project uses of its limits."""
+
+    open_jobs: int
+    """jobs that wait or run"""
+    open_runs: int
+    """runs of these jobs that have not ended"""
+    stored_bytes: int
+    """bytes of recordings"""
+    daily_evaluations: int
+    """simulations of jobs that ran in the last 24 hours"""
 
 
 class ValidationInDocument(TypedDict):

@@ -1,7 +1,9 @@
 """Every error the service raises on purpose, each with its HTTP status.
 
 * ServiceError
+    - Unauthorized           401  the request has no valid API key
     - ForeignOrigin          403  a page of another origin sent a request that changes something
+    - OutOfScope             403  the API key does not allow this request
     - NotFound               404  the dataset, model, job or run does not exist
     - StalledRequest         408  the sender of a body stopped
     - Conflict               409  the state of the resource does not allow the request
@@ -12,6 +14,7 @@
     - MisdirectedRequest     421  the Host header names another server
     - InvalidRequest         422  the body or a query value is invalid; lists every fault
     - QuotaExceeded          429  the project has reached its limit of unfinished work
+        - BudgetExceeded          or its limit of stored bytes or of evaluations in a day
     - Unavailable            503  a component of the service is down
         - ServiceBusy             too many heavy requests
     - Misconfigured               the settings are invalid (command line only)
@@ -23,6 +26,7 @@ heavy library, so that the light client can use it.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import ceil
 from typing import Any, ClassVar
 
 from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
@@ -78,6 +82,34 @@ class ForeignOrigin(ServiceError):
     """A page of another origin sent a request that changes something."""
 
     status, kind, title = 403, "foreign-origin", "Not allowed from another origin"
+
+
+class Unauthorized(ServiceError):
+    """The request has no valid API key.
+
+    Attributes
+    ----------
+    is_wrong : bool
+        Whether it has one that is not valid.
+    """
+
+    status, kind, title = 401, "unauthorized", "A valid API key is needed"
+
+    def __init__(self, detail: str, *, is_wrong: bool = False) -> None:
+        super().__init__(detail)
+        self.is_wrong = is_wrong
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """How to authenticate (RFC 6750)."""
+        error = ', error="invalid_token"' if self.is_wrong else ""
+        return {"WWW-Authenticate": f'Bearer realm="lagid"{error}'}
+
+
+class OutOfScope(ServiceError):
+    """The API key does not allow this request."""
+
+    status, kind, title = 403, "out-of-scope", "The API key does not allow this"
 
 
 class NotFound(ServiceError):
@@ -171,6 +203,21 @@ class QuotaExceeded(ServiceError):
     def headers(self) -> Mapping[str, str]:
         """When to try again, in seconds."""
         return {"Retry-After": "10"}
+
+
+class BudgetExceeded(QuotaExceeded):
+    """The project has reached its limit of stored bytes or of evaluations in a day."""
+
+    kind, title = "quota", "The project has used up its quota"
+
+    def __init__(self, detail: str, retry_seconds: float) -> None:
+        super().__init__(detail)
+        self._retry_seconds = retry_seconds
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to try again, in seconds."""
+        return {"Retry-After": str(max(1, ceil(self._retry_seconds)))}
 
 
 class Unavailable(ServiceError):

@@ -1,10 +1,10 @@
 """Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
 
 import stat
-from ipaddress import ip_address
+from ipaddress import IPv4Network, IPv6Network, ip_address, ip_network
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -30,6 +30,10 @@ def _strip_slash(value: Any) -> Any:
     return value.rstrip("/") if isinstance(value, str) else value
 
 
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)]
+AuthMode = Literal["off", "keys", "proxy"]
+
+
 class Settings(BaseSettings):
     """Storage, address, limits and habits of the service.
 
@@ -52,12 +56,23 @@ class Settings(BaseSettings):
     """Address where the web process listens."""
     port: int = Field(default=8000, ge=0, le=65535)
     """Port of the web process. 0 chooses a free one."""
-    require_keys: bool | None = None
-    """Reserved: this version has no API keys, and refuses `true`."""
+    auth: AuthMode | None = None
+    """Who may use the service. `off`: everybody who reaches it. `keys`: whoever sends an API key.
+    `proxy`: a key, or a user whom an authenticating proxy names. Without it: `off` on loopback,
+    else `keys`."""
     allow_open_host: bool = False
-    """Serve other hosts although this version has no API keys. Only behind a proxy that
-    authenticates."""
-    allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_names)] = ()
+    """Serve other hosts without API keys. Only where nobody else reaches the port."""
+    proxy_header: str = Field(default="X-Forwarded-User", pattern=r"^[A-Za-z0-9-]+$")
+    """Header in which an authenticating proxy names the user."""
+    proxy_addresses: Names = ("127.0.0.1", "::1")
+    """Addresses or networks of proxies, separated by commas. Headers of others are not believed."""
+    proxy_project: str = "proj_default"
+    """Project of the users whom the proxy names."""
+    proxy_admins: Names = ()
+    """Users of the proxy with the scope admin, separated by commas."""
+    session_hours: float = Field(default=12.0, gt=0, le=8760)
+    """How long a browser stays signed in."""
+    allowed_hosts: Names = ()
     """More host names that are answered, separated by commas, such as that of a reverse proxy."""
     root_path: Annotated[
         str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
@@ -121,6 +136,25 @@ class Settings(BaseSettings):
         if path == (url or "") or not path or path.startswith(("/", ":memory:", "file:")):
             return url
         return f"sqlite:///{Path(path).absolute()}"
+
+    @field_validator("proxy_addresses")
+    @classmethod
+    def _check_addresses(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
+        for address in addresses:
+            ip_network(address, strict=False)
+        return addresses
+
+    @property
+    def auth_mode(self) -> AuthMode:
+        """Who may use the service: everybody, or whoever has a key or is named by a proxy."""
+        if self.auth is not None:
+            return self.auth
+        return "off" if is_loopback(self.host) or self.allow_open_host else "keys"
+
+    @property
+    def proxy_networks(self) -> tuple[IPv4Network | IPv6Network, ...]:
+        """Networks of the proxies whose headers are believed."""
+        return tuple(ip_network(address, strict=False) for address in self.proxy_addresses)
 
     @property
     def database_location(self) -> str:
@@ -190,20 +224,18 @@ class Settings(BaseSettings):
         return None
 
     def check_exposure(self) -> None:
-        """Refuse to serve other hosts without API keys.
+        """Refuse to serve other hosts without API keys, unless that is said twice.
 
         Raises
         ------
         Misconfigured
-            If the host is not loopback, or keys are required: this version has no API keys.
+            If the host is not loopback, keys are off, and `allow_open_host` is not set.
         """
-        if self.require_keys:
-            raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
-        if not is_loopback(self.host) and not self.allow_open_host:
+        if self.auth_mode == "off" and not is_loopback(self.host) and not self.allow_open_host:
             raise Misconfigured(
-                f"host {self.host} can be reached from other machines, and this version has no "
-                "API keys yet. Serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if an "
-                "authenticating reverse proxy is in front of it."
+                f"host {self.host} can be reached from other machines, and LAGID_AUTH=off asks "
+                "for no API keys. Set LAGID_AUTH=keys, or LAGID_ALLOW_OPEN_HOST=true if others "
+                "may do everything."
             )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from service.core.errors import ServiceError
 from sysid.islands.state import RunState
 from sysid.search.archive import make_archive
-from sysid.search.island import Island, to_improvement
+from sysid.search.island import Island, to_improvements
 from sysid.search.state import (
     COLUMN_EVALUATIONS,
     COLUMN_GENERATION,
@@ -152,7 +152,7 @@ def _read_islands(descriptions: list[Any], reader: "_ArrayReader") -> Iterator[I
             name: reader.read_array(kind, shape)
             for (name, kind), shape in zip(_ARRAYS, shapes, strict=True)
         }
-        history = tuple(to_improvement(row) for row in arrays.pop("history").tolist())
+        history = tuple(to_improvements(arrays.pop("history")))
         yield Island(number, int(one["seed"]), **arrays, history=history)
 
 

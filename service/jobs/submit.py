@@ -28,6 +28,7 @@ from service.queue.admission import count_unfinished
 from service.queue.run_writes import NewRun, insert_runs
 from service.repositories.jobs import JobRepository, NewJob, Submission
 from service.repositories.lineage import LineageRepository
+from service.repositories.projects import ProjectRepository, check_daily_evaluations
 from service.storage.columns import utc_now
 from service.storage.sessions import Database
 from service.storage.tables import Dataset, Job
@@ -56,7 +57,7 @@ def submit_job(
     KeyReused
         If the idempotency key was used with another body.
     QuotaExceeded
-        If the project has too many jobs or runs queued and running.
+        If the project has too much queued and running, or made too many evaluations today.
     """
     with database.read_session() as session:
         checked = check_job(session, body, settings)
@@ -107,7 +108,7 @@ def store_job(
     KeyReused
         If the idempotency key was used with another body.
     QuotaExceeded
-        If the project has too many jobs or runs queued and running.
+        If the project has too much queued and running, or made too many evaluations today.
     """
     submission = JobRepository(session).submit(checked.job, key=key, request_hash=checked.digest)
     if submission.is_new:
@@ -122,25 +123,29 @@ def store_job(
 
 
 def check_limits(session: Session, job: Job, settings: Settings) -> None:
-    """Refuse a job just queued if its project now exceeds its limits of unfinished work.
+    """Refuse a job just queued if its project now exceeds its limits of work.
 
     Raises
     ------
     QuotaExceeded
         With the counts; the caller's transaction ends with it.
     """
+    limits = ProjectRepository(session).lock_limits(job.project_id)
+    max_jobs = settings.max_open_jobs if limits.max_open_jobs is None else limits.max_open_jobs
+    max_runs = settings.max_open_runs if limits.max_open_runs is None else limits.max_open_runs
     open_now = count_unfinished(session, job.project_id)
-    if open_now.jobs > settings.max_open_jobs:
+    if open_now.jobs > max_jobs:
         raise QuotaExceeded(
             f"{open_now.jobs - 1} jobs of the project are queued or running; at most "
-            f"{settings.max_open_jobs} may be. Cancel some, or submit this job later"
+            f"{max_jobs} may be. Cancel some, or submit this job later"
         )
-    if open_now.runs > settings.max_open_runs:
+    if open_now.runs > max_runs:
         left = job.n_runs - job.n_done
         raise QuotaExceeded(
             f"{open_now.runs - left} runs of the project are not done, and this job adds {left}. "
-            f"At most {settings.max_open_runs} may be open. Cancel some, or submit this job later"
+            f"At most {max_runs} may be open. Cancel some, or submit this job later"
         )
+    check_daily_evaluations(session, job.project_id, limits.max_daily_evaluations)
 
 
 def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
@@ -151,7 +156,7 @@ def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
     Conflict
         If it is in another state.
     QuotaExceeded
-        If the project has too many jobs or runs queued and running.
+        If the project has too much queued and running, or made too many evaluations today.
     """
     job = JobRepository(session).resume(job_id)
     check_limits(session, job, settings)

@@ -7,13 +7,14 @@ servers.
 import base64
 import gzip
 import hashlib
+from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -22,6 +23,11 @@ from service.core.root_path import get_root_path, to_address
 from service.core.text import TEMPLATE_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
+if TYPE_CHECKING:
+    from service.access.callers import Caller
+
+shown_account: "ContextVar[Caller | None]" = ContextVar("shown_account", default=None)
+"""Who is signed in, in the head of each page of a request; None shows nothing."""
 STATIC_FOLDER = Path(__file__).parent / "static"
 MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
@@ -78,6 +84,7 @@ def template_environment() -> Environment:
     )
     environment.filters.update(TEMPLATE_FILTERS)
     environment.globals["default_algorithm"] = GeneticAlgorithm()
+    environment.globals["get_account"] = shown_account.get
     environment.globals.update(
         root=get_root_path,
         static=lambda name: to_address(f"/static/{name}"),

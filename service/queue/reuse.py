@@ -9,8 +9,9 @@ from sqlalchemy.orm import Session
 from service.core.states import JobState
 from service.queue.leases import Lease
 from service.queue.run_writes import RunOutcome, RunWriter
+from service.storage.sessions import find_project
 from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks
-from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
+from service.storage.tables import Job, MigrationLog, Run, RunHistory
 
 _COPIED_COLUMNS = (
     "spec_hash",
@@ -32,7 +33,7 @@ _COPIED_COLUMNS = (
 def find_computed_runs(
     session: Session,
     hashes: Collection[str],
-    project_id: str = DEFAULT_PROJECT,
+    project_id: str | None = None,
     *,
     with_signals: bool = False,
 ) -> dict[str, str]:
@@ -50,7 +51,7 @@ def find_computed_runs(
         first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
         query = first.where(
             Job.deleted_at.is_(None),
-            Run.project_id == project_id,
+            Run.project_id == (project_id or find_project(session)),
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
             Run.signals_sha256.is_not(None) if with_signals else true(),

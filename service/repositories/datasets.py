@@ -8,9 +8,12 @@ from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.repositories.audit import record_action
 from service.repositories.lineage import LineageRepository, Relation
+from service.repositories.projects import check_stored_bytes
 from service.storage.columns import Document, utc_now
 from service.storage.errors import RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
 from service.storage.tables import DEFAULT_PROJECT, Dataset
 
@@ -47,13 +50,19 @@ class StoredDataset:
 class DatasetRepository:
     """The datasets of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def add(
         self, new: NewDataset, *, parents: Iterable[str] = (), relation: Relation = "derived"
     ) -> StoredDataset:
-        """Store a dataset and its lineage, or return the existing one of the same source."""
+        """Store a dataset and its lineage, or return the existing one of the same source.
+
+        Raises
+        ------
+        BudgetExceeded
+            If the project would store more bytes than it may.
+        """
         existing = self.find_by_source(new.source_key)
         if existing is not None:
             return StoredDataset(existing, False)
@@ -66,7 +75,9 @@ class DatasetRepository:
             if existing is None:
                 raise
             return StoredDataset(existing, False)
+        check_stored_bytes(self._session, self._project_id)
         LineageRepository(self._session, self._project_id).add_links(dataset.id, parents, relation)
+        record_action(self._session, "dataset.add", dataset.id, self._project_id)
         return StoredDataset(dataset, True)
 
     def find_by_source(self, source_key: str) -> Dataset | None:
@@ -111,6 +122,7 @@ class DatasetRepository:
     def delete(self, dataset_id: str) -> None:
         """Hide a dataset. Its object becomes garbage when no other row refers to it."""
         self.get(dataset_id).deleted_at = utc_now()
+        record_action(self._session, "dataset.delete", dataset_id, self._project_id)
         self._session.flush()
 
     def _filter_project(self) -> tuple[Any, ...]:

@@ -9,9 +9,11 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
+from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import (
     RETURNING_OPTIONS,
     RowPage,
@@ -19,7 +21,7 @@ from service.storage.statements import (
     make_page,
     new_id,
 )
-from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run, StoredSummary
+from service.storage.tables import IdempotencyKey, Job, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -47,8 +49,8 @@ class Submission:
 class JobRepository:
     """The jobs of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def submit(self, new: NewJob, *, key: str | None = None, request_hash: str = "") -> Submission:
         """Queue a job; with a `key` that was used before, return the earlier job.
@@ -143,6 +145,7 @@ class JobRepository:
             job.state, job.finished_at = JobState.CANCELLED, utc_now()
             end_open_runs(self._session, job_id, JobState.CANCELLED, None)
             EventRepository(self._session).append_state(job)
+        record_action(self._session, "job.cancel", job_id, self._project_id)
         self._session.flush()
         return job
 
@@ -167,6 +170,7 @@ class JobRepository:
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
         self._session.execute(delete(StoredSummary).where(StoredSummary.job_id == job_id))
+        record_action(self._session, "job.resume", job_id, self._project_id)
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job
@@ -177,6 +181,7 @@ class JobRepository:
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
         job.deleted_at = utc_now()
+        record_action(self._session, "job.delete", job_id, self._project_id)
         self._session.flush()
 
     def _filter_project(self) -> tuple[Any, ...]:
@@ -207,6 +212,7 @@ class JobRepository:
         )
         self._session.add(job)
         self._session.flush()
+        record_action(self._session, "job.submit", job.id, self._project_id)
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session, aliased
 
+from service.storage.sessions import find_project
 from service.storage.statements import insert_missing
 from service.storage.tables import (
-    DEFAULT_PROJECT,
     AcceptedReference,
     Dataset,
     LineageEdge,
@@ -34,8 +34,8 @@ class LineageLink:
 class LineageRepository:
     """The lineage of one project in one session."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def add_links(self, child: str, parents: Iterable[str], relation: Relation) -> None:
         """Record that `child` was made from each of `parents`."""
@@ -81,29 +81,30 @@ class WrittenProgress(NamedTuple):
 
 
 def find_datasets_by_name(
-    session: Session, name: str, project_id: str = DEFAULT_PROJECT
+    session: Session, name: str, project_id: str | None = None
 ) -> list[Dataset]:
     """List the datasets with exactly this name, latest first."""
     query = select(Dataset).where(
-        Dataset.project_id == project_id, Dataset.deleted_at.is_(None), Dataset.name == name
+        Dataset.project_id == (project_id or find_project(session)),
+        Dataset.deleted_at.is_(None),
+        Dataset.name == name,
     )
     return list(session.scalars(query.order_by(Dataset.id.desc()).limit(10)))
 
 
-def list_dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[str]:
+def list_dataset_names(session: Session, project_id: str | None = None) -> list[str]:
     """List the names of the latest datasets, for suggestions."""
     query = select(Dataset.name).where(
-        Dataset.project_id == project_id, Dataset.deleted_at.is_(None)
+        Dataset.project_id == (project_id or find_project(session)), Dataset.deleted_at.is_(None)
     )
     return list(session.scalars(query.order_by(Dataset.id.desc()).limit(200)))
 
 
-def list_reference_names(
-    session: Session, run_id: str, project_id: str = DEFAULT_PROJECT
-) -> list[str]:
+def list_reference_names(session: Session, run_id: str, project_id: str | None = None) -> list[str]:
     """List the names for which a run is or was an accepted reference."""
     query = select(AcceptedReference.name).where(
-        AcceptedReference.project_id == project_id, AcceptedReference.run_id == run_id
+        AcceptedReference.project_id == (project_id or find_project(session)),
+        AcceptedReference.run_id == run_id,
     )
     return list(session.scalars(query.distinct().order_by(AcceptedReference.name)))
 

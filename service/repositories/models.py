@@ -8,10 +8,12 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.repositories.audit import record_action
 from service.storage.columns import Document, to_json, utc_now
 from service.storage.errors import RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
-from service.storage.tables import DEFAULT_PROJECT, ModelVersion
+from service.storage.tables import ModelVersion
 
 _MAX_TRIES = 20
 
@@ -27,8 +29,8 @@ class AddedModel:
 class ModelRepository:
     """The models of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def add(self, name: str, document: Document) -> AddedModel:
         """Store a document as the next version of `name`, unless it equals the latest version."""
@@ -67,7 +69,9 @@ class ModelRepository:
 
     def delete(self, reference: str) -> None:
         """Hide one version of a model; jobs with this version keep its document."""
-        self.get(reference).deleted_at = utc_now()
+        model = self.get(reference)
+        model.deleted_at = utc_now()
+        record_action(self._session, "model.delete", model.id, self._project_id)
         self._session.flush()
 
     def _filter_project(self) -> tuple[Any, ...]:
@@ -104,4 +108,5 @@ class ModelRepository:
         )
         self._session.add(model)
         self._session.flush()
+        record_action(self._session, "model.add", model.id, self._project_id)
         return model

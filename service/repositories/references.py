@@ -7,10 +7,12 @@ from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.repositories.audit import record_action
 from service.storage.columns import Document
 from service.storage.errors import RowConflict, RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, make_page
-from service.storage.tables import DEFAULT_PROJECT, AcceptedReference, Run
+from service.storage.tables import AcceptedReference, Run
 
 MAX_HISTORY = 1000
 """Longest reported history of one name."""
@@ -31,8 +33,8 @@ class CurrentReference(NamedTuple):
 class ReferenceRepository:
     """The references of one project in one session. The opener of the session commits."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def accept_run(
         self, name: str, run_id: str, accepted_by: str | None = None, note: str | None = None
@@ -60,6 +62,7 @@ class ReferenceRepository:
                     self._session.flush()
             except IntegrityError:
                 continue
+            record_action(self._session, "reference.accept", run_id, self._project_id)
             return new
         raise RowConflict(f"reference {name!r} is being accepted by others; try again")
 

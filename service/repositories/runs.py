@@ -24,8 +24,9 @@ from service.core.text_checks import MANY
 from service.repositories.history import HistoryPoint, MigrantPoint, unpack_history, unpack_migrants
 from service.storage.columns import Document, to_json
 from service.storage.errors import InvalidCursor, RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage, make_page
-from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
+from service.storage.tables import Job, MigrationLog, Run, RunHistory
 
 RunOrder = Literal[
     "number", "best_rms", "fit_estimation", "fit_validation", "sigma", "seconds", "evaluations"
@@ -44,8 +45,8 @@ _ORDER_COLUMNS: dict[RunOrder, InstrumentedAttribute[Any]] = {
 class RunRepository:
     """The runs of one project in one session."""
 
-    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
-        self._session, self._project_id = session, project_id
+    def __init__(self, session: Session, project_id: str | None = None) -> None:
+        self._session, self._project_id = session, project_id or find_project(session)
 
     def get(self, run_id: str) -> Run:
         """Return a run of this project; else raise `RowNotFound`."""

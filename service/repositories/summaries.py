@@ -13,8 +13,9 @@ from sqlalchemy.orm import Session
 from service.core.states import JobState
 from service.repositories.runs import entry_equals, select_job_id
 from service.storage.columns import Document
+from service.storage.sessions import find_project
 from service.storage.statements import upsert
-from service.storage.tables import DEFAULT_PROJECT, Job, Run, StoredSummary
+from service.storage.tables import Job, Run, StoredSummary
 
 READ_ROWS = 2_000
 """Rows that are held at a time."""
@@ -91,7 +92,7 @@ _ESTIMATES: tuple[tuple[str, QuantityKind], ...] = (("value", "estimate"), ("std
 _NO_ESTIMATE = {entry: None for entry, _ in _ESTIMATES}
 
 
-def read_run_table(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> RunTable:
+def read_run_table(session: Session, job_id: str, project_id: str | None = None) -> RunTable:
     """Read the columns of all created runs of a job: about a second of CPU for 100,000 runs."""
     query = (
         select(
@@ -101,7 +102,7 @@ def read_run_table(session: Session, job_id: str, project_id: str = DEFAULT_PROJ
             Run.valid,
             *(getattr(Run, name) for name in _FLOATS),
         )
-        .where(Run.job_id == select_job_id(job_id, project_id))
+        .where(Run.job_id == select_job_id(job_id, project_id or find_project(session)))
         .order_by(Run.number)
         .execution_options(yield_per=READ_ROWS)
     )
@@ -162,11 +163,11 @@ def _read_part(
 
 
 def find_quietest_run(
-    session: Session, job_id: str, cell: Mapping[str, Any], project_id: str = DEFAULT_PROJECT
+    session: Session, job_id: str, cell: Mapping[str, Any], project_id: str | None = None
 ) -> Run | None:
     """Find the best valid run of a cell among those with the least noise; None without success."""
     query = select(Run).where(
-        Run.job_id == select_job_id(job_id, project_id),
+        Run.job_id == select_job_id(job_id, project_id or find_project(session)),
         Run.state == JobState.SUCCEEDED,
         Run.valid.is_(True),
         Run.best_rms.is_not(None),

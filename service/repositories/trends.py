@@ -8,7 +8,8 @@ from sqlalchemy.orm import Session
 from service.core.states import JobState
 from service.repositories.runs import select_job_id
 from service.storage.columns import Document
-from service.storage.tables import DEFAULT_PROJECT, Run
+from service.storage.sessions import find_project
+from service.storage.tables import Run
 
 RESULT_PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlation_times")
 
@@ -30,7 +31,7 @@ class TrendRow(NamedTuple):
 
 
 def read_trend_rows(
-    session: Session, job_id: str, limit: int, project_id: str = DEFAULT_PROJECT
+    session: Session, job_id: str, limit: int, project_id: str | None = None
 ) -> list[TrendRow]:
     """Read the successful runs of a job in the order of the sweep, at most `limit` of them."""
     names = TrendRow._fields
@@ -40,16 +41,20 @@ def read_trend_rows(
     ]
     query = (
         select(*columns)
-        .where(Run.job_id == select_job_id(job_id, project_id), Run.state == JobState.SUCCEEDED)
+        .where(
+            Run.job_id == select_job_id(job_id, project_id or find_project(session)),
+            Run.state == JobState.SUCCEEDED,
+        )
         .order_by(Run.number)
         .limit(limit)
     )
     return [TrendRow(*row) for row in session.execute(query)]
 
 
-def count_succeeded(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> int:
+def count_succeeded(session: Session, job_id: str, project_id: str | None = None) -> int:
     """Count the successful runs of a job."""
     query = select(func.count()).where(
-        Run.job_id == select_job_id(job_id, project_id), Run.state == JobState.SUCCEEDED
+        Run.job_id == select_job_id(job_id, project_id or find_project(session)),
+        Run.state == JobState.SUCCEEDED,
     )
     return int(session.scalar(query) or 0)

@@ -197,6 +197,8 @@ def _to_json(value: Any) -> Any:
     """Convert a value to JSON: arrays to lists, non-finite numbers to null."""
     if isinstance(value, float):
         return to_finite(value)
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and np.isfinite(value).all():
+        return value.tolist()
     if isinstance(value, tuple | list | np.ndarray):
         return [_to_json(item) for item in value]
     return value

@@ -1,10 +1,12 @@
 """Engines and sessions: one transaction per session, opened for reading or for writing."""
 
+import copy
 import os
 import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,6 +20,7 @@ from service.core import metrics
 from service.core.extras import check_extra
 from service.storage.columns import to_json
 from service.storage.retry import is_transient
+from service.storage.tables import DEFAULT_PROJECT
 
 BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
@@ -25,7 +28,29 @@ ANALYSED_ROWS = 1000
 """Rows of each index that SQLite's ANALYZE reads."""
 _READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
 _BUSY_OPTION = "lagid_busy_seconds"
-_DATABASE_KEY = "lagid_database"
+_DATABASE_KEY, _OWNER_KEY = "lagid_database", "lagid_owner"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionOwner:
+    """For whom a session works: it sees this project, and its changes are this actor's.
+
+    Attributes
+    ----------
+    project_id : str
+    actor : str
+        Identifier of an API key, or ``user:NAME`` from a proxy. Without keys ``loopback``, or
+        ``anybody`` on an open host. Else a part of lagid.
+    request_id : str or None
+        Identifier of the request that the session serves.
+    """
+
+    project_id: str = DEFAULT_PROJECT
+    actor: str = "lagid"
+    request_id: str | None = None
+
+
+_DEFAULT_OWNER = SessionOwner()
 
 
 class Database:
@@ -49,18 +74,24 @@ class Database:
     def __init__(self, url: str, *, is_durable: bool = False, **options: Any) -> None:
         self.engine = _create_engine(url, is_durable=is_durable, **options)
         event.listen(self.engine, "handle_error", _count_error)
+        self._info: dict[str, Any] = {_DATABASE_KEY: self}
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
             self.engine.execution_options(**_READ_OPTIONS),
             expire_on_commit=False,
             autoflush=False,
-            info={_DATABASE_KEY: self},
         )
 
     @property
     def is_sqlite(self) -> bool:
         """Whether the database is SQLite (else PostgreSQL)."""
         return self.engine.dialect.name == "sqlite"
+
+    def open_for(self, owner: SessionOwner) -> "Database":
+        """Return the same database for sessions of an owner; both share their connections."""
+        owned = copy.copy(self)
+        owned._info = {_DATABASE_KEY: owned, _OWNER_KEY: owner}
+        return owned
 
     @contextmanager
     def write_session(self, busy_seconds: float | None = None) -> Iterator[Session]:
@@ -78,13 +109,13 @@ class Database:
                 **{_BUSY_OPTION: min(busy_seconds, BUSY_SECONDS)}
             )
             factory = sessionmaker(impatient, expire_on_commit=False)
-        with factory.begin() as session:
+        with factory(info=self._info) as session, session.begin():
             yield session
 
     @contextmanager
     def read_session(self) -> Iterator[Session]:
         """Open a session that only reads."""
-        with self._read() as session:
+        with self._read(info=self._info) as session:
             yield session
 
     def get_waiting_engine(self, seconds: float) -> Engine:
@@ -119,6 +150,17 @@ def find_database(session: Session) -> Database:
     """Return the database of a reading session, to store what reading it has shown."""
     database: Database = session.info[_DATABASE_KEY]
     return database
+
+
+def find_owner(session: Session) -> SessionOwner:
+    """Return for whom a session works."""
+    owner: SessionOwner = session.info.get(_OWNER_KEY, _DEFAULT_OWNER)
+    return owner
+
+
+def find_project(session: Session) -> str:
+    """Return the project that a session sees."""
+    return find_owner(session).project_id
 
 
 def _create_engine(url: str, *, is_durable: bool, **options: Any) -> Engine:

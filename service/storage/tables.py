@@ -54,17 +54,27 @@ def _partial_index(name: str, condition: str, *columns: str, unique: bool = Fals
 
 
 class Project(Base):
-    """Owner of everything that a user creates."""
+    """Owner of everything that a user creates.
+
+    The limits are those of the settings where they are None, or there is none.
+    """
 
     __tablename__ = "projects"
 
     id: Mapped[str] = mapped_column(primary_key=True)
-    name: Mapped[str]
+    name: Mapped[str] = mapped_column(unique=True, index=True)
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    max_open_jobs: Mapped[int | None]
+    max_open_runs: Mapped[int | None]
+    max_stored_bytes: Mapped[int | None] = mapped_column(LargeInteger)
+    max_daily_evaluations: Mapped[int | None] = mapped_column(LargeInteger)
 
 
 class ApiKey(Base):
-    """A key to a project; only its digest is stored."""
+    """A key to a project; only the digest of its secret is stored.
+
+    `last_used_at` is at most a minute old.
+    """
 
     __tablename__ = "api_keys"
 
@@ -76,6 +86,36 @@ class ApiKey(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     expires_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
+    last_used_at: Mapped[datetime | None]
+
+
+class WebSession(Base):
+    """A browser that signed in with a key; `digest` is that of the cookie's secret."""
+
+    __tablename__ = "web_sessions"
+
+    digest: Mapped[str] = mapped_column(primary_key=True)
+    key_id: Mapped[str] = mapped_column(ForeignKey("api_keys.id"), index=True)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime]
+
+
+class AuditEntry(Base):
+    """Who did what: written in the transaction of the change, and never changed."""
+
+    __tablename__ = "audit_log"
+    __table_args__ = (
+        Index("ix_audit_log_project_id_id", "project_id", "id"),
+        {"sqlite_autoincrement": True},  # no number is used twice
+    )
+
+    id: Mapped[int] = mapped_column(LargeInteger, primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    at: Mapped[datetime] = mapped_column(default=utc_now)
+    actor: Mapped[str]
+    action: Mapped[str]
+    object_id: Mapped[str | None]
+    request_id: Mapped[str | None]
 
 
 class Dataset(Base):
@@ -177,6 +217,13 @@ class Job(Base):
             "state",
             "cancel_requested",
             "id",
+        ),
+        _partial_index(  # for the evaluations of a day
+            "ix_jobs_finished",
+            "finished_at IS NOT NULL",
+            "project_id",
+            "finished_at",
+            "evaluations",
         ),
     )
 

@@ -38,6 +38,7 @@ _SOURCE_PATTERNS = (
     "plants/*.py",
     "simulation/*.py",
     "uncertainty/sensitivities.py",
+    "residuals/restricted_likelihood.py",
 )
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
 _LONG_TO_COMPILE = "sysid.islands.evolve"  # its function holds the whole search

@@ -10,6 +10,7 @@ distance along them. A direction counts only if the output stays the same there.
 
 import numpy as np
 
+from sysid.core.linear_algebra import TruncatedSvd
 from sysid.core.types import FloatArray
 from sysid.simulation.problem import Problem
 
@@ -23,7 +24,7 @@ _SAME_TOLERANCE = 1e-10  # of the output's size: rounding
 def find_translations(
     problem: Problem,
     theta: FloatArray,
-    columns: FloatArray,
+    decomposition: TruncatedSvd,
     scale: FloatArray,
     most: int | None = None,
 ) -> tuple[FloatArray, int]:
@@ -33,8 +34,8 @@ def find_translations(
     ----------
     theta : FloatArray, shape (D,)
         The estimate.
-    columns : FloatArray, shape (n, D)
-        Sensitivities to the places in [0, 1].
+    decomposition : TruncatedSvd
+        Of the sensitivities (n, D) to the places in [0, 1].
     scale : FloatArray, shape (D,)
         ∂θ/∂p for the places p.
     most : int or None
@@ -45,7 +46,7 @@ def find_translations(
     FloatArray, shape (k, D)
         In the parameters' units; k = 0: there is none.
     """
-    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
+    _, singular, rows, _ = decomposition
     directions = []
     evaluations = 0
     for row in rows[singular < _UNCERTAIN_RATIO * singular[0]]:

@@ -13,7 +13,11 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.identifiability.exchange import find_exchanges, order_exchangeable
+from sysid.identifiability.exchange import (
+    ExchangeGroups,
+    find_exchanges,
+    order_exchangeable,
+)
 from sysid.identification.budget import Budget
 from sysid.identification.deadline import Deadline
 from sysid.identification.generalised_least_squares import (
@@ -39,8 +43,8 @@ from sysid.identification.minima import (
     Fit,
     FoundMinima,
     collect_minima,
-    compute_distance,
     continue_from_archive,
+    find_nearest,
     is_same_place,
     scan_by_projection,
     scan_parameters,
@@ -218,13 +222,13 @@ class _EstimateSearch:
             self.problem, best.theta, self._budget.count_left(self._reserved)
         )
         self._budget.spend(spent)
-        self.ends = [
-            replace(end, theta=order_exchangeable(self.problem, end.theta, groups))
-            for end in self.ends
-        ]
+        if groups:
+            self.ends = [
+                replace(end, theta=order_exchangeable(self.problem, end.theta, groups))
+                for end in self.ends
+            ]
         self._scanned = self.theta
-        self._analyse(self.theta)
-        self.analysis = replace(self.analysis, exchanges=groups)
+        self._analyse(self.theta, exchanges=groups)
         if self._refines:
             self._search_local_minima()
 
@@ -301,8 +305,8 @@ class _EstimateSearch:
             white = make_whitening(problem, estimate.correlation_times)
             groups, is_cut = self.analysis.exchanges, self.analysis.is_cut_short
             estimate = estimate._replace(theta=order_exchangeable(problem, estimate.theta, groups))
-            self._analyse(estimate.theta, white)
-            self.analysis = replace(self.analysis, exchanges=groups, is_cut_short=is_cut)
+            self._analyse(estimate.theta, white, exchanges=groups)
+            self.analysis = replace(self.analysis, is_cut_short=is_cut)
             self._widen_intervals(LocalMinima(None, estimate.minima, estimate.rms, 0))
         return estimate
 
@@ -326,11 +330,13 @@ class _EstimateSearch:
         if not self._refines:
             return FoundMinima((), 0)
         problem, groups = self.problem, self.analysis.exchanges
-        fits = [
-            replace(fit, theta=order_exchangeable(problem, fit.theta, groups)) for fit in self._fits
-        ]
+        fits = self._fits
+        if groups:
+            fits = [
+                replace(fit, theta=order_exchangeable(problem, fit.theta, groups)) for fit in fits
+            ]
         minima = collect_minima(problem, fits, self.analysis.linear_model)
-        own = min(minima, key=lambda one: compute_distance(problem, one.values, self.theta))
+        own = find_nearest(problem, minima, self.theta)
         equal = own.rms * (1.0 + SAME_OPTIMUM)  # anywhere on a group's surface, or a mirror image
         agreeing = sum(one.independent for one in minima if one is own or one.rms <= equal)
         all_minima = (*minima, *recorded.minima)
@@ -436,8 +442,7 @@ class _EstimateSearch:
             groups = self.analysis.exchanges
             theta = order_exchangeable(problem, minima.best.theta, groups)
             self._move_best(IslandEnd(theta, minima.best.rms, True))
-            self._analyse(theta)
-            self.analysis = replace(self.analysis, exchanges=groups)
+            self._analyse(theta, exchanges=groups)
         self._widen_intervals(minima)
 
     def _move_best(self, reached: IslandEnd, evaluations: int = 0) -> None:
@@ -447,8 +452,9 @@ class _EstimateSearch:
             reached, evaluations=end.evaluations + evaluations, is_cut_short=end.is_cut_short
         )
 
-    def _analyse(self, theta: FloatArray, *whitening: Whitening) -> None:
-        self.analysis = analyse_estimate(self.problem, theta, self._budget.count_left(), *whitening)
+    def _analyse(self, theta: FloatArray, *whitening: Whitening, exchanges: ExchangeGroups) -> None:
+        analysis = analyse_estimate(self.problem, theta, self._budget.count_left(), *whitening)
+        self.analysis = replace(analysis, exchanges=exchanges) if exchanges else analysis
         self._budget.spend(self.analysis.evaluations)
 
     def _widen_intervals(self, minima: LocalMinima) -> None:

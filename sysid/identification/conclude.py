@@ -172,7 +172,7 @@ def _build_identification(
         correlation_times=times,
         input_holds=holds,
         data_bounds=tuple(p.name for p in problem.free_parameters if p.bounds is not None),
-        sample_time=find_common_sample_time(problem.records),
+        sample_time=problem.share("sample time", lambda: find_common_sample_time(problem.records)),
         search=evidence,
         substeps=problem.model.solver.substeps,
         known_before=_compute_input_history(problem),

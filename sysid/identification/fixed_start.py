@@ -121,7 +121,8 @@ def _predict_starts(
         error, columns = sensitivities.residuals, sensitivities.columns
     else:
         error, columns = analysis.residuals_and_sensitivities
-    left, _, _, retained = compute_truncated_svd(columns)
+    known = None if analysis.residuals_and_sensitivities is None else analysis.decomposition
+    left, _, _, retained = compute_truncated_svd(columns) if known is None else known
     basis = left[:, retained]
     rest = error - basis @ (basis.T @ error)
     loss = float(rest @ rest)
@@ -154,24 +155,31 @@ def _compute_start_slopes(
     """
     weight, rows = problem.evaluator.weight[problem.scored_rows], problem.scored_rows
     starts = _get_assumed_starts(problem)[state]
-    freed = _free_starts(problem, {state: starts}, {state: 1.0})
+
+    def free_start() -> Problem:
+        return _free_starts(problem, {state: starts}, {state: 1.0})
+
+    # A start at a measured value differs from run to run of a sweep, and any other does not.
+    depends = _list_states(problem, MeasuredInitial)
+    freed = free_start() if depends else problem.share(f"free start of {state}", free_start)
     known = dict(zip(problem.free_names, theta.tolist(), strict=True))
 
-    def simulate(step: float) -> FloatArray:
-        place = _join_starts(freed, known, {state: starts + step})
-        return np.asarray(weight * freed.predict(place[None])[0][rows])
+    def simulate(*steps: float) -> FloatArray:
+        places = [_join_starts(freed, known, {state: starts + step}) for step in steps]
+        return np.asarray(weight * freed.predict(np.array(places))[:, rows])
 
     experiments = _number_experiments(problem)
     slopes = np.zeros((rows.size, len(problem.experiments)))
     step = _FIRST_STEP * max(float(np.max(np.abs(starts))), 1.0)
     with np.errstate(all="ignore"):
-        output = simulate(0.0)
+        output, above, below = simulate(0.0, step, -step)
         for _ in range(_MAX_TRIALS):
-            move = float(np.sqrt(np.mean((simulate(step) - output) ** 2)))
+            move = float(np.sqrt(np.mean((above - output) ** 2)))
             if not move < _NOTABLE_STEP * noise:
                 break
             step *= noise / max(move, noise / _MAX_GROWTH)
-        slope = (simulate(step) - simulate(-step)) / (2.0 * step)
+            above, below = simulate(step, -step)
+        slope = (above - below) / (2.0 * step)
     if np.all(np.isfinite(slope)):
         slopes[np.arange(rows.size), experiments] = slope
     return slopes

@@ -26,7 +26,7 @@ _ROUNDING = 1e-9  # of the loss
 def warn_hard_switching(problem: Problem, theta: FloatArray, rms: Sequence[float]) -> list[str]:
     """Warn if the loss jumps near the estimate (D,) and islands ended at different `rms`."""
     finite = [value for value in rms if np.isfinite(value)]
-    switch = next(_iterate_switches(problem.model), None)
+    switch = problem.share("switch", lambda: next(_iterate_switches(problem.model), None))
     if switch is None or not finite or max(finite) <= (1.0 + _DISAGREEMENT) * min(finite):
         return []
     if not _has_jumps(problem, theta):

@@ -23,10 +23,14 @@ _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band
 
 def list_input_holds(problem: Problem) -> tuple[InputHold, ...]:
     """List how each input is read; one whose experiments differ is listed once for each reading."""
-    return tuple(
-        hold
-        for signal in problem.model.inputs
-        for hold in _list_holds(signal.name, problem.records, is_difference(problem.model))
+    is_recursion = is_difference(problem.model)
+    return problem.share(
+        "input holds",
+        lambda: tuple(
+            hold
+            for signal in problem.model.inputs
+            for hold in _list_holds(signal.name, problem.records, is_recursion)
+        ),
     )
 
 

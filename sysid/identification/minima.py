@@ -180,16 +180,19 @@ def continue_from_archive(
     places = from_unit(problem.evaluator, np.array([one.place for one in archived]))
     fitness, spent = problem.evaluate_fitness(places), len(archived)
     best = min(end.rms for end in ends)
+    units, known = to_unit(problem.evaluator, places), [*ends]
+    known_units = [*to_unit(problem.evaluator, np.array([end.theta for end in ends]))]
     fits: list[Fit] = []
     continued = 0
     for i in np.argsort(fitness, kind="stable"):
         theta, rms, count = places[i], float(fitness[i]), archived[i].count
         if not rms < _PROMISING * best:
             break
-        near = min((*ends, *fits), key=lambda fit: compute_distance(problem, fit.theta, theta))
+        distances = _compute_distances(np.array(known_units), units[i])
+        nearest = int(np.argmin(distances))
         same = _SAME_VALLEY if rms <= best * (1.0 + SAME_OPTIMUM) else SAME_PLACE
-        if compute_distance(problem, near.theta, theta) < same:
-            fits.append(replace(near, count=count, independent=count))
+        if distances[nearest] < same:
+            fits.append(replace(known[nearest], count=count, independent=count))
             continue
         if continued == _MOST_CONTINUED or (is_late is not None and is_late()):
             break
@@ -198,6 +201,8 @@ def continue_from_archive(
             break
         spent, continued = spent + end.evaluations, continued + 1
         fits.append(Fit(end.theta, end.rms, count, count))
+        known.append(fits[-1])
+        known_units.append(to_unit(problem.evaluator, end.theta[None])[0])
     return fits, spent
 
 
@@ -280,18 +285,21 @@ def collect_minima(
     the lowest one if the linear model at the estimate says so too.
     """
     kept: list[Minimum] = []
+    kept_units: list[FloatArray] = []
     n = problem.n_scored * _get_variance_ratio(linear)
-    for fit in sorted(fits, key=lambda fit: fit.rms):
+    ordered = sorted(fits, key=lambda fit: fit.rms)
+    units = to_unit(problem.evaluator, np.array([fit.theta for fit in ordered]))
+    for fit, unit in zip(ordered, units, strict=True):
         rms, count, independent = fit.rms, fit.count, fit.independent
         least = kept[0].rms if kept else rms
         ratio = 0.0 if rms <= least else np.inf if least == 0 else 2.0 * n * np.log(rms / least)
-        near = next(
-            (i for i, one in enumerate(kept) if is_same_place(problem, one.values, fit.theta)), None
-        )
+        is_near = _compute_distances(np.array(kept_units), unit) < SAME_PLACE if kept else ()
+        near = next((i for i, is_same in enumerate(is_near) if is_same), None)
         if near is None and kept and linear is not None and ratio <= CHI_SQUARE_95:
             near = 0 if _is_in_valley(problem, linear, n, fit.theta, kept[0].values) else None
         if near is None:
             kept.append(Minimum(fit.theta, rms, count, independent, float(ratio), recorded_from))
+            kept_units.append(unit)
         else:
             count, independent = kept[near].count + count, kept[near].independent + independent
             kept[near] = replace(kept[near], count=count, independent=independent)
@@ -327,7 +335,18 @@ def is_same_place(problem: Problem, first: FloatArray, second: FloatArray) -> bo
 def compute_distance(problem: Problem, first: FloatArray, second: FloatArray) -> float:
     """Compute the largest distance of two places (D,) in one parameter, as a share of its range."""
     places = to_unit(problem.evaluator, np.array([first, second]))
-    return float(np.max(np.abs(places[0] - places[1]), initial=0.0))
+    return float(_compute_distances(places[:1], places[1])[0])
+
+
+def find_nearest(problem: Problem, minima: Sequence[Minimum], theta: FloatArray) -> Minimum:
+    """Find the minimum nearest to a place (D,)."""
+    places = to_unit(problem.evaluator, np.array([*(one.values for one in minima), theta]))
+    return minima[int(np.argmin(_compute_distances(places[:-1], places[-1])))]
+
+
+def _compute_distances(units: FloatArray, unit: FloatArray) -> FloatArray:
+    """Compute the largest difference (P,) of places (P, D) in [0, 1] from one of them (D,)."""
+    return np.asarray(np.max(np.abs(units - unit), axis=1, initial=0.0))
 
 
 def mark_ambiguous(

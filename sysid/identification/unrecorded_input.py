@@ -197,6 +197,17 @@ def _select_recorded(
         return None
 
 
+def _leaves_samples_out(problem: Problem, reach: float) -> bool:
+    """Whether some scored sample reads an input from before its recorded part."""
+    starts = _find_recorded_starts(problem, reach)
+    weights = problem.split_by_output(problem.evaluator.weight)
+    return any(
+        bool(np.any(channel.times[weight[channel.name] > 0] < start))
+        for record, start, weight in zip(problem.records, starts, weights, strict=True)
+        for channel in _order_outputs(problem, record)
+    )
+
+
 def _release_initial_states(problem: Problem) -> dict[str, dict[str, Any]]:
     """Widen the bounds of initial states: these make up for an input that is assumed wrongly."""
     declared = {parameter.name for parameter in problem.model.parameters}
@@ -246,11 +257,11 @@ def compare_where_recorded(
     spans |= dict(zip(problem.free_names, ends, strict=True))
     shortest = min(record.duration for record in problem.records)
     reach = min(_compute_longest_input_delay(problem, spans), 0.5 * shortest)
+    if not _leaves_samples_out(problem, reach):
+        return RecordedComparison()  # no time lag in question reads an assumed input
     others = _select_recorded(problem, reach, _release_initial_states(problem))
     if others is None or others.n_scored <= _MIN_SAMPLES_PER_PARAMETER * theta.size:
         return RecordedComparison()
-    if others.n_scored == problem.n_scored:
-        return RecordedComparison()  # no time lag in question reads an assumed input
     (end,) = refine_candidates(others, [theta], min(budget, _MAX_STEPS * (theta.size + 1)))
     is_contradicted = end is not None and _is_contradicted(problem, end, others, assumed)
     if end is None or not (is_contradicted or not assumed.any()):

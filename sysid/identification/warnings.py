@@ -68,8 +68,10 @@ def collect_warnings(
         messages.append(
             f"the RMS error {rms:.4g} is above the safe limit {limit:g}, so the model is not valid"
         )
-    messages += list_mixed_unit_warnings(problem.model, problem.records)
-    messages += list_time_unit_warnings(problem.model)
+    about_units, about_unread_units = problem.share(
+        "unit warnings", lambda: _list_unit_warnings(problem)
+    )
+    messages += about_units
     messages += _warn_active_bounds(analysis)
     messages += _warn_no_prediction(problem)
     messages += _warn_constant_outputs(problem)
@@ -102,7 +104,16 @@ def collect_warnings(
         messages += _warn_coloured_residuals(
             tests, delay_names, analysis.uncertainty, may_be_noise=is_plain
         )
-    return (*messages, *list_unread_unit_warnings(problem.model, problem.records))
+    return (*messages, *about_unread_units)
+
+
+def _list_unit_warnings(problem: Problem) -> tuple[list[str], list[str]]:
+    """List the warnings about units: those that come early, and about units not read."""
+    model, records = problem.model, problem.records
+    return (
+        [*list_mixed_unit_warnings(model, records), *list_time_unit_warnings(model)],
+        [*list_unread_unit_warnings(model, records)],
+    )
 
 
 def _warn_active_bounds(analysis: Analysis) -> list[str]:
@@ -238,6 +249,11 @@ def _warn_vague_group(group: IdentifiableCombination) -> str:
 
 def find_delay_parameters(problem: Problem) -> set[str]:
     """Find the names of the parameters that time lags depend on."""
+    names = problem.share("delay parameters", lambda: _collect_delay_parameters(problem))
+    return names & set(problem.free_names)
+
+
+def _collect_delay_parameters(problem: Problem) -> set[str]:
     past_values = [
         *list_delayed_values(problem.model, "input"),
         *list_delayed_values(problem.model, "state"),
@@ -246,7 +262,7 @@ def find_delay_parameters(problem: Problem) -> set[str]:
     for past_value in past_values:
         if past_value.delay is not None:
             names |= collect_parameter_names(past_value.delay)
-    return names & set(problem.free_names)
+    return names
 
 
 def _warn_correlations(

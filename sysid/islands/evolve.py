@@ -25,6 +25,7 @@ from sysid.islands.packed import (
     unpack_islands,
 )
 from sysid.islands.stopping import StoppingRule, has_search_ended
+from sysid.kernels.borrowing import borrow
 from sysid.search.evolution import is_done, run_generations
 from sysid.search.island import NO_TARGET_RMS, Island
 from sysid.search.state import COLUMN_RMS, COLUMN_VALUES, IslandArrays, IslandPlan, Migrant
@@ -249,6 +250,7 @@ def _run_epochs(
     log: EvolutionLog,
 ) -> tuple[int, int, bool]:
     """Evolve in place; return the last border, the migrations and whether it was just passed."""
+    evaluator, plan, packed, log = borrow((evaluator, plan, packed, log))
     for _ in range(plan.most_borders):
         target = compute_next_border(
             generation,
@@ -280,6 +282,7 @@ def _evolve_to_border(
     log: EvolutionLog,
 ) -> int:
     """Evolve every island up to a border; return the remaining budget, −1 if it ran out."""
+    evaluator, plans, packed, log = borrow((evaluator, plans, packed, log))
     for i in range(packed.champion_rms.size):
         begin, end = packed.offsets[i], packed.offsets[i + 1]
         plan, search, written = unpack_plan(plans, i), packed.search[i], log.counts[0]
@@ -321,6 +324,7 @@ def _record_improvements(
     packed: PackedIslands, island: int, improvements: int, log: EvolutionLog
 ) -> None:
     """Record the island of the improvements just written, and make the last one its champion."""
+    packed, log = borrow((packed, log))
     for r in range(log.counts[0], log.counts[0] + improvements):
         log.improvement_islands[r] = island
     log.counts[0] += improvements

@@ -17,6 +17,7 @@ from sysid.islands.packed import (
     unpack_islands,
 )
 from sysid.islands.topology import list_edges
+from sysid.kernels.borrowing import borrow
 from sysid.search.evolution import reset_evidence, write_improvement
 from sysid.search.island import Island
 from sysid.search.operators import decode, encode, sort_population
@@ -76,6 +77,7 @@ def exchange_migrants(
     routes: MigrationRoutes, packed: PackedIslands, epoch: int, log: EvolutionLog
 ) -> None:
     """Exchange migrants once in place (see `migrate`). An edge writes one improvement at most."""
+    routes, packed, log = borrow((routes, packed, log))
     words, fitness = packed.chromosomes.copy(), packed.fitness.copy()
     champions = packed.champions.copy()
     discontinuities = packed.search.fitness_discontinuities.copy()
@@ -104,18 +106,23 @@ def exchange_migrants(
 @jit_compile
 def _accepts_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> bool:
     """Return whether a migrant is fitter than the worst individual, and new on the island."""
+    packed, word = borrow((packed, word))
     begin, end = packed.offsets[island], packed.offsets[island + 1]
     if not fitness < packed.fitness[end - 1]:  # nan (not evaluated yet) comes last and stays
         return False
-    is_new = True
     for p in range(begin, end):
-        is_new &= not np.all(packed.chromosomes[p] == word)
-    return is_new
+        is_equal = True
+        for d in range(word.size):
+            is_equal &= packed.chromosomes[p, d] == word[d]
+        if is_equal:
+            return False
+    return True
 
 
 @jit_compile
 def _insert_migrant(packed: PackedIslands, island: int, word: WordArray, fitness: float) -> None:
     """Replace the worst individual by a migrant."""
+    packed, word = borrow((packed, word))
     begin, end = packed.offsets[island], packed.offsets[island + 1]
     for d in range(word.size):
         packed.chromosomes[end - 1, d] = word[d]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.search.island import Island, stack_search, to_improvement
+from sysid.search.island import Island, stack_search, to_improvements
 from sysid.search.state import COLUMN_VALUES, Improvement, Migrant, SearchArray
 
 
@@ -83,12 +83,11 @@ def unpack_islands(
     """Make islands of the packed arrays, and append the log to their histories."""
     new_improvements: list[list[Improvement]] = [[] for _ in islands]
     count = int(log.counts[0])
-    improvement_islands, rows = (
-        log.improvement_islands[:count].tolist(),
-        log.improvements[:count].tolist(),
-    )
-    for index, row in zip(improvement_islands, rows, strict=True):
-        new_improvements[index].append(to_improvement(row))
+    improvements = to_improvements(log.improvements[:count])
+    for index, improvement in zip(
+        log.improvement_islands[:count].tolist(), improvements, strict=True
+    ):
+        new_improvements[index].append(improvement)
     ends = packed.offsets.tolist()
     return tuple(
         Island(

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.fft import irfft, rfft
+from numpy.typing import NDArray
 
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.data.records import Channel, Hold, measure_sampling
@@ -18,6 +19,7 @@ ROUNDING_SHARE = 1e-9
 """Share of a signal below which a remainder is rounding."""
 
 _GRID_TOLERANCE = 0.05  # of a period: largest distance of a sample from its grid point
+_MAX_TRANSFORMS = 4  # of lagged inputs that are kept
 _MIN_FILLED_SHARE = 0.5  # of the points of a grid must be filled
 
 
@@ -140,13 +142,33 @@ def compute_lagged_sums(
     )
     if isinstance(shifted, str):
         return shifted
-    columns, sizes, is_used = shifted
-    weighted = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
+    columns, sizes, is_used, _ = shifted
+    weighted = (shifted.transform(2 * (colour.size - 1)) * colour).view(np.float64)
     covariance = weighted @ weighted.T  # real part of the product with the conjugate
     norm = sizes * np.sqrt(float(residual[is_used] @ residual[is_used]))
     tiny = np.finfo(float).tiny
     deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
     return LaggedSums(lags, columns @ residual, np.maximum(norm, tiny), covariance, deviation)
+
+
+class _LaggedInputs(NamedTuple):
+    """Lagged inputs without mean (n, N), their norms (n,), and the known samples (N,).
+
+    `transforms` holds their transforms by length.
+    """
+
+    columns: FloatArray
+    sizes: FloatArray
+    is_used: BoolArray
+    transforms: dict[int, NDArray[np.complex128]]
+
+    def transform(self, length: int) -> NDArray[np.complex128]:
+        """Transform the inputs over some length: the same for most runs of a sweep."""
+        if length not in self.transforms:
+            if len(self.transforms) == _MAX_TRANSFORMS:
+                self.transforms.clear()
+            self.transforms[length] = rfft(self.columns, length, axis=1)
+        return self.transforms[length]
 
 
 @lru_cache(maxsize=2)
@@ -158,10 +180,10 @@ def _build_lagged_inputs(
     input_times: bytes,
     values: bytes,
     lags: bytes,
-) -> tuple[FloatArray, FloatArray, BoolArray] | str:
-    """Build the lagged inputs without mean (n, N), their norms (n,), and the known samples (N,).
+) -> _LaggedInputs | str:
+    """Build the lagged inputs, or return the reason why there are none.
 
-    Returns a reason if there are none. The cache serves the runs of a sweep, which differ in their
+    The cache serves the runs of a sweep, which differ in their
     residuals only. The bytes are those of arrays: `SpacedResiduals.times` and
     `SpacedResiduals.present`, times and values of the input, lags in periods.
     """
@@ -180,7 +202,7 @@ def _build_lagged_inputs(
         return "the input is constant there"
     for array in (columns, sizes, is_used):
         array.flags.writeable = False
-    return columns, sizes, is_used
+    return _LaggedInputs(columns, sizes, is_used, {})
 
 
 def _shift_input(spaced: SpacedResiduals, channel: Channel, lags: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, expit
 
+from sysid.core.jit import jit_compile
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
@@ -125,18 +126,33 @@ def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
 
 def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
     """Whiten basis and values, (n, r + 1), and compute ln det R."""
-    from scipy.linalg import cholesky_banded, solve_banded
-
     a, w = _to_pole_and_share(place)
-    carried = a**series.gaps
-    band = np.ones((2, series.values.size))
-    band[0, 1:] = (1.0 - w) * (1.0 - carried**2) + w * (1.0 + carried**2)
-    band[1, :-1] = -w * carried
-    band[1, -1] = 0.0
-    root = cholesky_banded(band, lower=True)
     columns = np.column_stack([series.basis, series.values])
-    columns[1:] -= carried[:, None] * columns[:-1]
-    return solve_banded((1, 0), root, columns), 2.0 * float(np.sum(np.log(root[0])))
+    carried = np.asarray(a**series.gaps, dtype=np.float64)
+    return columns, _whiten_in_place(carried, w, columns)
+
+
+@jit_compile
+def _whiten_in_place(carried: FloatArray, w: float, columns: FloatArray) -> float:
+    """Whiten columns (n, c) by the Cholesky factor of the differences; return ln det R.
+
+    `carried` (n - 1,) is the share of a sample's noise that the next one has, w that of white
+    noise. Not finite if R is not positive definite.
+    """
+    n, count = columns.shape
+    deviation, log_determinant = 1.0, 0.0  # of the first sample
+    for i in range(n - 1, 0, -1):
+        for c in range(count):
+            columns[i, c] -= carried[i - 1] * columns[i - 1, c]
+    for i in range(1, n):
+        share = carried[i - 1]
+        below = -w * share / deviation
+        variance = (1.0 - w) * (1.0 - share**2) + w * (1.0 + share**2) - below**2
+        deviation = np.sqrt(variance)
+        log_determinant += np.log(deviation)
+        for c in range(count):
+            columns[i, c] = (columns[i, c] - below * columns[i - 1, c]) / deviation
+    return 2.0 * log_determinant
 
 
 def _compute_innovations(

@@ -4,6 +4,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
+from sysid.kernels.borrowing import borrow
 from sysid.search.adaptive_search import (
     EARLY_SEARCHES,
     N_TRIALS,
@@ -74,6 +75,7 @@ def draw_initial_places(plan: IslandPlan, individuals: int, n: int) -> FloatArra
 @jit_compile
 def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
     """Breed as in Figure 4: the survivors stay, their children replace the others."""
+    plan, island = borrow((plan, island))
     chromosomes, fitness = island.chromosomes, island.fitness
     generation, length = island.search.generation, chromosomes.shape[1] * plan.bits
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
@@ -103,6 +105,7 @@ def _breed_child(
     word: WordArray,
 ) -> None:
     """Write child `p` by crossover or by differential evolution."""
+    plan, places, parents, word = borrow((plan, places, parents, word))
     bits, n = plan.bits, word.size
     first_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
     next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
@@ -127,6 +130,7 @@ def _breed_child(
 @jit_compile
 def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray:
     """Breed as many children as there are individuals; they compete with their parents."""
+    plan, island = borrow((plan, island))
     parents = island.chromosomes
     children, places = np.empty_like(parents), decode(parents, plan.bits)
     for p in range(parents.shape[0]):
@@ -137,6 +141,7 @@ def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray
 @jit_compile
 def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
     """Draw all individuals but the champion again."""
+    plan, island = borrow((plan, island))
     chromosomes, fitness = island.chromosomes, island.fitness
     largest, n = float((1 << plan.bits) - 1), chromosomes.shape[1]
     for p in range(1, fitness.size):
@@ -151,6 +156,7 @@ def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
 @jit_compile
 def select_fittest(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
     """Select the fittest of parents and children; on equal fitness the parent stays."""
+    island, children, reached = borrow((island, children, reached))
     chromosomes, fitness = island.chromosomes, island.fitness
     size, n = chromosomes.shape
     candidates, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
@@ -173,6 +179,7 @@ def evaluate_new_individuals(
 
     Returns the number of simulations.
     """
+    evaluator, plan, chromosomes, fitness = borrow((evaluator, plan, chromosomes, fitness))
     unevaluated = np.flatnonzero(np.isnan(fitness))
     if unevaluated.size == 0:
         return 0
@@ -189,6 +196,7 @@ def evaluate_new_individuals(
 
 @jit_compile
 def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
+    evaluator, plan, island = borrow((evaluator, plan, island))
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.in_sequence_search and plan.method == METHOD_IMPROVED:
         run_adaptive_sequence(evaluator, plan, island)
@@ -217,6 +225,7 @@ def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
 @jit_compile
 def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Switch to the local search when the genetic search stagnates."""
+    evaluator, plan, island = borrow((evaluator, plan, island))
     search = island.search
     if search.in_sequence_search or plan.method == METHOD_SIMPLE:
         return
@@ -275,6 +284,7 @@ def run_generations(
     An island that has used up its evaluations or reached the target rests. The initial population
     is evaluated before the first generation.
     """
+    evaluator, plan, island, improvements = borrow((evaluator, plan, island, improvements))
     fitness, search, written = island.fitness, island.search, 0
     if np.any(np.isnan(fitness)):  # first generation, or migrants from an island of other bits
         # The count of evaluations does not tell: the starts of a polynomial may have taken some.

@@ -1,6 +1,6 @@
 """An island: one population between two generations, its evolution and its budgets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,6 @@ from sysid.kernels.abi import LANES
 from sysid.search.adaptive_search import N_TRIALS
 from sysid.search.evolution import run_generations
 from sysid.search.state import (
-    COLUMN_EVALUATIONS,
-    COLUMN_GENERATION,
-    COLUMN_PHASE,
-    COLUMN_RMS,
     COLUMN_VALUES,
     PHASE_NAMES,
     SEARCH_RECORD,
@@ -97,19 +93,16 @@ def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -
     )
     rows = np.empty((count + 1, COLUMN_VALUES + island.point.size))
     written = run_generations(evaluator, plan, count, after.arrays, rows)
-    new_improvements = tuple(to_improvement(row) for row in rows[:written].tolist())
-    return replace(after, history=island.history + new_improvements)
+    return replace(after, history=island.history + tuple(to_improvements(rows[:written])))
 
 
-def to_improvement(row: Sequence[float]) -> Improvement:
-    """Convert a row that compiled code wrote to an improvement."""
-    return Improvement(
-        int(row[COLUMN_GENERATION]),
-        int(row[COLUMN_EVALUATIONS]),
-        row[COLUMN_RMS],
-        PHASE_NAMES[int(row[COLUMN_PHASE])],
-        tuple(row[COLUMN_VALUES:]),
-    )
+def to_improvements(rows: FloatArray) -> Iterator[Improvement]:
+    """Convert the rows that compiled code wrote to improvements."""
+    generations, evaluations, rms, phases = rows.T[:COLUMN_VALUES].tolist()
+    names = [PHASE_NAMES[int(phase)] for phase in phases]
+    values = map(tuple, rows[:, COLUMN_VALUES:].tolist())
+    counts = (map(int, column) for column in (generations, evaluations))
+    return map(Improvement, *counts, rms, names, values)
 
 
 def stack_search(islands: Sequence[Island]) -> SearchArray:

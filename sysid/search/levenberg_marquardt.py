@@ -8,6 +8,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
+from sysid.kernels.borrowing import borrow
 from sysid.simulation.loss import compute_loss as _plain_loss
 from sysid.simulation.loss import compute_loss_weight as _plain_weight
 
@@ -38,6 +39,7 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
 
     Each neighbour differs in one parameter, away from the nearer bound.
     """
+    point = borrow(point)
     n = point.size
     places, steps = np.empty((n + 1, n)), np.empty(n)
     for d in range(n):
@@ -53,6 +55,7 @@ def form_normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
     """Form JᵀJ (lower half) and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss."""
+    error, columns = borrow((error, columns))
     d, n = columns.shape
     if scale > 0.0:
         weighted_error, weighted_columns = np.empty(n), np.empty((d, n))
@@ -79,6 +82,7 @@ def factor_damped(
     These are parameters at a bound that would leave it, parameters without effect on the output,
     and parameters whose effect is a combination of others' (no positive pivot).
     """
+    matrix, gradient, point = borrow((matrix, gradient, point))
     n = point.size
     factor = np.zeros((n, n))
     for d in range(n):
@@ -114,6 +118,7 @@ def _move_within_bounds(point: FloatArray, step: FloatArray, place: FloatArray) 
 @jit_compile
 def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
     """Solve the step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
+    factor, gradient = borrow((factor, gradient))
     step = np.zeros(gradient.size)
     for d in range(gradient.size):
         if factor[d, d] > 0.0:
@@ -133,6 +138,7 @@ def write_damped_step(
 
     Returns the promised gain, −gᵀ times the step within the bounds: the linear part of the loss.
     """
+    matrix, gradient, point, place = borrow((matrix, gradient, point, place))
     step = solve_step(factor_damped(matrix, gradient, point, damping), gradient)
     _move_within_bounds(point, step, place)
     promised = 0.0
@@ -150,5 +156,6 @@ def write_spread_place(
     The distance is long where the output is insensitive, and short across the valley. `factor` is
     that of A.
     """
+    factor, point, deviation, place = borrow((factor, point, deviation, place))
     _solve_transposed(factor, deviation)
     _move_within_bounds(point, deviation, place)

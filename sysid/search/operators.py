@@ -16,6 +16,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.kernels.borrowing import borrow
 
 RandomWords: TypeAlias = tuple[Any, Any, Any, Any]
 """Four independent words of 32 bits, as integers."""
@@ -72,6 +73,7 @@ def to_normal(word: RandomWords) -> float:
 @jit_compile
 def encode(places: FloatArray, bits: int) -> WordArray:
     """Encode places in [0, 1] as the nearest chromosomes."""
+    places = borrow(places)
     largest = float((1 << bits) - 1)
     words = np.empty(places.shape, np.uint32)
     for p in range(places.shape[0]):
@@ -83,6 +85,7 @@ def encode(places: FloatArray, bits: int) -> WordArray:
 @jit_compile
 def decode(words: WordArray, bits: int) -> FloatArray:
     """Decode chromosomes to places in [0, 1]; the inverse of `encode`."""
+    words = borrow(words)
     largest = float((1 << bits) - 1)
     places = np.empty(words.shape)
     for p in range(words.shape[0]):
@@ -97,6 +100,7 @@ def sort_population(words: WordArray, fitness: FloatArray) -> None:
 
     Insertion sort: populations are small, and half of them is in order after a generation.
     """
+    words, fitness = borrow((words, fitness))
     n = words.shape[1]
     moved = np.empty(n, np.uint32)
     for p in range(1, fitness.size):

@@ -7,6 +7,7 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
+from sysid.kernels.borrowing import borrow
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
     compute_loss,
@@ -24,6 +25,7 @@ def evaluate_partial_fitness(
     evaluator: Evaluator, plan: IslandPlan, predicted: FloatArray, horizon: float
 ) -> FloatArray:
     """Compute the fitness of each column of predictions (M, P) up to `horizon` (1: all)."""
+    evaluator, plan, predicted = borrow((evaluator, plan, predicted))
     totals, count = np.zeros(predicted.shape[1]), 0
     for m in range(predicted.shape[0]):
         weight, measured = evaluator.weight[m], evaluator.measured[m]
@@ -57,18 +59,24 @@ def build_normal_equations(
     evaluator: Evaluator, plan: IslandPlan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Compute JᵀJ, Jᵀe and the fitness at a point up to `horizon`, in D + 1 simulations."""
+    evaluator, plan, point = borrow((evaluator, plan, point))
     n, (places, steps) = point.size, step_aside(point, difference)
     predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
-    scored = np.flatnonzero((evaluator.weight != 0.0) & (plan.progress <= horizon))
-    error, columns, total = np.empty(scored.size), np.empty((n, scored.size)), 0.0
-    per_step = 1.0 / steps
-    for i in range(scored.size):
-        m = scored[i]
-        weight = evaluator.weight[m]
-        error[i] = weight * (predicted[m, 0] - evaluator.measured[m])
+    weights, measured, progress = evaluator.weight, evaluator.measured, plan.progress
+    count, total, per_step = 0, 0.0, 1.0 / steps
+    for m in range(weights.size):
+        count += weights[m] != 0.0 and progress[m] <= horizon
+    error, columns = np.empty(count), np.empty((n, count))
+    i = -1
+    for m in range(weights.size):
+        if not (weights[m] != 0.0 and progress[m] <= horizon):
+            continue
+        i += 1
+        weight = weights[m]
+        error[i] = weight * (predicted[m, 0] - measured[m])
         total += compute_loss(error[i], plan.loss_scale)
         for d in range(n):
             columns[d, i] = weight * per_step[d] * (predicted[m, d + 1] - predicted[m, 0])
     matrix, gradient = form_normal_equations(error, columns, plan.loss_scale)
-    fitness = np.sqrt(total / max(scored.size, 1))
+    fitness = np.sqrt(total / max(count, 1))
     return matrix, gradient, fitness if np.isfinite(fitness) else np.inf

@@ -165,7 +165,8 @@ def replace_outputs(
     return replace(
         placed,
         outputs=tuple(
-            _make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs
+            _replace_samples(samples, grid, c, weights[c.name], skip, since[c.name])
+            for samples, c in zip(placed.outputs, outputs, strict=True)
         ),
         starts=tuple(_make_starts(model, grid, outputs, experiment, rows)),
     )
@@ -239,6 +240,24 @@ def _make_samples(
     values = np.where(np.isfinite(channel.values), channel.values, 0.0)
     return OutputSamples(
         locate_samples(grid, model, channel), values, weights, _interpolate_to_grid(grid, channel)
+    )
+
+
+def _replace_samples(
+    samples: OutputSamples,
+    grid: Grid,
+    channel: Channel,
+    weight: float,
+    skip: int,
+    scored_from: float,
+) -> OutputSamples:
+    """Replace the values of samples; weights that are equal remain the same array."""
+    weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
+    return OutputSamples(
+        samples.places,
+        np.where(np.isfinite(channel.values), channel.values, 0.0),
+        samples.weights if np.array_equal(weights, samples.weights) else weights,
+        _interpolate_to_grid(grid, channel),
     )
 
 

@@ -162,6 +162,31 @@ def pack_experiment(
     return PackedExperiment(*builder.build_arrays(), n_work)
 
 
+def replace_measured(
+    model: Model,
+    ints: IntArray,
+    floats: FloatArray,
+    outputs: Sequence[OutputSamples],
+    starts: Sequence[StateStart],
+    *,
+    on_grid: bool,
+) -> None:
+    """Replace, in place, what the values of outputs determine in the arrays of an experiment."""
+    layout = ExperimentLayout.from_model(model)
+    for i, start in enumerate(starts):
+        floats[layout.locate_initial(i)] = start.first_values[0]
+        given = ints[layout.locate_state(i, "given")]
+        floats[given : given + start.first_values.size] = start.first_values
+    for i, samples in enumerate(outputs):
+        measured = floats[ints[layout.locate_output(i, "measured")] :]
+        if on_grid:
+            measured[samples.places.astype(np.int64)] = samples.values
+        else:
+            measured[: samples.values.size] = samples.values
+        grid = ints[layout.locate_output(i, "grid")]
+        floats[grid : grid + samples.grid_values.size] = samples.grid_values
+
+
 class _ArrayBuilder:
     """The two arrays of an experiment; values are appended behind their heads."""
 

@@ -1,10 +1,10 @@
 """A problem: a model, its records, and the fitness of a population of candidates on them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import sqrt
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,8 +27,15 @@ from sysid.simulation.experiments import (
     replace_outputs,
 )
 from sysid.simulation.metrics import ChannelMetrics, Metrics, compute_fit_percent, rms
-from sysid.simulation.packing import PackedExperiment, are_on_grid, has_weights, pack_experiment
+from sysid.simulation.packing import (
+    PackedExperiment,
+    are_on_grid,
+    has_weights,
+    pack_experiment,
+    replace_measured,
+)
 
+_Value = TypeVar("_Value")
 _ReduceResult = tuple[Callable[..., "Problem"], tuple[Any, ...]]
 
 
@@ -82,6 +89,7 @@ class Problem:
     output_weights: Mapping[str, float]
     ties: Ties
     simulates_only: bool = False
+    _shared: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def build(
@@ -203,6 +211,16 @@ class Problem:
             return build_simulation_problem, (self.untied_model, self.records[0])
         return Problem.from_settings, (self.untied_model, self.records, self.settings)
 
+    def share(self, key: str, compute: Callable[[], _Value]) -> _Value:
+        """Return what does not depend on the values of the outputs, computed once for a sweep.
+
+        All problems that `replace_outputs` makes of one another share it.
+        """
+        if key not in self._shared:
+            self._shared[key] = compute()
+        value: _Value = self._shared[key]
+        return value
+
     def replace_outputs(self, records: Sequence[Record]) -> "Problem":
         """Build the problem again for records that differ in the values of their outputs only.
 
@@ -225,13 +243,34 @@ class Problem:
             )
             for e, (placed, record) in enumerate(zip(self.experiments, records, strict=True))
         )
-        evaluator = _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
+        are_alike = all(
+            new is old
+            for before, after in zip(self.experiments, experiments, strict=True)
+            for new, old in zip(
+                [samples.weights for samples in after.outputs],
+                [samples.weights for samples in before.outputs],
+                strict=True,
+            )
+        )
+        evaluator = (
+            _replace_measured(self.evaluator, self.model, experiments, self._has_grid_samples)
+            if are_alike
+            else _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
+        )
         return replace(
             self,
             records=tuple(records),
             evaluator=evaluator,
             experiments=experiments,
             output_weights=per_output,
+        )
+
+    @property
+    def _has_grid_samples(self) -> bool:
+        """Whether every sample has a grid point of its own."""
+        return self.share(
+            "samples on grid points",
+            lambda: all(are_on_grid(experiment.outputs) for experiment in self.experiments),
         )
 
     def evaluate_fitness(self, theta: FloatArray) -> FloatArray:
@@ -436,6 +475,29 @@ def _build_evaluator(
     )
 
 
+def _replace_measured(
+    evaluator: Evaluator,
+    model: Model,
+    experiments: Sequence[GridExperiment],
+    on_grid: bool,
+) -> Evaluator:
+    """Replace the measured values of an evaluator; places and weights are as before."""
+    floats = evaluator.floats.copy()
+    for experiment, (first_int, first_float, _) in zip(
+        experiments, evaluator.offsets.tolist(), strict=True
+    ):
+        replace_measured(
+            model,
+            evaluator.ints[first_int:],
+            floats[first_float:],
+            experiment.outputs,
+            experiment.starts,
+            on_grid=on_grid,
+        )
+    measured = np.concatenate([s.values for e in experiments for s in e.outputs])
+    return evaluator._replace(floats=floats, measured=measured)
+
+
 def _locate_experiments(
     packed_experiments: Sequence[PackedExperiment], experiments: Sequence[GridExperiment]
 ) -> Any:
@@ -461,10 +523,13 @@ def _check_population(theta: FloatArray, free: int) -> FloatArray:
 
 def compute_record_progress(problem: Problem) -> FloatArray:
     """Compute the share of its experiment (0 … 1) that each measured value (M,) requires."""
-    return np.concatenate(
-        [
-            np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
-            for experiment in problem.experiments
-            for samples in experiment.outputs
-        ]
+    return problem.share(
+        "record progress",
+        lambda: np.concatenate(
+            [
+                np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
+                for experiment in problem.experiments
+                for samples in experiment.outputs
+            ]
+        ),
     )

@@ -4,12 +4,14 @@ import numpy as np
 
 from sysid.core.jit import jit_compile
 from sysid.core.types import BoolArray, FloatArray
+from sysid.kernels.borrowing import borrow
 from sysid.simulation.evaluator import Evaluator
 
 
 @jit_compile
 def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
     """Convert positions in [0, 1] to physical values: (P, D) → (P, D)."""
+    evaluator, places = borrow((evaluator, places))
     theta = np.empty(places.shape)
     for d in range(places.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]
@@ -25,6 +27,7 @@ def from_unit(evaluator: Evaluator, places: FloatArray) -> FloatArray:
 @jit_compile
 def to_unit(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Convert physical values to positions, the inverse of `from_unit`; clipped to the bounds."""
+    evaluator, theta = borrow((evaluator, theta))
     places = np.empty(theta.shape)
     for d in range(theta.shape[1]):
         lower, upper = evaluator.lower[d], evaluator.upper[d]

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sysid.core.linear_algebra import compute_truncated_svd
+from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
 from sysid.identifiability.bound_limits import find_widest_bounds
@@ -91,6 +91,8 @@ class Analysis:
     """Whether the time limit prevented the search for minima near the estimate."""
     residuals_and_sensitivities: tuple[FloatArray, FloatArray] | None = None
     """Residuals (n,) and sensitivities (n, D), not whitened."""
+    decomposition: TruncatedSvd | None = None
+    """Of these sensitivities; of the whitened ones under a noise model. None: no uncertainty."""
     likelihood: LikelihoodModel | None = None
     """None if there is no uncertainty."""
 
@@ -164,18 +166,23 @@ def _analyse_sensitivities(
             _make_estimates_without_stderr(problem, theta, reason), None, 0.0, count, criteria
         )
     place = to_unit(problem.evaluator, theta[None])[0]
+    decomposition = compute_truncated_svd(columns)
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
-    sloping = np.where(plateau > 0, 0.0, columns)
+    has_plateau = bool((plateau > 0).any())
+    sloping = np.where(plateau > 0, 0.0, columns) if has_plateau else columns
     influence = compute_influence(error, problem.loss_scale)
-    gain = _compute_possible_gain(influence, sloping, place)
+    gain = _compute_possible_gain(influence, sloping, place, None if has_plateau else decomposition)
     is_pulled = is_active(influence, sloping, place)
     scale = compute_physical_scale(problem, theta)
-    powers = find_scalings(problem.model, problem.all_parameters)
+    powers = problem.share("scalings", lambda: find_scalings(problem.model, problem.all_parameters))
     left = None if max_simulations is None else max_simulations - count
-    shifts, spent = find_translations(problem, theta, columns, scale, left)
+    shifts, spent = find_translations(problem, theta, decomposition, scale, left)
     count += spent
-    columns, n_symmetries = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
-    _, singular, rows, retained = compute_truncated_svd(columns)
+    moving, n_symmetries = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    _, singular, rows, retained = (
+        decomposition if moving is columns else compute_truncated_svd(moving)
+    )
+    columns, retained = moving, retained.copy()
     retained[d - n_symmetries :] = False
     inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
     colour = estimate_joint_covariance(problem, influence, columns)
@@ -237,6 +244,7 @@ def _analyse_sensitivities(
         criteria,
         active_bounds,
         linear,
+        decomposition=decomposition,
         likelihood=LikelihoodModel(error, columns, middle, float(np.min(degrees)), whitening),
     )
 
@@ -335,11 +343,17 @@ def _centre_on_plateau(estimate: Estimate, plateau_offset: float) -> Estimate:
     return replace(estimate, interval95=(lower + plateau_offset, upper + plateau_offset))
 
 
-def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
+def _compute_possible_gain(
+    influence: FloatArray,
+    columns: FloatArray,
+    place: FloatArray,
+    decomposition: TruncatedSvd | None = None,
+) -> float:
     """Share of Σψ² in the span of the sensitivities along which the parameters may move.
 
     It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds may
-    not move. Then the bound holds it, and the estimate is optimal inside its bounds.
+    not move. Then the bound holds it, and the estimate is optimal inside its bounds. A known
+    `decomposition` of the sensitivities is used where all parameters may move.
     """
     total = float(influence @ influence)
     downhill = -(columns.T @ influence)
@@ -347,7 +361,9 @@ def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: Fl
     is_held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
     if total == 0.0 or is_held.all():
         return 0.0
-    left, _, _, retained = compute_truncated_svd(columns[:, ~is_held])
+    if decomposition is None or is_held.any():
+        decomposition = compute_truncated_svd(columns[:, ~is_held])
+    left, _, _, retained = decomposition
     return float(np.sum((left[:, retained].T @ influence) ** 2)) / total
 
 

@@ -67,7 +67,8 @@ def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
     sensitivities = compute_sensitivities(problem, theta)
     scale = compute_physical_scale(problem, theta)
     powers = find_scalings(problem.model, problem.all_parameters)
-    shifts, _ = find_translations(problem, theta, sensitivities.columns, scale)
+    decomposition = compute_truncated_svd(sensitivities.columns)
+    shifts, _ = find_translations(problem, theta, decomposition, scale)
     columns, n_symmetries = remove_symmetries(
         sensitivities.columns, np.vstack([powers * theta, shifts]) / scale
     )

@@ -337,4 +337,4 @@ def _fix_parameter(problem: Problem, d: int, value: float) -> Problem:
         is_log=np.delete(old.is_log, d),
     )
     space = (*problem.free_parameters[:d], *problem.free_parameters[d + 1 :])
-    return replace(problem, free_parameters=space, evaluator=evaluator)
+    return replace(problem, free_parameters=space, evaluator=evaluator, _shared={})

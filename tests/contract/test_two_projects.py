@@ -19,6 +19,7 @@ from service.repositories.references import ReferenceRepository
 from service.repositories.summaries import find_quietest_run
 from service.repositories.trends import count_succeeded, read_trend_rows
 from service.storage.errors import RowNotFound
+from service.storage.sessions import SessionOwner, find_database
 from service.storage.tables import DEFAULT_PROJECT, Project
 from tests.stored import job_of, new_dataset
 
@@ -171,3 +172,22 @@ def test_a_trend_and_the_best_run_are_read_within_a_project(shared):
         assert (count_succeeded(session, job), count_succeeded(session, job, OTHER)) == (1, 0)
         assert find_quietest_run(session, job, {}).id == run
         assert find_quietest_run(session, job, {}, OTHER) is None
+
+
+def test_sessions_of_an_owner_see_and_write_its_project_alone(shared):
+    mine, theirs = (shared.open_for(SessionOwner(project)) for project in PROJECTS)
+    with theirs.write_session() as session:
+        dataset = DatasetRepository(session).add(new_dataset()).dataset.id
+        job = JobRepository(session).submit(NewJob(name="tube", spec={"model": "tube"})).job.id
+    for reader in (mine, shared):
+        with reader.read_session() as session:
+            assert DatasetRepository(session).list_page().items == ()
+            assert find_datasets_by_name(session, "step") == []
+            with pytest.raises(RowNotFound):
+                JobRepository(session).get(job)
+            assert find_database(session) is reader
+    with theirs.read_session() as session:
+        assert [row.id for row in DatasetRepository(session).list_page().items] == [dataset]
+        assert JobRepository(session).get(job).project_id == OTHER
+    with theirs.write_session(busy_seconds=1.0) as session:  # from another factory
+        assert JobRepository(session).cancel(job).state is JobState.CANCELLED

@@ -91,9 +91,11 @@ def _serve_filled(folder: Path, bound: socket.socket | None = None) -> Iterator[
 
 
 @contextmanager
-def serve_folder(folder: Path, bound: socket.socket | None = None) -> Iterator[Server]:
+def serve_folder(
+    folder: Path, bound: socket.socket | None = None, **changes: object
+) -> Iterator[Server]:
     """The service over a data folder, at a bound socket, which it closes, or a port of its own."""
-    app = create_app(settings_of(folder, poll_seconds=0.05))
+    app = create_app(settings_of(folder, poll_seconds=0.05, **changes))
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([bound] if bound else None,))

@@ -39,12 +39,13 @@ def test_every_answer_has_a_status_of_the_openapi_document(
     ("method", "path", "statuses"),
     [
         ("get", "/healthz", {421, 422, 503}),
-        ("get", "/v1/jobs/{job_id}", {404, 409, 421, 422, 503}),
-        ("post", "/v1/jobs", {403, 404, 409, 413, 415, 421, 422, 429, 503}),
-        ("post", "/v1/jobs/{job_id}:cancel", {403, 404, 409, 421, 422, 503}),
-        ("post", "/v1/datasets", {403, 404, 408, 409, 413, 415, 421, 422, 503}),
-        ("post", "/v1/models", {403, 404, 409, 413, 415, 421, 422, 503}),
-        ("get", "/v1/datasets/{dataset_id}/content", {404, 409, 412, 416, 421, 422, 503}),
+        ("get", "/v1/jobs/{job_id}", {401, 403, 404, 409, 421, 422, 503}),
+        ("post", "/v1/jobs", {401, 403, 404, 409, 413, 415, 421, 422, 429, 503}),
+        ("post", "/v1/jobs/{job_id}:cancel", {401, 403, 404, 409, 421, 422, 503}),
+        ("post", "/v1/datasets", {401, 403, 404, 408, 409, 413, 415, 421, 422, 429, 503}),
+        ("post", "/v1/models", {401, 403, 404, 409, 413, 415, 421, 422, 429, 503}),
+        ("post", "/v1/models:check", {401, 403, 404, 409, 413, 415, 421, 422, 503}),
+        ("get", "/v1/datasets/{dataset_id}/content", {401, 403, 404, 409, 412, 416, 421, 422, 503}),
     ],
 )
 def test_an_operation_has_the_errors_of_its_kind_as_problem_documents(

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -110,13 +111,36 @@ def test_loopback_is_this_machine_only(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
 
 
-def test_another_host_is_refused_as_long_as_there_are_no_keys() -> None:
+@pytest.mark.parametrize(
+    ("values", "mode"),
+    [
+        ({}, "off"),
+        ({"host": "localhost"}, "off"),
+        ({"host": "0.0.0.0"}, "keys"),
+        ({"host": "0.0.0.0", "allow_open_host": True}, "off"),
+        ({"auth": "keys"}, "keys"),
+        ({"host": "0.0.0.0", "auth": "proxy"}, "proxy"),
+    ],
+)
+def test_keys_are_off_on_loopback_only_unless_said_otherwise(
+    values: dict[str, Any], mode: str
+) -> None:
+    settings = Settings(**values)
+    settings.check_exposure()
+    assert settings.auth_mode == mode
+
+
+def test_keys_are_not_switched_off_for_other_machines_by_one_setting_alone() -> None:
     with pytest.raises(Misconfigured, match="LAGID_ALLOW_OPEN_HOST"):
-        Settings(host="0.0.0.0").check_exposure()
-    with pytest.raises(Misconfigured, match="REQUIRE_KEYS"):
-        Settings(require_keys=True).check_exposure()
-    Settings(host="0.0.0.0", allow_open_host=True).check_exposure()
-    Settings().check_exposure()
+        Settings(host="0.0.0.0", auth="off").check_exposure()
+    Settings(host="0.0.0.0", auth="off", allow_open_host=True).check_exposure()
+
+
+def test_addresses_of_proxies_are_addresses_or_networks() -> None:
+    networks = Settings(proxy_addresses="10.0.0.0/8, ::1").proxy_networks  # type: ignore[arg-type]
+    assert [str(network) for network in networks] == ["10.0.0.0/8", "::1/128"]
+    with pytest.raises(ValidationError, match="proxy_addresses"):
+        Settings(proxy_addresses=("everywhere",))
 
 
 def test_a_data_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from workers.tasks import process_pack
 def complete() -> list[CompleteRun]:
     items = [AdvanceRun(f"run_{seed}", spec(seed, generations=5), None, 60.0) for seed in (1, 2, 3)]
     runs = []
-    for item, result in zip(items, process_pack(items, ["short"], RECORDS["short"]), strict=True):
+    for item in items:  # alone: a slow machine would leave the later ones of a pack
+        (result,) = process_pack([item], ["short"], RECORDS["short"])
         assert isinstance(result.outcome, RunConclusion)
         runs.append(CompleteRun(item.run, item.spec, result.outcome, 0.25))
     return runs

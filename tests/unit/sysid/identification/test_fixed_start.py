@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Record
 from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.identify import identify
@@ -98,6 +99,22 @@ def test_the_moves_are_those_of_an_estimate_with_that_start_free() -> None:
     freed = identify(parse_model(document), record, GeneticAlgorithm(generations=50))
     for estimate in freed.estimates[:3]:
         assert f"{estimate.name} is {estimate.value:.4g} ± {estimate.stderr:.2g}" in note
+
+
+@pytest.mark.parametrize("start", [FixedInitial(0.0), MeasuredInitial()])
+def test_the_runs_of_a_sweep_get_the_warnings_that_they_would_get_alone(
+    start: FixedInitial | MeasuredInitial,
+) -> None:
+    """They share the problem with a free start, unless the start itself has noise."""
+    tank = replace(TANK, initial=(start,))
+    base = measured(0, 2.0, TANK, noise=0.0)
+    problem, found = Problem.build(tank, [base]), []
+    for seed in range(3):
+        record = add_output_noise(base, Noise(0.2, seed))
+        problem = problem.replace_outputs([record])
+        found.append(notes(problem))
+        assert found[-1] == notes(Problem.build(tank, [record]))
+    assert any(found)
 
 
 def test_of_a_right_start_nothing_is_reported_whatever_the_noise() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from sysid.core.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
 from sysid.core.jit import jit_compile
-from sysid.core.settings import FitSettings, Loss
+from sysid.core.settings import FitSettings, Loss, PredictionKind
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.simulation.evaluator import Evaluator, evaluate_population
@@ -296,3 +296,42 @@ def test_a_start_that_is_no_parameter_is_told_how_to_become_one(
     model = differential({"x": "-b*x"}, "x", initial={"x": initial})
     with pytest.raises(InvalidSettings, match=re.escape(told)):
         Problem.build(model, [record()], parameters={name: {"fixed": 0.5}})
+
+
+@pytest.mark.parametrize("prediction", ["simulation", "one-step"])
+@pytest.mark.parametrize("is_even", [True, False])
+def test_other_outputs_make_the_arrays_of_a_new_problem(
+    is_even: bool, prediction: PredictionKind
+) -> None:
+    """Also where other samples are missing, and where the start is the first measured value."""
+    t = 0.1 * np.arange(40.0)
+    when = t if is_even else t + 0.03 * np.sin(7.0 * t)
+    force = Channel("u", t, np.sin(t), "V")
+    model = differential({"x": "u(t - L) - b*x"}, "x", initial={"x": "measured"})
+    records = []
+    for seed, missing in ((1, []), (2, []), (3, [0, 7, 8]), (4, [7])):
+        values = np.cos(when) + np.random.default_rng(seed).normal(0.0, 0.1, when.size)
+        values[missing] = np.nan
+        records.append(Record((force,), (Channel("y", when, values, "m"),)))
+    before = Problem.build(model, records[:1], prediction=prediction, skip=1)
+    for one in records[1:]:
+        before = before.replace_outputs([one])
+        alone = Problem.build(model, [one], prediction=prediction, skip=1)
+        for replaced, built in zip(before.evaluator, alone.evaluator, strict=True):
+            np.testing.assert_array_equal(replaced, built)
+        assert before.output_scale == alone.output_scale
+
+
+def test_what_outputs_do_not_change_is_computed_once_for_all_of_them() -> None:
+    calls: list[int] = []
+    first = Problem.build(duffing(), [record()])
+
+    def compute() -> int:
+        calls.append(1)
+        return len(calls)
+
+    (channel,) = record().outputs
+    other = replace(record(), outputs=(replace(channel, values=channel.values + 0.1),))
+    assert first.share("number", compute) == 1
+    assert first.replace_outputs([other]).share("number", compute) == 1
+    assert first.rebuild(skip=3).share("number", compute) == 2

@@ -1,0 +1,359 @@
+"""Keys, scopes and sessions of browsers at the door, on both databases."""
+
+import logging
+import re
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy import update
+
+from service.access.tokens import hash_secret, parse_token
+from service.api import events
+from service.api.access_check import COOKIE
+from service.repositories.keys import note_use
+from service.storage.tables import ApiKey, WebSession
+from tests.database import record_statements
+from tests.guarded import Guarded, guard
+from tests.rest import CSV, recording, refused
+from tests.stored import submit
+
+PAGE = {"Accept": "text/html"}
+MODEL = {"name": "tank"}
+
+
+def key_id(token: str) -> str:
+    parts = parse_token(token)
+    assert parts is not None
+    return parts.key_id
+
+
+def change_key(guarded: Guarded, token: str, **values: object) -> None:
+    with guarded.parts.database.write_session() as session:
+        session.execute(update(ApiKey).where(ApiKey.id == key_id(token)).values(**values))
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/nothing", "/metrics", "/v1/jobs/job_0/events"])
+def test_a_request_without_a_key_is_told_how_to_send_one(guarded: Guarded, path: str) -> None:
+    answer = guarded.ask("GET", path)
+    refused(answer, 401, "unauthorized")
+    assert answer.headers["www-authenticate"] == 'Bearer realm="lagid"'
+    assert "Authorization: Bearer" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/healthz", "/docs", "/openapi.json", "/sign-in", "/static/lagid.css"]
+)
+def test_what_belongs_to_no_project_needs_no_key(guarded: Guarded, path: str) -> None:
+    assert guarded.ask("GET", path).status_code == 200
+
+
+def test_a_wrong_key_is_refused_whatever_is_wrong_with_it(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    lagid, name, secret = token.split("_")
+    wrong = (
+        "x",
+        "lagid_" + "0" * 5000,
+        f"{lagid}_{name}",
+        f"{lagid}_{name}_{secret[:-1]}0{secret[-1]}",
+        f"{lagid}_{name[:-1]}_{secret}",
+        f"{lagid}_{name}_{hash_secret(secret)}",
+        f"{lagid}_{name}_\x00",
+    )
+    for text in wrong:
+        answer = guarded.ask("GET", "/v1/jobs", text)
+        refused(answer, 401, "unauthorized")
+        assert 'error="invalid_token"' in answer.headers["www-authenticate"]
+        assert secret not in answer.text
+    basic = guarded.ask("GET", "/v1/jobs", headers={"Authorization": f"Basic {token}"})
+    refused(basic, 401, "unauthorized")
+    assert guarded.ask("GET", "/v1/jobs", token).status_code == 200
+
+
+def test_a_key_ends_when_it_expires_or_is_revoked(guarded: Guarded) -> None:
+    ending, revoked = guarded.add_key(days=1), guarded.add_key()
+    assert guarded.ask("GET", "/v1/jobs", ending).status_code == 200
+    change_key(guarded, ending, expires_at=datetime.now(UTC))
+    change_key(guarded, revoked, revoked_at=datetime.now(UTC))
+    for token in (ending, revoked):
+        refused(guarded.ask("GET", "/v1/jobs", token), 401, "unauthorized")
+
+
+def test_a_scope_includes_the_lower_ones_and_no_higher_one(guarded: Guarded) -> None:
+    tokens = [guarded.add_key(scope=scope) for scope in ("read", "write", "admin")]
+    requests = (
+        ("GET", "/v1/jobs", {}, 0),
+        ("HEAD", "/v1/datasets/ds_0/content", {}, 0),
+        ("POST", "/v1/models:check", {"json": MODEL}, 0),
+        ("POST", "/v1/runs:compare", {"json": {"runs": ["a", "b"]}}, 0),
+        ("POST", "/v1/jobs", {"json": {}}, 1),
+        ("POST", "/v1/runs/run_0:simulate", {"json": {}}, 1),
+        ("PUT", "/v1/references/a", {"json": {"run": "run_0"}}, 1),
+        ("DELETE", "/v1/jobs/job_0", {}, 1),
+        ("GET", "/v1/audit", {}, 2),
+        ("GET", "/keys", {}, 2),
+        ("POST", "/keys", {"data": {"name": "a", "scope": "read"}}, 2),
+    )
+    for method, path, body, needed in requests:
+        for rank, token in enumerate(tokens):
+            answer = guarded.ask(method, path, token, **body)
+            if rank >= needed:
+                assert answer.status_code not in (401, 403), (method, path, answer.text)
+            elif method != "HEAD":
+                refused(answer, 403, "out-of-scope")
+                assert "scope" in answer.json()["detail"]
+
+
+def test_a_body_without_a_key_is_not_read(guarded: Guarded) -> None:
+    def content():
+        raise AssertionError("the body was read")
+        yield b""
+
+    answer = guarded.ask("POST", "/v1/datasets", content=content(), headers=CSV)
+    refused(answer, 401, "unauthorized")
+
+
+def test_no_cache_gives_an_answer_to_another_caller(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    answer = guarded.ask("GET", "/v1/jobs", token)
+    assert answer.headers["cache-control"] == "private, no-cache"
+    assert guarded.ask("GET", "/", token, headers=PAGE).headers["cache-control"] == "no-store"
+
+
+def test_access_says_who_asks(guarded: Guarded) -> None:
+    project = guarded.add_project("asking", max_open_jobs=3)
+    token = guarded.add_key(project, "write")
+    answer = guarded.ask("GET", "/v1/access", token).json()
+    assert answer["actor"] == key_id(token)
+    assert (answer["project"], answer["project_name"]) == (project, "asking")
+    assert answer["scopes"] == ["read", "write"]
+    assert answer["limits"]["max_open_jobs"] == 3
+    assert answer["limits"]["max_stored_bytes"] is None
+    assert answer["used"] == dict.fromkeys(answer["used"], 0)
+
+
+def test_the_last_use_of_a_key_is_written_once_a_minute(guarded: Guarded) -> None:
+    token = guarded.add_key()
+
+    def count_writes() -> int:
+        with record_statements(guarded.parts.database) as statements:
+            assert guarded.ask("GET", "/v1/jobs", token).status_code == 200
+        return sum(statement.startswith("UPDATE api_keys") for statement, _ in statements)
+
+    assert [count_writes() for _ in range(3)] == [1, 0, 0]
+    change_key(guarded, token, last_used_at=datetime.now(UTC) - timedelta(seconds=61))
+    assert [count_writes() for _ in range(2)] == [1, 0]
+
+
+def test_requests_at_once_write_the_use_of_a_key_once(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    uses = []
+    for _ in range(2):  # both have read that the key was never used
+        with guarded.parts.database.write_session() as session:
+            note_use(session, key_id(token))
+        with guarded.parts.database.read_session() as session:
+            uses.append(session.get_one(ApiKey, key_id(token)).last_used_at)
+    assert uses[0] is not None
+    assert uses[0] == uses[1]
+
+
+def test_only_digests_are_stored_and_nothing_is_logged(
+    guarded: Guarded, caplog: pytest.LogCaptureFixture
+) -> None:
+    token = guarded.add_key()
+    secret = token.rpartition("_")[2]
+    with caplog.at_level(logging.DEBUG):
+        guarded.ask("GET", "/v1/jobs", token)
+        guarded.ask("GET", "/v1/jobs", token + "0")
+        signed_in = guarded.ask("POST", "/sign-in", data={"key": token})
+    cookie = signed_in.cookies[COOKIE]
+    guarded.client.cookies.clear()
+    with guarded.parts.database.engine.connect() as connection:
+        stored = [
+            str(row)
+            for kind in (ApiKey, WebSession)
+            for row in connection.execute(kind.__table__.select())
+        ]
+    assert any(hash_secret(secret) in row for row in stored)
+    assert any(hash_secret(cookie) in row for row in stored)
+    for hidden in (secret, cookie):
+        assert not any(hidden in row for row in stored)
+        assert hidden not in caplog.text
+
+
+def sign_in(guarded: Guarded, token: str, **form: str) -> str:
+    answer = guarded.ask("POST", "/sign-in", data={"key": token, **form})
+    assert answer.status_code == 303, answer.text
+    guarded.client.cookies.clear()
+    return str(answer.cookies[COOKIE])
+
+
+def test_a_browser_signs_in_and_out(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    asked = guarded.ask("GET", "/datasets?cursor=ds_1", headers=PAGE)
+    assert asked.status_code == 303
+    assert asked.headers["location"] == "/sign-in?next=/datasets%3Fcursor%3Dds_1"
+    form = guarded.ask("GET", asked.headers["location"]).text
+    assert 'name="next" value="/datasets?cursor=ds_1"' in form
+    answer = guarded.ask("POST", "/sign-in", data={"key": token, "next": "/datasets?cursor=ds_1"})
+    assert (answer.status_code, answer.headers["location"]) == (303, "/datasets?cursor=ds_1")
+    attributes = answer.headers["set-cookie"]
+    for needed in ("HttpOnly", "SameSite=strict", "Path=/", "Max-Age=43"):
+        assert needed in attributes
+    assert "Secure" not in attributes  # this test does not come over https
+    cookie = {"Cookie": f"{COOKIE}={answer.cookies[COOKIE]}"}
+    guarded.client.cookies.clear()
+    page = guarded.ask("GET", "/datasets", headers={**PAGE, **cookie})
+    assert "Sign out" in page.text
+    assert 'href="/keys"' in page.text
+    assert guarded.ask("GET", "/v1/jobs", headers=cookie).status_code == 200
+    assert guarded.ask("POST", "/sign-out", headers=cookie).status_code == 303
+    refused(guarded.ask("GET", "/v1/jobs", headers=cookie), 401, "unauthorized")
+
+
+def test_a_session_ends_with_its_key_and_its_time(guarded: Guarded) -> None:
+    revoked, ended, short = (guarded.add_key(days=days) for days in (None, None, 1))
+    cookies = [
+        {"Cookie": f"{COOKIE}={sign_in(guarded, token)}"} for token in (revoked, ended, short)
+    ]
+    for cookie in cookies:
+        assert guarded.ask("GET", "/v1/jobs", headers=cookie).status_code == 200
+    admin = guarded.add_key()
+    answer = guarded.ask("POST", f"/keys/{key_id(revoked)}/revoke", admin)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/keys")
+    change_key(guarded, short, expires_at=datetime.now(UTC))
+    with guarded.parts.database.write_session() as session:
+        session.execute(update(WebSession).values(expires_at=datetime.now(UTC)))
+    for cookie in cookies:
+        refused(guarded.ask("GET", "/v1/jobs", headers=cookie), 401, "unauthorized")
+
+
+def test_an_open_event_stream_ends_after_its_key(
+    guarded: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.05)
+    token, parts = guarded.add_key(), guarded.parts
+    job = submit(parts.database)
+    with ThreadPoolExecutor(1) as pool:
+        stream = pool.submit(guarded.ask, "GET", f"/v1/jobs/{job}/events", token)
+        with pytest.raises(TimeoutError):
+            stream.result(timeout=0.5)
+        change_key(guarded, token, revoked_at=datetime.now(UTC))
+        answer = stream.result(timeout=60)
+    assert answer.status_code == 200
+    assert "still here" in answer.text
+    refused(guarded.ask("GET", f"/v1/jobs/{job}/events", token), 401, "unauthorized")
+
+
+def test_a_wrong_key_at_the_form_is_told_there(guarded: Guarded) -> None:
+    answer = guarded.ask("POST", "/sign-in", data={"key": "lagid_1_2"})
+    assert answer.status_code == 401
+    assert "is unknown, has expired, or was revoked" in answer.text
+    assert "set-cookie" not in answer.headers
+
+
+@pytest.mark.parametrize(
+    "target", ["//evil.example", "https://evil.example", "/\\evil.example", ""]
+)
+def test_a_sign_in_leads_to_pages_of_this_service_only(guarded: Guarded, target: str) -> None:
+    token = guarded.add_key()
+    answer = guarded.ask("POST", "/sign-in", data={"key": token, "next": target})
+    guarded.client.cookies.clear()
+    assert answer.headers["location"] == "/"
+
+
+def test_a_foreign_page_cannot_use_the_session_or_sign_in(guarded: Guarded) -> None:
+    token = guarded.add_key()
+    cookie = {"Cookie": f"{COOKIE}={sign_in(guarded, token)}"}
+    foreign = {"Origin": "http://evil.example", "Sec-Fetch-Site": "cross-site"}
+    headers = {**cookie, **foreign}
+    refused(guarded.ask("POST", "/v1/models", json=MODEL, headers=headers), 403, "foreign-origin")
+    form = guarded.ask("POST", "/sign-in", data={"key": token}, headers=foreign)
+    refused(form, 403, "foreign-origin")
+
+
+def test_keys_are_made_shown_once_and_revoked_on_their_page(guarded: Guarded) -> None:
+    project = guarded.add_project("paged")
+    admin = guarded.add_key(project)
+    made = guarded.ask(
+        "POST", "/keys", admin, data={"name": "laptop", "scope": "read", "days": "3"}
+    )
+    assert made.status_code == 201
+    (token,) = set(re.findall(r"lagid_\w+_[0-9a-f]{64}", made.text))
+    assert guarded.ask("GET", "/v1/access", token).json()["scopes"] == ["read"]
+    page = guarded.ask("GET", "/keys", admin).text
+    assert token not in page
+    assert "laptop" in page
+    assert guarded.ask("POST", f"/keys/{key_id(token)}/revoke", admin).status_code == 303
+    refused(guarded.ask("GET", "/v1/jobs", token), 401, "unauthorized")
+    others = guarded.add_key()
+    refused(guarded.ask("POST", f"/keys/{key_id(others)}/revoke", admin), 404, "not-found")
+    for form in ({"name": " "}, {"name": "a", "days": "0"}, {"name": "a", "days": "x"}):
+        answer = guarded.ask("POST", "/keys", admin, data=form)
+        assert answer.status_code == 422
+        assert 'role="alert"' in answer.text
+        assert "found" in answer.text
+    refused(guarded.ask("POST", "/keys", admin, data={"name": "a", "scope": "all"}), 422, "invalid")
+
+
+def test_the_audit_log_says_who_did_what(guarded: Guarded) -> None:
+    project = guarded.add_project("audited")
+    admin, writer = guarded.add_key(project), guarded.add_key(project, "write")
+    stored = guarded.ask(
+        "POST",
+        "/v1/datasets?name=a",
+        writer,
+        content=recording(n=30),
+        headers={**CSV, "X-Request-ID": "request-7"},
+    ).json()["id"]
+    again = guarded.ask("POST", "/v1/datasets?name=a", writer, content=recording(n=30), headers=CSV)
+    assert again.status_code == 200  # nothing was changed
+    entries = guarded.ask("GET", "/v1/audit", admin).json()["items"]
+    assert [entry["action"] for entry in entries[:3]] == ["dataset.add", "key.create", "key.create"]
+    first = entries[0]
+    assert (first["actor"], first["object_id"]) == (key_id(writer), stored)
+    assert first["request_id"] == "request-7"
+    page = guarded.ask("GET", "/v1/audit?limit=1", admin).json()
+    following = guarded.ask("GET", f"/v1/audit?limit=1&cursor={page['next']}", admin).json()
+    assert [page["items"][0], following["items"][0]] == entries[:2]
+    refused(guarded.ask("GET", "/v1/audit?cursor=x", admin), 422, "invalid")
+    other = guarded.ask("GET", "/v1/audit", guarded.add_key()).json()["items"]
+    assert stored not in {entry["object_id"] for entry in other}
+
+
+def test_nothing_is_recorded_of_what_was_refused(guarded: Guarded) -> None:
+    project = guarded.add_project("full", max_stored_bytes=10)
+    token = guarded.add_key(project)
+    answer = guarded.ask("POST", "/v1/datasets", token, content=recording(n=30), headers=CSV)
+    refused(answer, 429, "quota")
+    actions = guarded.ask("GET", "/v1/audit", token).json()["items"]
+    assert {entry["action"] for entry in actions} == {
+        "key.create",
+        "project.create",
+        "project.limit",
+    }
+    assert guarded.ask("GET", "/v1/datasets", token).json()["items"] == []
+
+
+def test_failing_keys_wait_and_too_many_of_them_are_sent_away(tmp_path: Path) -> None:
+    with guard("sqlite", tmp_path) as guarded:
+        token, failures = guarded.add_key(), guarded.parts.failures
+        failures._most = 0
+        answer = guarded.ask("GET", "/v1/jobs", "lagid_1_2")
+        refused(answer, 503, "unavailable")
+        assert answer.headers["retry-after"] == "2"
+        assert guarded.ask("GET", "/v1/jobs", token).status_code == 200
+        refused(guarded.ask("GET", "/v1/jobs"), 401, "unauthorized")  # no key is no guess
+
+
+def test_a_database_that_is_away_is_told_as_everywhere(tmp_path: Path) -> None:
+    with guard("sqlite", tmp_path) as guarded:
+        token = guarded.add_key()
+        (tmp_path / "lagid.db").rename(tmp_path / "gone.db")
+        guarded.parts.database.dispose()
+        (tmp_path / "lagid.db").mkdir()
+        refused(guarded.ask("GET", "/v1/jobs", token), 503, "unavailable")
+        (tmp_path / "lagid.db").rmdir()
+        (tmp_path / "gone.db").rename(tmp_path / "lagid.db")
+        assert guarded.ask("GET", "/v1/jobs", token).status_code == 200

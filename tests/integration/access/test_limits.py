@@ -1,0 +1,139 @@
+"""Limits of a project: stored bytes, evaluations in a day, open jobs and runs."""
+
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from threading import Barrier
+
+import pytest
+
+from service.core.errors import BudgetExceeded, QuotaExceeded
+from service.core.settings import Settings
+from service.core.states import JobState
+from service.jobs.submit import check_limits
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.projects import ProjectRepository
+from service.storage.columns import utc_now
+from service.storage.errors import RowConflict, RowNotFound
+from service.storage.sessions import Database, SessionOwner
+from service.storage.tables import Job
+from tests.database import record_statements
+from tests.stored import new_dataset
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def limited(database: Database) -> Database:
+    """The database for a project that may store 25 bytes and make 100 evaluations a day."""
+    limits = {"max_stored_bytes": 25, "max_daily_evaluations": 100, "max_open_jobs": 3}
+    with database.write_session() as session:
+        project = ProjectRepository(session).add("limited")
+        ProjectRepository(session).change_limits("limited", limits)
+    return database.open_for(SessionOwner(project.id))
+
+
+def add_dataset(database: Database, source: str) -> str:
+    with database.write_session() as session:
+        new = new_dataset(source_key=source, size_bytes=10)
+        return str(DatasetRepository(session).add(new).dataset.id)
+
+
+def add_job(database: Database, **values: object) -> Job:
+    """A job of the project with these columns, checked as a submission is."""
+    with database.write_session() as session:
+        new = NewJob(name="tube", spec={"model": "tube"})
+        job = JobRepository(session).submit(new).job
+        check_limits(session, job, SETTINGS)
+        for name, value in values.items():
+            setattr(job, name, value)
+        return job
+
+
+def end_job(database: Database, evaluations: int, hours_ago: float, **values: object) -> None:
+    finished_at = utc_now() - timedelta(hours=hours_ago)
+    ended = {"state": JobState.SUCCEEDED, "finished_at": finished_at, "evaluations": evaluations}
+    add_job(database, **ended, **values)
+
+
+def test_stored_bytes_are_limited_and_a_deletion_makes_room(limited: Database) -> None:
+    first = add_dataset(limited, "a")
+    add_dataset(limited, "b")
+    with pytest.raises(BudgetExceeded, match="would store 30 bytes; at most 25") as error:
+        add_dataset(limited, "c")
+    assert error.value.headers == {"Retry-After": "3600"}
+    assert add_dataset(limited, "a") == first  # what is there already needs no room
+    with limited.write_session() as session:
+        DatasetRepository(session).delete(first)
+    add_dataset(limited, "c")
+
+
+def test_bytes_that_are_stored_at_once_do_not_pass_the_limit_together(limited: Database) -> None:
+    start = Barrier(6)
+
+    def store(number: int) -> bool:
+        start.wait()
+        try:
+            add_dataset(limited, f"s{number}")
+        except BudgetExceeded:
+            return False
+        return True
+
+    with ThreadPoolExecutor(6) as pool:
+        assert sum(pool.map(store, range(6))) == 2
+
+
+def test_evaluations_of_a_day_are_limited_until_the_first_job_is_a_day_old(
+    limited: Database,
+) -> None:
+    end_job(limited, 1000, hours_ago=25)
+    end_job(limited, 60, hours_ago=23)
+    end_job(limited, 30, hours_ago=1)
+    end_job(limited, 1000, hours_ago=1, n_runs=4, n_reused=4)  # computed by other jobs
+    add_job(limited, evaluations=20)
+    with pytest.raises(BudgetExceeded, match="made 110 evaluations; 100 are allowed") as error:
+        add_job(limited)
+    assert 3500 < int(error.value.headers["Retry-After"]) <= 3600
+    with limited.write_session() as session:
+        ProjectRepository(session).change_limits("limited", {"max_daily_evaluations": 111})
+    add_job(limited)
+
+
+def test_a_project_has_its_own_limit_of_open_jobs(limited: Database) -> None:
+    for _ in range(3):
+        add_job(limited)
+    with pytest.raises(QuotaExceeded, match="3 jobs of the project are queued or running"):
+        add_job(limited)
+    with limited.write_session() as session:
+        ProjectRepository(session).change_limits("limited", {"max_open_jobs": None})
+    add_job(limited)
+
+
+def test_what_a_project_uses_is_measured(limited: Database) -> None:
+    add_dataset(limited, "a")
+    end_job(limited, 60, hours_ago=1)
+    add_job(limited, evaluations=20)
+    with limited.read_session() as session:
+        repository = ProjectRepository(session)
+        used = repository.measure_use(repository.get("limited").id)
+        others = repository.measure_use("proj_default")
+    assert (used.stored_bytes, used.daily_evaluations) == (10, 80)
+    assert (others.stored_bytes, others.daily_evaluations) == (0, 0)
+
+
+def test_without_a_limit_nothing_is_counted(database: Database) -> None:
+    with record_statements(database) as statements:
+        add_dataset(database, "a")
+        add_job(database)
+    assert not [text for text, _ in statements if "sum(datasets" in text or "evaluations *" in text]
+
+
+def test_a_project_is_found_by_name_or_identifier_and_names_are_unique(limited: Database) -> None:
+    with limited.write_session() as session:
+        repository = ProjectRepository(session)
+        project = repository.get("limited")
+        assert repository.get(project.id) is project
+        with pytest.raises(RowNotFound, match="'absent'"):
+            repository.get("absent")
+        with pytest.raises(RowConflict, match="'limited' already"):
+            repository.add("limited")
