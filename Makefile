@@ -38,7 +38,7 @@ demo: $(READY)
 	@$(BIN)/lagid demo
 
 paper: $(READY)
-	@$(BIN)/lagid paper
+	@$(BIN)/lagid paper --force
 
 serve: warm
 	@exec $(BIN)/lagid serve

@@ -12,7 +12,7 @@ sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != Path(__fi
 import numpy as np
 
 from benchmarks.table import Row, parser, report
-from service.formats.mcap import read_recording, write_recording
+from service.formats.mcap import read_mcap, write_recording
 from sysid.data.records import Channel, Recording
 
 SAMPLES = 1_000_000
@@ -46,14 +46,14 @@ def main() -> None:
     file = BytesIO()
     write_recording(recording, file)
     content = file.getvalue()
-    back = read_recording(content)
+    back = read_mcap(content)
     if not all(
         np.array_equal(a.values, b.values) and np.array_equal(a.times, b.times)
         for a, b in zip(recording.channels, back.channels, strict=True)
     ):
         sys.exit("the recording did not come back bit for bit")
     write = least_seconds(lambda: write_recording(recording, BytesIO()), repeats)
-    read = least_seconds(lambda: read_recording(content), repeats)
+    read = least_seconds(lambda: read_mcap(content), repeats)
     rows = [
         Row("write 1 M samples × 2 channels", write, "s of CPU", WRITE_BAR_S),
         Row("read them, all checksums compared", read, "s of CPU", READ_BAR_S),

@@ -54,6 +54,8 @@ from workers.protocol import (
 
 SIGMAS, METHODS = [0.01, 0.02, 0.03, 0.04, 0.05], ["simple", "improved"]
 RECORDED_RUNS = 40
+MAX_RUNS = 10_000_000
+"""Runs of a sweep at most: more than a service allows by default."""
 DatabaseKind = Literal["SQLite", "PostgreSQL"]
 
 
@@ -122,7 +124,7 @@ class SimulatedCluster:
         other.close()
         assert self._pipe.recv_bytes() == b"ready"
         self._answers: dict[int, bytes] = {}
-        self._next = 0
+        self._next = self.n_ended = 0
 
     def share_records(self, records: Records) -> int:
         """The player needs no records."""
@@ -147,6 +149,7 @@ class SimulatedCluster:
     def fetch_results(self, handle: PackHandle) -> PackResult:
         """Return the results of a pack, unpickled as by Ray."""
         pack: PackResult = pickle.loads(memoryview(self._answers.pop(handle))[8:])
+        self.n_ended += len(pack.results)
         return pack
 
     def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
@@ -256,9 +259,11 @@ def _join_rows(blocks: Sequence[PackedRows]) -> PackedRows:
 
 
 class TimedDatabase(Database):
-    """A database that counts the time inside its transactions."""
+    """A database that counts the time inside its transactions, in all threads."""
 
-    seconds = 0.0
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.seconds, self._lock = 0.0, threading.Lock()
 
     @contextmanager
     def write_session(self, busy_seconds: float | None = None) -> Iterator[Session]:
@@ -274,34 +279,84 @@ class TimedDatabase(Database):
 
     @contextmanager
     def _measure(self) -> Iterator[None]:
-        is_ours = threading.current_thread() is threading.main_thread()
         start = time.perf_counter()
         try:
             yield
         finally:
-            if is_ours:
+            with self._lock:
                 self.seconds += time.perf_counter() - start
 
 
 @dataclass(frozen=True)
 class Played:
-    """A sweep on a simulated cluster.
+    """A sweep on simulated clusters, one for each dispatcher.
 
     Attributes
     ----------
     rate : float
-        Runs a second, from the first look at the queue to the end of the job.
-    busy : float
-        Workers that had a run to compute, on average.
-    cpu, transactions, server : float
-        In ms a run: CPU time of the dispatcher, time in its transactions, CPU time of PostgreSQL.
+        Runs a second of all dispatchers, from the first claim to the end of the job.
+    cpu, transactions, server, player : float
+        In ms a run: CPU time of the dispatchers, time in their transactions, CPU time of
+        PostgreSQL, and of those who play the workers.
+    least_part : float
+        Part of the runs that the dispatcher with the fewest took.
     """
 
+    n_dispatchers: int
+    slots: int
+    seconds: float
     rate: float
-    busy: float
     cpu: float
     transactions: float
     server: float
+    player: float
+    least_part: float
+
+    @property
+    def busy(self) -> float:
+        """Workers that had a run to compute, on average."""
+        return min(self.rate * self.seconds, self.slots)
+
+    @property
+    def rate_by_cpu(self) -> float:
+        """Runs a second if each dispatcher had a core, and the database as many as it needs."""
+        return self.n_dispatchers * 1e3 / self.cpu
+
+    @property
+    def busy_by_cpu(self) -> float:
+        """Workers that would be busy then."""
+        return min(self.rate_by_cpu * self.seconds, self.slots)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one dispatcher needs to play, and to tell."""
+
+    settings: Settings
+    recording: RecordedRuns
+    slots: int
+    seconds: float
+
+
+def _play_part(part: _Part, pipe: Connection) -> None:
+    """Run a dispatcher until it is told to stop; tell what it took. A process of its own."""
+    database = TimedDatabase(part.settings.database_location)
+    store = open_store(part.settings.store_location)
+    cluster = SimulatedCluster(part.slots, part.recording, part.seconds)
+    dispatcher = Dispatcher(database, store, cluster, HeldLeases(database, 30.0))
+    pipe.send("ready")
+    pipe.recv()
+    database.seconds, cpu = 0.0, time.process_time()
+
+    def wait_for_end() -> None:
+        pipe.recv()
+        dispatcher.stopping.set()
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
+    dispatcher.run_until_stopped()
+    pipe.send((time.process_time() - cpu, database.seconds, cluster.n_ended))
+    cluster.close()
+    database.dispose()
 
 
 class Stage:
@@ -312,7 +367,9 @@ class Stage:
         server = parts.enter_context(_open_postgres()) if kind == "PostgreSQL" else None
         url = None if server is None else server.get_uri()
         self._server = None if server is None else psutil.Process(server.get_pid())
-        self._settings = Settings(data_dir=folder, database_url=url)
+        self._settings = Settings(
+            data_dir=folder, database_url=url, max_runs_per_job=MAX_RUNS, max_open_runs=MAX_RUNS
+        )
         self._settings.prepare_data_folder()
         self._database = TimedDatabase(self._settings.database_location)
         parts.callback(self._database.dispose)
@@ -331,34 +388,63 @@ class Stage:
         recorder = RecordingExecutor()
         self._carry_out(RECORDED_RUNS, recorder)
         self._recording = recorder.recording
+        self.last_job = ""
 
-    def play_sweep(self, n_runs: int, slots: int, seconds: float) -> Played:
-        """Carry out a sweep on so many workers, with runs of `seconds`."""
-        cluster = SimulatedCluster(slots, self._recording, seconds)
+    def play_sweep(self, n_runs: int, slots: int, seconds: float, n_dispatchers: int = 1) -> Played:
+        """Carry out a sweep on so many workers in all, with runs of `seconds`."""
+        part = _Part(self._settings, self._recording, slots // n_dispatchers, seconds)
+        context = multiprocessing.get_context("spawn")
+        pipes, processes = [], []
+        for _ in range(n_dispatchers):
+            pipe, other = context.Pipe()
+            process = context.Process(target=_play_part, args=(part, other))
+            process.start()
+            other.close()
+            pipes.append(pipe)
+            processes.append(process)
         try:
-            job = self._submit(n_runs)
-            self._database.seconds = 0.0
-            server, cpu, wall = self._measure_server(), time.process_time(), time.perf_counter()
-            self._dispatch(job, cluster)
-            wall = time.perf_counter() - wall
-            cpu, server = time.process_time() - cpu, self._measure_server() - server
+            return self._measure_sweep(n_runs, part, pipes, [one.pid for one in processes])
         finally:
-            cluster.close()
-        rate = n_runs / wall
+            for process in processes:
+                process.join(20.0)
+                process.kill()
+
+    def _measure_sweep(
+        self, n_runs: int, part: _Part, pipes: Sequence[Any], pids: Sequence[Any]
+    ) -> Played:
+        assert all(pipe.recv() == "ready" for pipe in pipes)
+        players = [psutil.Process(pid).children()[-1] for pid in pids]
+        server, played = self._measure_server(), _measure_processes(players)
+        self.last_job = self._submit(n_runs)
+        wall = time.perf_counter()
+        for pipe in pipes:
+            pipe.send("begin")
+        while (state := self._read_state(self.last_job)) in OPEN_STATES:
+            time.sleep(0.1)
+        wall = time.perf_counter() - wall
+        assert state is JobState.SUCCEEDED, state
+        server, played = self._measure_server() - server, _measure_processes(players) - played
+        for pipe in pipes:
+            pipe.send("stop")
+        cpu, transactions, ended = map(list, zip(*(pipe.recv() for pipe in pipes), strict=True))
         each = 1e3 / n_runs
         return Played(
-            rate,
-            min(rate * seconds, slots),
-            cpu * each,
-            self._database.seconds * each,
+            len(pipes),
+            part.slots * len(pipes),
+            part.seconds,
+            n_runs / wall,
+            sum(cpu) * each,
+            sum(transactions) * each,
             server * each,
+            played * each,
+            min(ended) / n_runs,
         )
 
     def _measure_server(self) -> float:
         if self._server is None:
             return 0.0
         family = [self._server, *self._server.children(recursive=True)]
-        return sum(sum(process.cpu_times()[:2]) for process in family)
+        return _measure_processes(family)
 
     def _carry_out(self, n_runs: int, executor: Executor) -> None:
         self._dispatch(self._submit(n_runs), executor)
@@ -386,6 +472,11 @@ class Stage:
     def _read_state(self, job: str) -> JobState:
         with self._database.read_session() as session:
             return JobRepository(session).get(job).state
+
+
+def _measure_processes(processes: Sequence[psutil.Process]) -> float:
+    """CPU time of processes, in s."""
+    return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
 @contextmanager

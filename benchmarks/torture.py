@@ -28,6 +28,8 @@ GCS_SECONDS = 65.0
 DISK_MEGABYTES = 512
 TABLE_MEGABYTES = 64
 WORKER_MEGABYTES = 512
+PARCEL_RUNS = 20
+"""Runs of a parcel, so that the two dispatchers on PostgreSQL share each sweep."""
 
 Fault = Callable[[Bench], float]
 FAULTS: dict[str, Fault] = {
@@ -88,8 +90,10 @@ class Torture:
                 "BREAK_RAY": str(self.ray_away),
                 "BREAK_SEEDS": ",".join(map(str, DEADLY)),
                 "BREAK_MEMORY": ",".join(map(str, GREEDY)),
+                "BREAK_PARCELS": str(PARCEL_RUNS),
                 "LAGID_WORKER_MEMORY_MB": str(WORKER_MEGABYTES),
             },
+            has_second=postgres is not None,
         )
         self.met: dict[str, list[Met]] = {kind: [] for kind in self.list_faults()}
         self.at_risk: list[float] = []

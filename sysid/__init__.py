@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from sysid.core.lazy_names import load_on_first_use
 
 if TYPE_CHECKING:
-    from sysid.core.errors import SysidError
+    from sysid.core.errors import SysidError, UnreadableFile
     from sysid.core.settings import (
         GeneticAlgorithm,
         IslandChange,
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     )
     from sysid.data.noise import Noise
     from sysid.data.records import Channel, History, Record, Recording
+    from sysid.data.table_rules import ReadingNote
     from sysid.export.export import export_model
     from sysid.export.load import load_identified
     from sysid.identification.identify import identify
@@ -42,11 +43,13 @@ __all__ = [
     "Noise",
     "Parameter",
     "Problem",
+    "ReadingNote",
     "Record",
     "Recording",
     "SequenceSearch",
     "Stop",
     "SysidError",
+    "UnreadableFile",
     "catalogue",
     "export_model",
     "identify",
@@ -59,7 +62,7 @@ DISTRIBUTION = "lagid"
 """Tells this package from others of the name; `lagid` looks at it."""
 
 _PUBLIC_NAMES = {
-    "core.errors": ("SysidError",),
+    "core.errors": ("SysidError", "UnreadableFile"),
     "core.settings": (
         "GeneticAlgorithm",
         "IslandChange",
@@ -70,6 +73,7 @@ _PUBLIC_NAMES = {
     ),
     "data.noise": ("Noise",),
     "data.records": ("Channel", "History", "Record", "Recording"),
+    "data.table_rules": ("ReadingNote",),
     "export.export": ("export_model",),
     "export.load": ("load_identified",),
     "identification.identify": ("identify",),

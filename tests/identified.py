@@ -29,8 +29,10 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
             claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
-    floors = build_bounds_maker(parts.database, claim, source)
-    recorder = RunRecorder(parts.database, claim, parts.store, source.encoder, source.note_end)
+    floors = build_bounds_maker(parts.database, source.parts)
+    recorder = RunRecorder(
+        parts.database, claim, parts.store, source.parts.encoder, source.parts.warm.record_end
+    )
     feeder: Scheduler[str] = Scheduler(InlineExecutor())
     feeder.add_job(job, source, recorder)
     for _ in range(steps):

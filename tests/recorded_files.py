@@ -10,7 +10,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from scipy.io import savemat
 
-N = 40
+N = 240  # more than the first rows that are looked at
 TIMES = np.arange(N) / 10.0
 INPUT = np.repeat([0.0, 1.0, 0.5, 2.0], N // 4)
 OUTPUT = np.round(np.sin(TIMES) - 1.25, 6)

@@ -2,6 +2,8 @@
 
 from datetime import UTC, datetime, timedelta
 
+from sqlalchemy import select
+
 from service.core.states import JobState
 from service.queue.leases import Claim, Lease, LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
@@ -9,7 +11,7 @@ from service.repositories.datasets import NewDataset
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import Job, Run
+from service.storage.tables import Job, Parcel, Run
 
 
 class Clock:
@@ -63,6 +65,19 @@ def record_success(database: Database, lease: Lease, run_id: str, rms: float | N
 def job_of(database: Database, job_id: str) -> Job:
     with database.read_session() as session:
         return JobRepository(session).get(job_id)
+
+
+def parcels_of(database: Database, job_id: str) -> list[Parcel]:
+    """The parcels of an open job, in order."""
+    with database.read_session() as session:
+        query = select(Parcel).where(Parcel.job_id == job_id).order_by(Parcel.first)
+        return list(session.scalars(query))
+
+
+def parcel_of(database: Database, job_id: str) -> Parcel:
+    """The only parcel of an open job."""
+    (parcel,) = parcels_of(database, job_id)
+    return parcel
 
 
 def state_of(database: Database, job_id: str) -> JobState:

@@ -1,13 +1,14 @@
-"""Runs of one job on the driver's side: the next items of work, and their results."""
+"""Runs of one parcel on the driver's side: the next items of work, and their results."""
 
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from workers.active_run import MAX_KILLS, ActiveRun
 from workers.errors import RecordsUnavailable
-from workers.packing import MeanCost, balance_packs, choose_pack_size
+from workers.packing import PACKS_PER_CPU, MeanCost, balance_packs, choose_pack_size
 from workers.protocol import (
     EvolveIsland,
     Executor,
@@ -32,26 +33,68 @@ MAX_SHARED_RECORDS = 16
 """Largest number of record sets that a job shares with the executor."""
 
 
+READ_SECONDS_PER_CORE = 4.0
+"""Runs that take longer than this together are not read ahead for a core."""
+
+
+@dataclass(slots=True, eq=False)
+class SharedWork:
+    """What the parcels of one job share: the cost of a run, records, and who has runs left.
+
+    Attributes
+    ----------
+    records : dict
+        Records that the executor has, by key.
+    queues : list of JobQueue
+        The parcels, the oldest first.
+    """
+
+    cost: MeanCost = field(default_factory=MeanCost)
+    records: dict[str, Any] = field(default_factory=dict)
+    queues: "list[JobQueue]" = field(default_factory=list)
+
+    @property
+    def has_no_more(self) -> bool:
+        """Whether no more runs can be read at present, in any parcel."""
+        return all(queue.has_no_more for queue in self.queues)
+
+    def count_waiting(self) -> int:
+        """Count the runs that were read and wait for a worker."""
+        return sum(queue.n_waiting for queue in self.queues)
+
+
 class JobQueue:
-    """Runs of one job: waiting, with the workers, or done.
+    """Runs of one parcel of a job: waiting, with the workers, or done.
 
     Attributes
     ----------
     in_flight : dict
         Items of each pack in flight.
+    has_no_more : bool
+        Whether nothing more can be read at present: the next run waits for unfinished ones.
     """
 
-    def __init__(self, source: JobSource, observer: RunObserver, executor: Executor) -> None:
+    def __init__(
+        self,
+        source: JobSource,
+        observer: RunObserver,
+        executor: Executor,
+        shared: SharedWork | None = None,
+    ) -> None:
         self.observer = observer
         self.in_flight: dict[PackHandle, tuple[WorkItem, ...]] = {}
         self._source, self._executor = source, executor
         self._entries: Iterator[JobEntry] = iter(source.iterate_runs())
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
-        self._shared: dict[str, Any] = {}
-        self._cost = MeanCost()
+        self._shared = shared or SharedWork()
+        self._shared.queues.append(self)
         self._exhausted = False
-        self._has_no_more = False  # at present: the next run waits for unfinished ones
+        self.has_no_more = False
+
+    def leave(self) -> None:
+        """Leave the other parcels of the job, because this one has ended."""
+        self._shared.queues.remove(self)
 
     @property
     def is_done(self) -> bool:
@@ -59,19 +102,24 @@ class JobQueue:
         return self._exhausted and not (self.in_flight or self._ready)
 
     @property
-    def has_waiting_runs(self) -> bool:
-        """Whether a run that was read waits for a worker."""
-        return bool(self._ready)
+    def n_waiting(self) -> int:
+        """Runs that were read and wait for a worker."""
+        return len(self._ready)
 
     def read_ahead(self, wanted: int, deadline: float) -> bool:
         """Read runs until `wanted` of them wait or the time is up; return whether a run waits.
 
-        A pack of them is read in any case, because small packs would take even more time.
+        A pack of them is read in any case, because small packs would take even more time. Long
+        runs are not read far ahead: another dispatcher may take them.
         """
-        left = choose_pack_size(self._cost, wanted, 1) - len(self._ready)
+        cost, cores = self._shared.cost.seconds, self._executor.slots
+        if cost is not None:
+            far = int(READ_SECONDS_PER_CORE * cores / max(cost, 1e-4))
+            wanted = min(wanted, max(far, PACKS_PER_CPU * cores))
+        left = choose_pack_size(self._shared.cost, wanted, 1) - len(self._ready)
         while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._entries, None)
-            self._has_no_more = queued is None or isinstance(queued, RunNotReady)
+            self.has_no_more = queued is None or isinstance(queued, RunNotReady)
             if queued is None:
                 self._exhausted = True
             elif isinstance(queued, RunNotReady):
@@ -98,9 +146,12 @@ class JobQueue:
         elif run.needs_own_pack:
             self._submit_items([self._ready.popleft().make_slice()])
         else:
-            shared_by = self._executor.slots if self._has_no_more else 1  # else more follow
-            size = choose_pack_size(self._cost, len(self._ready), shared_by)
-            self._submit_items([run.make_slice(self._cost) for run in self._take_unstarted(size)])
+            cost, waiting = self._shared.cost, len(self._ready)
+            size = choose_pack_size(cost, waiting, 1)
+            if self._shared.has_no_more:  # else more follow
+                all_waiting = self._shared.count_waiting()
+                size = min(size, choose_pack_size(cost, all_waiting, self._executor.slots))
+            self._submit_items([run.make_slice(cost) for run in self._take_unstarted(size)])
 
     def absorb_pack(self, handle: PackHandle, pack: PackResult) -> None:
         """Record the results of a pack; islands that were not processed are sent again."""
@@ -199,19 +250,20 @@ class JobQueue:
             self.observer.record_start(run.run)
 
     def _share_records(self, key: str) -> Any:
-        if key not in self._shared:
-            while len(self._shared) >= MAX_SHARED_RECORDS:
-                self._shared.pop(next(iter(self._shared)))
-            self._shared[key] = self._executor.share_records(self._source.load_records(key))
-        return self._shared[key]
+        shared = self._shared.records
+        if key not in shared:
+            while len(shared) >= MAX_SHARED_RECORDS:
+                shared.pop(next(iter(shared)))
+            shared[key] = self._executor.share_records(self._source.load_records(key))
+        return shared[key]
 
     def _take_result(self, run: ActiveRun, result: ItemResult) -> None:
         match result.outcome:
             case RunFailure() as failure:
-                self._cost = self._cost.add_measurement(result.seconds)
+                self._shared.cost = self._shared.cost.add_measurement(result.seconds)
                 self._fail_run(run.run, failure)
             case RunEnd():
-                self._cost = self._cost.add_measurement(run.seconds)
+                self._shared.cost = self._shared.cost.add_measurement(run.seconds)
                 del self._active[run.run]
             case RunProgress(state):
                 run.absorb_slice(state, result.seconds)

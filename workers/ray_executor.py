@@ -97,6 +97,9 @@ class RayExecutor:
         self._last_answer = self._last_process_check = time.monotonic()
         self._vital_pids = () if settings.address else _find_vital_processes()
         self._most_slots, self._start_seconds = settings.cpus, settings.start_seconds
+        self._shared_slots: int | None = None
+        self.identity = None if settings.address is None else _name_cluster(ray)
+        self.n_cores = self._count_cores()
         self.slots = self._count_slots()
         self._memory = settings.memory_bytes
         if self._memory is None and settings.address is None:
@@ -242,21 +245,33 @@ class RayExecutor:
             if not self.is_alive():
                 raise ClusterLost("a process of the local Ray is gone")
 
+    def limit_slots(self, n_cores: int) -> None:
+        """Use that many cores at most: the part of this dispatcher in a shared cluster."""
+        self._shared_slots = n_cores
+        slots = self._count_slots()
+        if slots != self.slots:
+            _log.info("%d of %d cores are used now, before %d", slots, self.n_cores, self.slots)
+            self.slots = slots
+
+    def _count_cores(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
     def _count_slots(self) -> int:
-        available = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-        return available if self._most_slots is None else min(available, self._most_slots)
+        limits = (self.n_cores, self._most_slots, self._shared_slots)
+        return max(1, min(limit for limit in limits if limit is not None))
 
     def _watch_slot_count(self) -> None:
         """Count cores in a thread, as the call may hang; the scheduler reads `slots` each step."""
         while not self._closing.wait(SLOT_COUNT_SECONDS):
             try:
-                slots = self._count_slots()
+                n_cores = self._count_cores()
             except (self._ray.exceptions.RayError, RuntimeError, ConnectionError) as error:
                 _log.warning("the cores of the cluster could not be counted: %s", error)
                 continue
-            if slots != self.slots:
-                _log.info("the cluster has %d cores now, before %d", slots, self.slots)
-                self.slots = slots
+            if n_cores != self.n_cores:
+                _log.info("the cluster has %d cores now, before %d", n_cores, self.n_cores)
+                self.n_cores = n_cores
+                self.slots = self._count_slots()
 
     def _remove_folder(self) -> None:
         if self._local is not None:
@@ -288,6 +303,12 @@ def _join_cluster(ray: Any, address: str) -> None:
             )
     except INIT_ERRORS as error:
         raise ClusterUnavailable(explain_failure(address, error)) from error
+
+
+def _name_cluster(ray: Any) -> str | None:
+    """Return the identifier of the head node, which all dispatchers of a cluster see."""
+    heads = [node for node in ray.nodes() if "node:__internal_head__" in node["Resources"]]
+    return str(heads[0]["NodeID"]) if heads else None
 
 
 def _require_same_program(fingerprints: Sequence[str]) -> None:

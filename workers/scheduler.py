@@ -2,12 +2,12 @@
 
 import logging
 import time
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from typing import Generic, TypeVar
 
 from workers.errors import PackFailed, PackLost
 from workers.fair_share import FairShare
-from workers.job_queue import JobQueue
+from workers.job_queue import JobQueue, SharedWork
 from workers.packing import PACKS_PER_CPU
 from workers.protocol import Executor, JobSource, PackHandle, RunObserver
 
@@ -32,7 +32,9 @@ class Scheduler(Generic[Key]):
     """Driver of an executor: add jobs, then call `run_step` until they have ended.
 
     The caller chooses the key of a job, which must not be in use. `workers.fair_share` decides
-    which job is next. `project_cores` is the largest number of packs of one project in flight.
+    which job is next. A job may come in several parcels: each is added by itself, under a key of
+    its own, and they share one account. `project_cores` is the largest number of packs of one
+    project in flight.
     `compile_seconds` is the time in which workers compiled kernels so far.
     """
 
@@ -46,14 +48,22 @@ class Scheduler(Generic[Key]):
         self.compile_seconds = 0.0
         self._executor = executor
         self._grace, self._project_cores = grace_seconds, project_cores
-        self._shares: FairShare[Key] = FairShare()
+        self._shares: FairShare[Hashable] = FairShare()
         self._jobs: dict[Key, JobQueue] = {}
+        self._accounts: dict[Key, Hashable] = {}
+        self._shared: dict[Hashable, SharedWork] = {}  # by account
         self._stopped: dict[Key, float] = {}  # time of the stop request; inf once forced
 
     @property
     def is_saturated(self) -> bool:
         """Whether every core has a pack."""
         return self._n_in_flight >= self._executor.slots
+
+    def count_wanted_cores(self) -> int | None:
+        """Count the cores that have work; None if runs wait, so that there is work for any."""
+        if any(work.n_waiting for work in self._jobs.values()):
+            return None
+        return self._n_in_flight
 
     def add_job(
         self,
@@ -63,11 +73,15 @@ class Scheduler(Generic[Key]):
         *,
         priority: int = 0,
         project: str = "",
+        account: Hashable | None = None,
     ) -> None:
-        """Add a job."""
+        """Add a job, or a parcel of the job that has this `account`."""
         assert job not in self._jobs
-        self._jobs[job] = JobQueue(source, observer, self._executor)
-        self._shares.open_account(job, priority=priority, project=project)
+        account = self._accounts[job] = job if account is None else account
+        if account not in self._shared:
+            self._shared[account] = SharedWork()
+            self._shares.open_account(account, priority=priority, project=project)
+        self._jobs[job] = JobQueue(source, observer, self._executor, self._shared[account])
 
     def run_step(self, timeout: float) -> tuple[Key, ...]:
         """Send packs, wait at most `timeout` seconds, collect; return the jobs that ended.
@@ -85,10 +99,16 @@ class Scheduler(Generic[Key]):
         self._executor.check_cluster_alive()
         ended = tuple(job for job, work in self._jobs.items() if work.is_done)
         for job in ended:
-            del self._jobs[job]
-            self._shares.close_account(job)
-            self._stopped.pop(job, None)
+            self._remove_job(job)
         return ended
+
+    def _remove_job(self, job: Key) -> None:
+        self._jobs.pop(job).leave()
+        self._stopped.pop(job, None)
+        account = self._accounts.pop(job)
+        if not self._shared[account].queues:
+            del self._shared[account]
+            self._shares.close_account(account)
 
     def stop_jobs(self, jobs: Iterable[Key] | None = None) -> None:
         """Stop jobs (all if not given): soft now, by force after the grace period."""
@@ -108,7 +128,7 @@ class Scheduler(Generic[Key]):
             chosen = self._choose_job(deadline)
             if chosen is None:
                 return
-            self._shares.record_pack(chosen)
+            self._shares.record_pack(self._accounts[chosen])
             self._jobs[chosen].send_next_pack(self._count_idle_cores(chosen))
 
     def _choose_job(self, deadline: float) -> Key | None:
@@ -117,40 +137,48 @@ class Scheduler(Generic[Key]):
         If all cores are busy (`is_saturated`), a job with packs in flight keeps its turn. Otherwise
         its next slice would wait behind a pack of another job.
         """
-        active = {job: work for job, work in self._jobs.items() if job not in self._stopped}
+        active: dict[Hashable, list[Key]] = {}
+        for job in self._jobs:
+            if job not in self._stopped:
+                active.setdefault(self._accounts[job], []).append(job)
         wanted = max(
             MIN_PREFETCH_RUNS, PREFETCH_RUNS_PER_CORE * self._executor.slots // max(len(active), 1)
         )
-        for job in self._shares.order_jobs(
-            {job: len(work.in_flight) for job, work in active.items()}
-        ):
-            if not self._has_project_core(job):
+        in_flight = self._count_in_flight()
+        for account in self._shares.order_jobs({key: in_flight[key] for key in active}):
+            if not self._has_project_core(account, in_flight):
                 continue
-            if active[job].read_ahead(wanted, deadline):
-                return job
-            if active[job].in_flight and self.is_saturated:
+            for job in active[account]:
+                if self._jobs[job].read_ahead(wanted, deadline):
+                    return job
+            if in_flight[account] and self.is_saturated:
                 return None
         return None
 
-    def _has_project_core(self, job: Key) -> bool:
+    def _count_in_flight(self) -> dict[Hashable, int]:
+        """Count the packs in flight of each account."""
+        counts: dict[Hashable, int] = dict.fromkeys(self._shared, 0)
+        for job, work in self._jobs.items():
+            counts[self._accounts[job]] += len(work.in_flight)
+        return counts
+
+    def _has_project_core(self, account: Hashable, in_flight: Mapping[Hashable, int]) -> bool:
         if self._project_cores is None:
             return True
-        project = self._shares.get_project(job)
-        in_flight = (
-            len(work.in_flight)
-            for other, work in self._jobs.items()
-            if self._shares.get_project(other) == project
+        project = self._shares.get_project(account)
+        of_project = (
+            count for key, count in in_flight.items() if self._shares.get_project(key) == project
         )
-        return sum(in_flight) < self._project_cores
+        return sum(of_project) < self._project_cores
 
     def _count_idle_cores(self, chosen: Key) -> int:
         """Count cores that one run of this job may take in addition, without delaying others."""
-        rank = self._shares.compute_rank(chosen)
-        taken = 0
-        for job, work in self._jobs.items():
-            if self._shares.compute_rank(job) <= rank:
-                taken += len(work.in_flight)
-                if job != chosen and work.has_waiting_runs:
+        own = self._accounts[chosen]
+        rank, taken = self._shares.compute_rank(own), 0
+        for account, count in self._count_in_flight().items():
+            if self._shares.compute_rank(account) <= rank:
+                taken += count
+                if account != own and self._shared[account].count_waiting():
                     return 0
         return self._executor.slots - taken
 
@@ -166,7 +194,9 @@ class Scheduler(Generic[Key]):
         if owner is None:  # its job has ended
             _log.warning("a pack of no job came back")
             return
-        self._shares.charge_seconds(owner, sum(result.seconds for result in pack.results))
+        self._shares.charge_seconds(
+            self._accounts[owner], sum(result.seconds for result in pack.results)
+        )
         if owner in self._stopped:
             del self._jobs[owner].in_flight[handle]
         else:

@@ -13,7 +13,7 @@ from benchmarks.breaking.stand import Stand
 from service.core.states import JobState
 from service.repositories.history import unpack_history, unpack_migrants
 from service.storage.retry import TRANSIENT_ERRORS
-from service.storage.tables import Event, Job, MigrationLog, Run, RunHistory
+from service.storage.tables import Event, Job, MigrationLog, Parcel, Run, RunHistory
 
 CLOCKED = ("seconds", "job", "run")
 """Fields of a summary that tell of time and place, not of the result."""
@@ -167,5 +167,5 @@ def count_steps(stand: Stand, jobs: list[str]) -> int | None:
 def list_owners(stand: Stand) -> set[str]:
     """Dispatchers that hold a lease."""
     with stand.database.read_session() as session:
-        held = select(Job.lease_owner).where(Job.state == JobState.RUNNING)
+        held = select(Parcel.lease_owner).where(Parcel.lease_owner.is_not(None))
         return {str(owner) for owner in session.scalars(held)}

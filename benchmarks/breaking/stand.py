@@ -39,6 +39,8 @@ class Stand:
         PostgreSQL; by default SQLite in the folder.
     lease_seconds : float
         Length of the leases of its dispatchers.
+    has_second : bool
+        Whether another supervised dispatcher works beside that of the service.
     environment : mapping
         Further variables for all its processes.
     working_folder : Path, optional
@@ -52,6 +54,7 @@ class Stand:
         database_url: str | None = None,
         cpus: int = 2,
         lease_seconds: float = 10.0,
+        has_second: bool = False,
         environment: Mapping[str, str] | None = None,
         working_folder: Path | None = None,
     ) -> None:
@@ -59,7 +62,7 @@ class Stand:
         self.temporary = Path(tempfile.mkdtemp(prefix=""))  # short: Ray puts sockets there
         self.folder, self.port = folder, find_free_port()
         self._working_folder = working_folder
-        self.lease_seconds = lease_seconds
+        self.lease_seconds, self._has_second = lease_seconds, has_second
         self.family = Family(mark := secrets.token_hex(8))
         address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
         self.environment = {
@@ -79,6 +82,7 @@ class Stand:
         self.database = Database(database_url or make_sqlite_url(folder / "lagid.db"))
         self.client = Client(self.url)
         self.web: subprocess.Popen[bytes] | None = None
+        self._second: subprocess.Popen[bytes] | None = None
         self._before = set(shared_memory())
         self._ending, self._down = threading.Event(), threading.Event()
         self._caretaker = threading.Thread(target=self._take_care, daemon=True)
@@ -169,9 +173,15 @@ class Stand:
         return leftovers + [f"object {path.name}" for path in unfinished.glob("*")]
 
     def _spawn(self) -> None:
-        with (self.folder / "serve.log").open("ab") as log:
-            self.web = subprocess.Popen(
-                build_child_command("service.cli.main", "serve"),
+        if self.web is None or self.web.poll() is not None:
+            self.web = self._spawn_command("serve")
+        if self._has_second and (self._second is None or self._second.poll() is not None):
+            self._second = self._spawn_command("dispatcher")
+
+    def _spawn_command(self, name: str) -> "subprocess.Popen[bytes]":
+        with (self.folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                build_child_command("service.cli.main", name),
                 env=self.environment,
                 cwd=self._working_folder,
                 stdin=subprocess.DEVNULL,
@@ -181,15 +191,17 @@ class Stand:
             )
 
     def _end_web(self) -> None:
-        if self.web is not None and self.web.poll() is None:
-            self.web.send_signal(signal.SIGTERM)
+        both = [child for child in (self.web, self._second) if child is not None]
+        running = [child for child in both if child.poll() is None]
+        for child in running:
+            child.send_signal(signal.SIGTERM)
+        for child in running:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.web.wait(20.0)
+                child.wait(20.0)
 
     def _take_care(self) -> None:
         while not self._ending.wait(RESTART_SECONDS):
-            has_ended = self.web is not None and self.web.poll() is not None
-            if has_ended and not self._down.is_set():
+            if not self._down.is_set():
                 self._spawn()
 
 

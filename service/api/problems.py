@@ -18,6 +18,7 @@ from service.core.errors import (
     Conflict,
     FieldError,
     InvalidRequest,
+    InvalidUpload,
     NotFound,
     ServiceError,
     Unavailable,
@@ -30,7 +31,7 @@ from service.core.text_checks import LONE_SURROGATE
 from service.core.validation import describe_error, explain_errors, find_body_type
 from service.storage.errors import InvalidCursor, StorageError
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
-from sysid.core.errors import SysidError
+from sysid.core.errors import SysidError, UnreadableFile
 
 log = logging.getLogger(__name__)
 
@@ -186,6 +187,8 @@ def _handle_unicode_error(request: Request, error: Exception) -> Response:
 
 def _handle_sysid_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, SysidError)
+    if isinstance(error, UnreadableFile):
+        return _handle_service_error(request, InvalidUpload(error))
     return _handle_service_error(request, InvalidRequest(to_field_errors(error)))
 
 

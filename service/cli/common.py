@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import IO, TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -23,6 +23,7 @@ from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import format_value
 from sysid.core.errors import join_pointer, split_pointer
+from sysid.core.files import open_replacement
 from sysid.core.text import DASH, plain_estimate
 
 if TYPE_CHECKING:
@@ -373,18 +374,35 @@ def read_model(name: str) -> Any:
 
 def write_file(path: Path, text: str) -> None:
     """Write a file that the user names; end the command if this fails."""
+    with replace_file(path) as stream:
+        stream.write(text.encode())
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file that takes the place of one that the user names, which stays whole till then.
+
+    End the command if it cannot be written.
+    """
     try:
-        path.write_text(text, encoding="utf-8")
+        with open_replacement(path) as stream:
+            yield stream
     except OSError as error:
         fail(f"{path} cannot be written: {error.strerror}")
 
 
-def protect_file(path: Path, force: bool, option: str = "--output") -> None:
+def protect_file(path: Path | None, force: bool, option: str = "--output") -> None:
     """Ask before a file is overwritten; end the command where nobody can answer.
 
-    `option` names another file.
+    This is done before the work, so that nothing is computed in vain. `option` names the file.
     """
-    if not force and path.exists():
+    if path is None:
+        return
+    if path.is_dir():
+        fail_usage(f"{option} {path}: this is a folder; name a file")
+    if not path.parent.is_dir():
+        fail_usage(f"{option} {path}: there is no folder {path.parent}")
+    if not force and path.is_file():
         ask_to_go_on(
             f"{path} exists. Overwrite it?",
             f"{path} exists, and nothing was written. Add --force, or name another by {option}",
@@ -443,11 +461,6 @@ def format_decimals(value: float | None) -> str | None:
 
 INVALID_STATUS = 422
 UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
-READ_OPTIONS = (
-    (re.compile(r"\bsample_time\b"), "--sample-time"),
-    (re.compile(r"\b(in|with|of) segments\b"), r"\1 --segments"),
-)
-"""Words of the reader of files, which are options here."""
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
@@ -456,13 +469,6 @@ SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
-
-
-def name_read_options(text: str) -> str:
-    """Name the options of reading a file as the user types them here."""
-    for pattern, option in READ_OPTIONS:
-        text = pattern.sub(option, text)
-    return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,13 +483,10 @@ class FieldOrigins:
         the pointer, which is a place in a file.
     rest : str
         The same for all other fields; in ``--set {}`` the braces stand for the whole path.
-    rewrite : callable
-        Changes the text of a fault, such as names of options in it.
     """
 
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
-    rewrite: Callable[[str], str] = str
 
     def locate(self, pointer: str) -> str:
         """Return the option or file where the field of a pointer was typed."""
@@ -516,7 +519,9 @@ class FieldOrigins:
         detail = fault.detail
         if not self.rest.endswith("…"):
             detail = POINTER_PATTERN.sub(lambda match: self.locate(match[0]), detail)
-        detail = self.rewrite(detail)
+        if fault.option is not None:  # the detail ends with advice that names it
+            before, _, after = detail.rpartition(fault.option)
+            detail = before + UPLOAD_OPTIONS.get(f"?{fault.option}", fault.option) + after
         return f"{origin}{column}: {detail}" if origin else detail
 
 
@@ -527,7 +532,7 @@ def file_origins(path: Path, options: Mapping[str, str] | None = None) -> FieldO
 
 def upload_origins(path: Path) -> FieldOrigins:
     """Return the origins of an upload: options, and the file for all faults in it."""
-    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path), rewrite=name_read_options)
+    return FieldOrigins(UPLOAD_OPTIONS, rest=name_file(path))
 
 
 @contextmanager
@@ -544,7 +549,10 @@ def report_faults(origins: FieldOrigins) -> Iterator[None]:
         fail(
             origins.describe_faults(
                 FieldError(
-                    str(entry.get("pointer") or ""), str(entry.get("detail")), entry.get("column")
+                    str(entry.get("pointer") or ""),
+                    str(entry.get("detail")),
+                    entry.get("column"),
+                    entry.get("option"),
                 )
                 for entry in entries
             )

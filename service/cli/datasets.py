@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -38,6 +38,7 @@ from service.cli.common import (
     read_document,
     read_file,
     read_object,
+    replace_file,
     report_faults,
     show_examples,
     upload_origins,
@@ -155,13 +156,8 @@ def download_dataset(
             return
         target = file or Path(f"{found['name'].replace('/', '_')}.{format}")
         protect_file(target, force)
-        part = target.with_name(f"{target.name}.part")
-        try:
-            with part.open("wb") as sink:
-                _write_pieces(client.download(found["id"], format), sink)
-            part.replace(target)
-        except OSError as error:
-            fail(f"{target} cannot be written: {error.strerror}")
+        with replace_file(target) as sink:
+            _write_pieces(client.download(found["id"], format), sink)
     print_line(str(target))
 
 
@@ -254,7 +250,7 @@ def _find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
     return found[0]
 
 
-def _write_pieces(pieces: Iterable[bytes], sink: BinaryIO) -> None:
+def _write_pieces(pieces: Iterable[bytes], sink: IO[bytes]) -> None:
     for piece in pieces:
         sink.write(piece)
     sink.flush()

@@ -30,7 +30,6 @@ from service.cli.common import (
     fail_usage,
     format_estimate,
     name_file,
-    name_read_options,
     out,
     parse_channels,
     print_json,
@@ -39,9 +38,11 @@ from service.cli.common import (
     read_file,
     split_names,
     split_setting_path,
+    upload_origins,
     write_file,
 )
-from sysid.core.errors import suggest_name
+from service.core.errors import to_field_errors
+from sysid.core.errors import UnreadableFile, suggest_name
 from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
@@ -161,16 +162,17 @@ def identify(
         changes.append("posterior=true")
     if report is not None:
         _check_report(report, force)
+    protect_file(output, force)
     unchecked = _build_body(data, model, changes, parse_channels(channels))
     _refuse_same_file(data, validation)
     reading = FileOptions(sample_time, tuple(split_names(segments)))
-    recording = read_recording(data, reading)
+    recording = read_input_file(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
     records = _extract_records(recording, Path(name_file(data)), loaded, body)
     validation_records = []
     if validation is not None:
         validation_records = _extract_records(
-            read_recording(validation, reading), validation, loaded, body
+            read_input_file(validation, reading), validation, loaded, body
         )
     from sysid.core.jit import announce_compilation, read_clock
 
@@ -190,10 +192,6 @@ def _check_report(path: Path, force: bool) -> None:
     missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
     if missing:
         fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
-    if path.is_dir():
-        fail_usage(f"--report {path}: this is a folder; name a file")
-    if not path.parent.is_dir():
-        fail_usage(f"--report {path}: there is no folder {path.parent}")
     protect_file(path, force, "--report")
 
 
@@ -298,9 +296,8 @@ def _refuse_same_file(data: Path, validation: Path | None) -> None:
         )
 
 
-def read_recording(path: Path, reading: FileOptions) -> "Recording":
+def read_input_file(path: Path, reading: FileOptions) -> "Recording":
     """Read a recording from a file and print notes about it on stderr."""
-    from service.formats.errors import InvalidUpload
     from service.formats.limits import DEFAULT_LIMITS
     from service.formats.recordings import read_with_notes
     from sysid.models.units import list_unknown_unit_warnings
@@ -313,8 +310,8 @@ def read_recording(path: Path, reading: FileOptions) -> "Recording":
             segments=reading.segments,
             limits=DEFAULT_LIMITS,
         )
-    except InvalidUpload as error:
-        fail(f"{name_file(path)}: {name_read_options(error.detail)}")
+    except UnreadableFile as error:
+        fail(upload_origins(path).describe_faults(to_field_errors(error)))
     for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import SERVER_PANEL, Key, Quiet, err, fail, out
+from service.cli.common import (
+    SERVER_PANEL,
+    Force,
+    Key,
+    Quiet,
+    err,
+    out,
+    protect_file,
+    write_file,
+)
 from service.core.extras import check_extra
 
 if TYPE_CHECKING:
@@ -35,6 +44,7 @@ def reproduce_paper(
         ),
     ] = None,
     key: Key = None,
+    force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Reproduce tables and figures of the paper that the method is from, by real jobs."""
@@ -45,8 +55,7 @@ def reproduce_paper(
     from service.paper.study import choose_parts, conduct_study
 
     names = choose_parts(only)
-    if not output.parent.is_dir():
-        fail(f"--output: there is no folder {output.parent}", 2)
+    protect_file(output, force)
     start = time.monotonic()
     sections = []
     with _client(url, key) as client:
@@ -54,7 +63,7 @@ def reproduce_paper(
         for section in conduct_study(bench, names):
             sections.append(section)
             out.print(to_markdown(section), markup=False, soft_wrap=True)
-    output.write_text(render_report(sections, quick=quick), encoding="utf-8")
+    write_file(output, render_report(sections, quick=quick))
     out.print(f"report {output.resolve()} ({time.monotonic() - start:.0f} s)", soft_wrap=True)
 
 

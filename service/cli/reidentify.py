@@ -15,6 +15,7 @@ from service.cli.common import (
     OUTPUT_PANEL,
     AsJson,
     FieldOrigins,
+    Force,
     Key,
     Limit,
     ModelName,
@@ -35,6 +36,7 @@ from service.cli.common import (
     print_json,
     print_listing,
     print_table,
+    protect_file,
     read_model,
     report_faults,
     show_examples,
@@ -112,6 +114,7 @@ def reidentify(
     accept: Accept = None,
     accept_run: AcceptRun = None,
     output: TrendFile = None,
+    force: Force = False,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
@@ -121,6 +124,7 @@ def reidentify(
 
     Each run starts at the reference, or at the result of its neighbour.
     """
+    protect_file(output, force)
     batch = [_parse_experiments(text) for text in experiments]
     chosen = _choose_label_value([x for x, _ in batch], label, accept, accept_run)
     body: dict[str, Any] = {

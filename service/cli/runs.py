@@ -15,6 +15,7 @@ from service.cli.common import (
     DOCUMENT_HELP,
     AsJson,
     FieldOrigins,
+    Force,
     Key,
     Quiet,
     Url,
@@ -27,6 +28,7 @@ from service.cli.common import (
     print_json,
     print_note,
     print_table,
+    protect_file,
     read_object,
     report_faults,
     show_examples,
@@ -321,6 +323,7 @@ def export_model(
             min=1, max=20, help="Order of the Padé approximation of dead times (control)."
         ),
     ] = 3,
+    force: Force = False,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
@@ -328,6 +331,7 @@ def export_model(
     """Write the identified model of a run for another program."""
     if as_json and format not in (None, "json"):
         fail_usage(f"--json prints the JSON document; leave out --format {format}")
+    protect_file(output, force)
     with connect_client(url, key) as client, report_faults(EXPORT_ORIGINS):
         text = client.export(run, format or "json", pade_order)
     if output is None or as_json:

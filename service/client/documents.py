@@ -529,6 +529,8 @@ class FaultDocument(TypedDict):
     """what was wrong, what was found, and what would be right"""
     column: NotRequired[int | None]
     """column inside the text of the field, from 1; for equations"""
+    option: NotRequired[str | None]
+    """option that the detail advises at its end, such as `segments`; for files"""
 
 
 class FigureDocument(TypedDict):

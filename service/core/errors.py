@@ -13,6 +13,7 @@
     - UnsatisfiableRange     416  a byte range outside the content
     - MisdirectedRequest     421  the Host header names another server
     - InvalidRequest         422  the body or a query value is invalid; lists every fault
+        - InvalidUpload           an uploaded file cannot be used
     - QuotaExceeded          429  the project has reached its limit of unfinished work
         - BudgetExceeded          or its limit of stored bytes or of evaluations in a day
     - Unavailable            503  a component of the service is down
@@ -29,7 +30,14 @@ from dataclasses import dataclass
 from math import ceil
 from typing import Any, ClassVar
 
-from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
+from sysid.core.errors import (
+    InvalidBounds,
+    InvalidModel,
+    InvalidSettings,
+    SysidError,
+    UnknownModel,
+    UnreadableFile,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +53,14 @@ class FieldError:
         What was wrong, which value was received, what would be right.
     column : int or None
         Column (from 1) inside the text of the field, for equations.
+    option : str or None
+        Option of the request that the detail advises at its end, such as ``sample_time``.
     """
 
     pointer: str
     detail: str
     column: int | None = None
+    option: str | None = None
 
     def __str__(self) -> str:
         return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
@@ -57,7 +68,8 @@ class FieldError:
     def to_dict(self) -> dict[str, Any]:
         """Return the fault as an entry of a problem document's ``errors``."""
         entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
-        return entry if self.column is None else {**entry, "column": self.column}
+        others = {"column": self.column, "option": self.option}
+        return entry | {name: value for name, value in others.items() if value is not None}
 
 
 class ServiceError(Exception):
@@ -194,6 +206,16 @@ class InvalidRequest(ServiceError):
         return cls((FieldError(pointer, detail),))
 
 
+class InvalidUpload(InvalidRequest):
+    """An uploaded file cannot be used."""
+
+    kind, title = "invalid-upload", "The file cannot be used"
+
+    def __init__(self, error: UnreadableFile) -> None:
+        super().__init__(to_field_errors(error))
+        self.detail = error.detail
+
+
 class QuotaExceeded(ServiceError):
     """The project has reached its limit of queued and running work."""
 
@@ -265,6 +287,9 @@ def to_field_errors(error: SysidError) -> list[FieldError]:
             return [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
         case InvalidSettings():
             return [FieldError(error.pointer, error.detail)]
+        case UnreadableFile():
+            option = error.advice and error.advice.option
+            return [FieldError(error.pointer, error.detail, option=option or None)]
         case InvalidBounds():
             return [FieldError(f"/parameters/{error.name}", str(error))]
         case UnknownModel():

@@ -101,7 +101,8 @@ class Settings(BaseSettings):
     """Head of the Ray cluster that the dispatcher joins, `host:port` or `auto`. Without it: a local
     Ray."""
     cpus: int | None = Field(default=None, ge=1)
-    """Workers of the local Ray, or cores that are used of a joined one. Without it: all cores."""
+    """Workers of the local Ray, or cores that are used of a joined one at most. Without it: all
+    cores."""
     worker_memory_mb: int | None = Field(default=None, ge=256)
     """Memory that a worker may use for its runs, in MiB. Without it: its share of 80 % of the
     machine."""

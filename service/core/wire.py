@@ -99,6 +99,10 @@ class FaultOut(Answer):
     column: int | None = Field(
         default=None, description="column inside the text of the field, from 1; for equations"
     )
+    option: str | None = Field(
+        default=None,
+        description="option that the detail advises at its end, such as `segments`; for files",
+    )
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]

@@ -94,7 +94,7 @@ def add_upload(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file cannot be used, with the position of the fault.
     """
     read_as = {

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from threading import Lock
 
 from service.datasets.signal_channels import SignalChannels
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.data.records import Record, Recording
@@ -49,7 +49,7 @@ def load_recording(store: ObjectStore, sha256: str) -> Recording:
     """
     recording = _recording_cache.get(sha256)
     if recording is None:
-        recording = read_recording(store.get_bytes(sha256))
+        recording = read_mcap(store.get_bytes(sha256))
         _recording_cache.put(sha256, recording)
     return recording
 

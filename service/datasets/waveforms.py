@@ -147,7 +147,7 @@ class InputSignals:
             raise InvalidRequest.from_fault(f"{pointer}/channel", str(error)) from None
         if row.id not in self.parents:
             self.parents.append(row.id)
-        return channel
+        return replace(channel, started_at=None)  # a simulation has times of its own
 
 
 def choose_hold(signal: RunInputIn) -> Hold:

@@ -22,15 +22,14 @@ from service.core.documents import to_finite
 from service.core.errors import ServiceError
 from service.core.json_pointer import build_run_body
 from service.dispatch.background import DocumentMaker
-from service.dispatch.job_runs import JobRuns
-from service.queue.leases import Claim
+from service.dispatch.job_parts import JobParts
 from service.repositories.datasets import DatasetRepository
 from service.repositories.summaries import find_quietest_run
 from service.storage.columns import Document
 from service.storage.errors import StorageError
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
-from service.storage.tables import Job, Run
+from service.storage.tables import Run
 from service.sweeps.groups import GroupKey, SweepGroups
 from service.sweeps.true_parameters import find_true_parameters
 from sysid.core.errors import SysidError
@@ -65,7 +64,7 @@ MAX_WORK = 10_000_000
 """Samples to simulate for the bounds of one job: below a second for most models."""
 
 
-def build_bounds_maker(database: Database, claim: Claim, source: JobRuns) -> DocumentMaker | None:
+def build_bounds_maker(database: Database, parts: JobParts) -> DocumentMaker | None:
     """Return the steps that build the bounds document of a job; None for a job without noise.
 
     All runs of the job must have ended, and their results must be written. Each step handles one
@@ -79,18 +78,18 @@ def build_bounds_maker(database: Database, claim: Claim, source: JobRuns) -> Doc
     - ``rms``: that of the response;
     - ``note``: why something is missing, or nothing.
     """
-    spec = claim.job.spec
+    spec = parts.job.spec
     axes = spec["sweep"]["axes"]
     if not spec["noise"]["sigma"] and not any(axis["path"].startswith("/noise") for axis in axes):
         return None
-    return _BoundsMaker(database, claim.job, source).iterate_steps
+    return _BoundsMaker(database, parts).iterate_steps
 
 
 class _BoundsMaker:
     """Computes the bounds of one job within a limit of work."""
 
-    def __init__(self, database: Database, job: Job, source: JobRuns) -> None:
-        self._database, self._job, self._source = database, job, source
+    def __init__(self, database: Database, parts: JobParts) -> None:
+        self._database, self._job, self._parts = database, parts.job, parts
         self._left = MAX_WORK
 
     def iterate_steps(self) -> Iterator[Document | None]:
@@ -122,7 +121,7 @@ class _BoundsMaker:
             entry["reference"] = retry_transient(partial(self._read_reference, cell))
             if entry["reference"] is None:
                 return {**entry, "note": "no run succeeded, so there is no reference for errors"}
-            spec = self._source.build_specification(cell).problem
+            spec = self._parts.build_specification(cell).problem
             return {**entry, **self._compute_bounds(spec, entry["reference"]["values"])}
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no Cramér–Rao bound: %s", self._job.id, error)
@@ -151,7 +150,7 @@ class _BoundsMaker:
         model = parse_model(spec.model)
         if model.rule is not None:
             return {"note": "no Cramér–Rao bound: the model selects its terms from the data"}
-        records = {key: self._source.load_records(key) for key in spec.record_keys}
+        records = {key: self._parts.load_records(key) for key in spec.record_keys}
         problem = Problem.build(
             model,
             prepare_run_records(replace(spec, noise=Noise()), records).estimation,

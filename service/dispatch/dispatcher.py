@@ -1,4 +1,4 @@
-"""Dispatcher: claims jobs by lease, drives the workers, and writes results.
+"""Dispatcher: claims parcels of jobs by lease, drives the workers, and writes results.
 
 It is a process of its own (`service.dispatch.process`). Any number of dispatchers share one queue.
 """
@@ -20,14 +20,18 @@ from service.core import metrics
 from service.core.errors import Misconfigured
 from service.core.logs import bind_ids
 from service.core.settings import Settings
-from service.dispatch.background import BackgroundJobs, DocumentMaker
+from service.dispatch.background import BackgroundJobs
+from service.dispatch.held_jobs import HeldJob, choose_first_size
 from service.dispatch.job_end import build_end_maker
+from service.dispatch.job_parts import JobParts
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.leases import HeldLeases
-from service.dispatch.recorder import RunRecorder
+from service.dispatch.overlap import Overlap
+from service.dispatch.recorder import JobSpeed, RunRecorder
 from service.dispatch.start import DispatcherStart
 from service.dispatch.supervisor import RESTART_EXIT_CODE, SUPERVISED_VARIABLE
 from service.queue.admission import Admission
+from service.queue.dispatchers import CLUSTER_KEY
 from service.queue.leases import Claim, Lease
 from service.queue.notifications import open_notifier
 from service.storage.errors import LeaseLost, StorageError
@@ -35,6 +39,7 @@ from service.storage.objects import ObjectStore, open_store
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from sysid.kernels.compilation import get_compile_seconds
+from workers.core_sharing import SharedCluster, divide_cores
 from workers.errors import ClusterLost, WorkersError
 from workers.local_ray import LocalRay
 from workers.protocol import Executor
@@ -69,19 +74,20 @@ class Dispatcher:
         *,
         project_cores: int | None = None,
         keeps_signals: bool = False,
+        cluster: SharedCluster | None = None,
     ) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._executor = database, store, executor
-        self._keeps_signals = keeps_signals
+        self._keeps_signals, self._cluster = keeps_signals, cluster
         self._woken = threading.Event()
         self._woken.set()  # earlier submissions sent no notification
         self._leases = leases
         # Keyed by lease: a job may return as a new attempt while packs of the old one still run.
         self._scheduler: Scheduler[Lease] = Scheduler(executor, project_cores=project_cores)
+        self._overlap = Overlap(database)
         self._recorders: dict[Lease, RunRecorder] = {}
-        self._priorities: dict[Lease, int] = {}
+        self._jobs: dict[str, HeldJob] = {}
         self._is_filling = False
-        self._last_steps: dict[Lease, DocumentMaker] = {}  # taken when the runs of a job end
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
         self._checked_at = 0.0
@@ -97,7 +103,10 @@ class Dispatcher:
         ClusterLost
             If the workers are lost. The jobs were released as lost.
         """
-        self._leases.start_heartbeat({"cpus": self._executor.slots, "pid": os.getpid()})
+        details: dict[str, object] = {"cpus": self._executor.slots, "pid": os.getpid()}
+        if self._cluster is not None:
+            details[CLUSTER_KEY] = self._cluster.identity
+        self._leases.start_heartbeat(details)
         metrics.cores.set_function(lambda: self._executor.slots)
         _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
         self._listener.start()
@@ -119,6 +128,7 @@ class Dispatcher:
             self._woken.clear()
             self._checked_at = time.monotonic()
             self._check_queue()
+        self._share_cores()
         has_time = self._recorders and not self._is_filling
         for lease in self._scheduler.run_step(STEP_SECONDS if has_time else 0.0):
             self._end_runs(lease)
@@ -131,9 +141,20 @@ class Dispatcher:
                 continue  # the pending heartbeat, or the next one, decides
             try:
                 with bind_lease(recorder.lease):
-                    retry_transient(recorder.write_due)
+                    recorder.write_due()
             except LeaseLost as error:
-                self._drop_lost_job(recorder, error)
+                self._drop_lost_parcel(recorder, error)
+
+    def _share_cores(self) -> None:
+        """Take the part of a shared cluster that this dispatcher has, by what others told."""
+        if self._cluster is None:
+            return
+        n_cores, owner = self._cluster.n_cores, self._leases.owner
+        wanted = self._scheduler.count_wanted_cores()
+        self._leases.wanted_cores = n_cores if wanted is None else wanted
+        # What the others do not want is free for this one, whatever it wants now.
+        shares = divide_cores(n_cores, {**self._leases.cores_of_others, owner: n_cores})
+        self._cluster.limit_slots(shares[owner])
 
     def _check_queue(self) -> None:
         admission = self._build_admission()
@@ -141,22 +162,43 @@ class Dispatcher:
         for recorder in self._list_held_recorders():
             lease = recorder.lease
             if self._leases.is_lost(lease):
-                self._drop_lost_job(recorder, LeaseLost(lease.job_id, lease.attempt))
+                self._drop_lost_parcel(recorder, LeaseLost(lease.job_id, lease.attempt))
             elif lease.job_id in signals.jobs_to_cancel:
                 recorder.is_stopped = True
         self._is_filling = False
-        if signals.has_waiting_job and len(self._recorders) < 2 * MAX_JOBS:
-            claim = retry_transient(partial(self._leases.claim_job, admission))
+        for job in signals.jobs_to_extend & self._jobs.keys():
+            if self._jobs[job].wants_parcel:
+                self._claim_next(job)
+        if signals.has_waiting_job and len(self._jobs) < 2 * MAX_JOBS:
+            choose = partial(choose_first_size, n_cores=self._executor.slots)
+            claim = retry_transient(partial(self._leases.claim_job, admission, choose_size=choose))
             if claim is not None:
-                self._take_job(claim)
+                self._take_parcel(claim)
                 self._is_filling = True  # one job per round, so that other dispatchers get some
                 self._woken.set()
 
+    def _claim_next(self, job: str) -> bool:
+        """Claim another parcel of a job that is held; return whether there was one."""
+        held = self._jobs[job]
+        n_sharing = self._leases.n_alive
+        claim = retry_transient(
+            partial(
+                self._leases.claim_job,
+                only=job,
+                choose_size=partial(held.choose_size, n_sharing=n_sharing),
+            )
+        )
+        if claim is None:
+            return False
+        self._take_parcel(claim)
+        self._woken.set()  # it may be read out before the next look at the queue
+        return True
+
     def _build_admission(self) -> Admission | None:
         """Return which jobs may still be claimed; None admits every job."""
-        if len(self._recorders) < MAX_JOBS:
+        if len(self._jobs) < MAX_JOBS:
             return None
-        return Admission(SHORT_RUNS, min(self._priorities.values()))
+        return Admission(SHORT_RUNS, min(held.job.priority for held in self._jobs.values()))
 
     def _list_held_recorders(self) -> list[RunRecorder]:
         return [recorder for lease, recorder in self._recorders.items() if lease not in self._lost]
@@ -168,44 +210,80 @@ class Dispatcher:
                     self._woken.set()
         self._woken.set()
 
-    def _take_job(self, claim: Claim) -> None:
-        source = JobRuns(self._database, claim, self._store, keeps_signals=self._keeps_signals)
-        last_steps = retry_transient(partial(build_end_maker, self._database, claim, source))
+    def _take_parcel(self, claim: Claim) -> None:
+        job = claim.job
+        held = self._jobs.get(job.id)
+        if held is None:
+            parts = JobParts(self._database, job, self._store, keeps_signals=self._keeps_signals)
+            held = self._jobs[job.id] = HeldJob(parts, JobSpeed(time.monotonic(), job.n_done))
+        else:
+            held.complete_row(job)
+        source = JobRuns(
+            self._database,
+            claim,
+            self._store,
+            parts=held.parts,
+            run_beside=self._overlap.run_beside,
+        )
         recorder = retry_transient(
             partial(
-                RunRecorder, self._database, claim, self._store, source.encoder, source.note_end
+                RunRecorder,
+                self._database,
+                claim,
+                self._store,
+                held.parts.encoder,
+                held.parts.warm.record_end,
+                run_beside=self._overlap.run_beside,
+                speed=held.speed,
             )
         )
-        if last_steps is not None:
-            self._last_steps[claim.lease] = last_steps
+        held.add_parcel(claim, source)
         self._recorders[claim.lease] = recorder
-        job = claim.job
-        self._priorities[claim.lease] = job.priority
         self._scheduler.add_job(
-            claim.lease, source, recorder, priority=job.priority, project=job.project_id
+            claim.lease,
+            source,
+            recorder,
+            priority=job.priority,
+            project=job.project_id,
+            account=job.id,
         )
-        metrics.held_jobs.set(len(self._recorders))
+        metrics.held_jobs.set(len(self._jobs))
+        runs = f"runs {claim.runs.start} to {claim.runs.stop - 1} of {job.n_runs}"
         with bind_lease(claim.lease):
-            _log.info("%s: %d runs, attempt %d", job.id, job.n_runs, claim.lease.attempt)
+            _log.info("%s: %s, attempt %d", job.id, runs, claim.lease.attempt)
 
-    def _drop_lost_job(self, recorder: RunRecorder, error: LeaseLost) -> None:
+    def _drop_lost_parcel(self, recorder: RunRecorder, error: LeaseLost) -> None:
         metrics.lease_losses.labels("owner").inc()
         with bind_lease(recorder.lease):
-            _log.warning("the job is dropped: %s", error)
+            _log.warning("the parcel is dropped: %s", error)
         self._lost.add(recorder.lease)
         self._leases.forget_lease(recorder.lease)
         recorder.is_stopped = True
 
     def _end_runs(self, lease: Lease) -> None:
-        """Handle a job whose runs have ended. Its last steps, if any, are taken before it ends."""
-        recorder, last_steps = self._recorders[lease], self._last_steps.pop(lease, None)
-        if last_steps is None or recorder.is_stopped:
+        """Handle a parcel whose runs have ended. If it is the last one, its job ends after it."""
+        recorder = self._recorders[lease]
+        if recorder.is_stopped or lease in self._lost:
             self._conclude_job(lease)
             return
+        held = self._jobs[lease.job_id]
+        is_whole = held.parcels[lease].has_whole_job
         try:
-            retry_transient(recorder.write_results)
+            if not is_whole and len(held.parcels) == 1:
+                self._claim_next(lease.job_id)  # so that the job does not wait in between
+            if not is_whole and retry_transient(recorder.end_parcel):
+                self._forget_parcel(lease)
+                return
+            last_steps = retry_transient(
+                partial(build_end_maker, self._database, lease, held.parts)
+            )
+            if is_whole and last_steps is not None:
+                retry_transient(recorder.write_results)
         except LeaseLost as error:
-            self._drop_lost_job(recorder, error)
+            self._drop_lost_parcel(recorder, error)
+            self._conclude_job(lease)
+            return
+        if last_steps is None:
             self._conclude_job(lease)
         else:
             self._side_jobs.start_job(lease, last_steps)
@@ -218,17 +296,17 @@ class Dispatcher:
         return [*stopped, *self._side_jobs.list_done()]
 
     def _conclude_job(self, lease: Lease) -> None:
+        """End the job of its last parcel, or a parcel that was cancelled or lost."""
         floors = self._side_jobs.take_result(lease) if lease in self._side_jobs else None
-        recorder = self._recorders.pop(lease)
-        metrics.held_jobs.set(len(self._recorders))
-        del self._priorities[lease]
+        recorder = self._recorders[lease]
+        self._forget_parcel(lease)
         if lease in self._lost:
             self._lost.discard(lease)
             return
         try:
             with bind_lease(lease):
                 retry_transient(
-                    recorder.cancel_job
+                    recorder.cancel_parcel
                     if recorder.is_stopped
                     else partial(recorder.finish_job, floors)
                 )
@@ -236,7 +314,16 @@ class Dispatcher:
         except LeaseLost as error:
             with bind_lease(lease):
                 _log.warning("the end of the job was not written: %s", error)
-        self._leases.forget_lease(lease)
+
+    def _forget_parcel(self, lease: Lease) -> None:
+        del self._recorders[lease]
+        held = self._jobs[lease.job_id]
+        del held.parcels[lease]
+        if not held.parcels:
+            del self._jobs[lease.job_id]
+        metrics.held_jobs.set(len(self._jobs))
+        if lease not in self._lost:
+            self._leases.forget_lease(lease)
 
     def _release_jobs(self, *, lost: bool = False) -> None:
         self._side_jobs.stop()
@@ -244,9 +331,10 @@ class Dispatcher:
             try:
                 retry_transient(recorder.write_all)
             except LeaseLost as error:
-                self._drop_lost_job(recorder, error)
+                self._drop_lost_parcel(recorder, error)
         self._leases.release_all(lost=lost)
         self._leases.stop_heartbeat()
+        self._overlap.close()
         _log.info("stopped")
 
 
@@ -306,6 +394,7 @@ def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStar
             start.leases,
             project_cores=settings.project_cores,
             keeps_signals=settings.keep_signals,
+            cluster=None if executor.identity is None else executor,
         )
         _stop_on_signals(dispatcher.stopping, executor)
         dispatcher.run_until_stopped()

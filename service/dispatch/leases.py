@@ -15,8 +15,13 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.processes import describe_process
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
-from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
-from service.queue.leases import Claim, Lease, LeaseQueue
+from service.queue.dispatchers import (
+    CLUSTER_KEY,
+    LEASE_SECONDS_KEY,
+    DispatcherRepository,
+    count_wanted_cores,
+)
+from service.queue.leases import Claim, Lease, LeaseQueue, SizeRule
 from service.queue.notifications import QueueStatus, read_queue_status
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import Document
@@ -31,12 +36,16 @@ RETRY_SECONDS = 0.5
 
 
 class HeldLeases:
-    """Jobs that this dispatcher may write for.
+    """Parcels of jobs that this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length. It also reaps
     expired leases of any dispatcher. A lease that was not renewed `is_lost`. A forgotten lease is
     no longer renewed, and expires. While a heartbeat waits for the database, the state of a late
     lease is unknown. Nothing should be written under it, but it may still be held.
+
+    The same heartbeat tells for how many cores this dispatcher has work (`wanted_cores`), and reads
+    `n_alive`, the number of living dispatchers, and `cores_of_others`, the cores wanted by those
+    that have joined the same cluster.
 
     Parameters
     ----------
@@ -60,6 +69,10 @@ class HeldLeases:
         self._clock, self._stopwatch = clock, stopwatch
         self._held: dict[Lease, float] = {}  # when each was renewed
         self._has_asked = False  # a claim was sent and not answered
+        self.n_alive = 1
+        self.wanted_cores = 0
+        self.cores_of_others: dict[str, int] = {}
+        self._cluster: str | None = None
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -67,31 +80,50 @@ class HeldLeases:
 
     def start_heartbeat(self, details: dict[str, object]) -> None:
         """Register the dispatcher and start the heartbeat; later calls change what it tells."""
-        description = {
+        description: Document = {
             LEASE_SECONDS_KEY: self._length.total_seconds(),
             **describe_process(),
             **details,
         }
+        self._cluster = description.get(CLUSTER_KEY)
         retry_transient(partial(self._announce_dispatcher, description))
         if not self._thread.is_alive():
             self._thread.start()
 
     def _announce_dispatcher(self, details: Document) -> None:
         with self._database.write_session() as session:
-            DispatcherRepository(session, self._clock).add_dispatcher(self.owner, details)
+            dispatchers = DispatcherRepository(session, self._clock)
+            dispatchers.add_dispatcher(self.owner, details)
+            self._look_at_others(dispatchers)
         reap_jobs(self._database, self._clock)
 
-    def claim_job(self, admission: Admission | None = None) -> Claim | None:
-        """Claim the next job that `admission` lets in, if one waits."""
+    def claim_job(
+        self,
+        admission: Admission | None = None,
+        *,
+        only: str | None = None,
+        choose_size: SizeRule | None = None,
+    ) -> Claim | None:
+        """Claim a parcel of the next job that `admission` lets in, if one waits.
+
+        Jobs of which a parcel is held are left out, unless one is the `only` one that counts.
+        """
         begun = self._stopwatch()
         claim, had_asked = None, self._has_asked
         self._has_asked = True  # a claim may succeed even if its answer is lost
         with self._database.write_session() as session:
             queue = LeaseQueue(session, self._clock)
             if had_asked:
-                claim = queue.recover_claim(self.owner, self._list_held_jobs())
+                claim = queue.recover_claim(self.owner, self.list_held())
             if claim is None:
-                claim = queue.claim_job(self.owner, self._length, admission)
+                claim = queue.claim_job(
+                    self.owner,
+                    self._length,
+                    admission,
+                    held=self._list_held_jobs(),
+                    only=only,
+                    choose_size=choose_size,
+                )
         self._has_asked = False
         if claim is not None:
             with self._lock:
@@ -101,11 +133,15 @@ class HeldLeases:
     def check_queue(self, admission: Admission | None = None) -> QueueStatus:
         """Check whether an admissible job waits, and which held jobs are to be cancelled."""
         with self._database.read_session() as session:
-            return read_queue_status(session, self.owner, admission)
+            return read_queue_status(session, self.owner, admission, self._list_held_jobs())
+
+    def list_held(self) -> tuple[Lease, ...]:
+        """List the leases that are not known to be lost."""
+        with self._lock:
+            return tuple(self._held)
 
     def _list_held_jobs(self) -> list[str]:
-        with self._lock:
-            return [lease.job_id for lease in self._held]
+        return sorted({lease.job_id for lease in self.list_held()})
 
     def is_lost(self, lease: Lease) -> bool:
         """Test whether the lease is known to be another's, or was forgotten."""
@@ -124,15 +160,14 @@ class HeldLeases:
             self._held.pop(lease, None)
 
     def release_all(self, *, lost: bool = False) -> None:
-        """Release every job, so that another dispatcher can claim it at once.
+        """Release every parcel, so that another dispatcher can claim it at once.
 
         Parameters
         ----------
         lost : bool
             Whether this counts as a lost lease.
         """
-        with self._lock:
-            held = tuple(self._held)
+        held = self.list_held()
         worked = lost and retry_transient(self._has_worked)
         for lease in held:
             try:
@@ -164,12 +199,12 @@ class HeldLeases:
     def renew_leases(self) -> None:
         """Send one heartbeat: renew the held leases, and reap expired ones."""
         begun = self._stopwatch()
-        with self._lock:
-            before = tuple(self._held)
+        before = self.list_held()
         with self._database.write_session(self._heartbeat_seconds) as session:
-            DispatcherRepository(session, self._clock).record_heartbeat(self.owner)
-            held = LeaseQueue(session, self._clock).renew_leases(before, self._length)
-        renewed = {claim.lease for claim in held}
+            dispatchers = DispatcherRepository(session, self._clock)
+            dispatchers.record_heartbeat(self.owner, self.wanted_cores)
+            renewed = LeaseQueue(session, self._clock).renew_leases(before, self._length)
+            self._look_at_others(dispatchers)
         with self._lock:
             for lease in before:
                 if lease not in renewed:
@@ -177,6 +212,11 @@ class HeldLeases:
                 elif lease in self._held:
                     self._held[lease] = begun
         reap_jobs(self._database, self._clock, busy_seconds=self._heartbeat_seconds)
+
+    def _look_at_others(self, dispatchers: DispatcherRepository) -> None:
+        alive = [one for one in dispatchers.list_alive() if one.owner != self.owner]
+        self.n_alive = 1 + len(alive)
+        self.cores_of_others = count_wanted_cores(alive, self._cluster)
 
     @property
     def _heartbeat_seconds(self) -> float:

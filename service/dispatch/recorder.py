@@ -1,10 +1,12 @@
-"""Writes of the dispatcher about the runs of one job: in bulk, fenced by the lease."""
+"""Writes of the dispatcher about the runs of one parcel: in bulk, fenced by the lease."""
 
 import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from itertools import accumulate
 
 from sqlalchemy.orm import Session
@@ -13,16 +15,22 @@ from service.core import metrics
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
+from service.dispatch.overlap import RunBeside, run_at_once
 from service.dispatch.results import to_history_points, to_migrant_points
 from service.queue.leases import Claim, JobProgress, LeaseQueue
 from service.queue.packed_results import PackedResults
-from service.queue.previous_attempts import summarize_attempts
+from service.queue.previous_attempts import (
+    PreviousAttempts,
+    list_failure_reasons,
+    summarize_attempts,
+)
 from service.queue.reuse import take_over_runs
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
+from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from sysid.islands.state import RunState
 from workers.protocol import Encoder, RunFailure
@@ -38,6 +46,9 @@ MAX_ENDED = 1000
 """Runs that one transaction ends, about. A longer one would hold up the heartbeat of the job."""
 MAX_STARTED = 500
 """Runs marked as running in one transaction. Of thousands of short runs most end unmarked."""
+
+MAX_UNWRITTEN = 5000
+"""Ended runs that wait for the database at most; then the dispatcher waits too."""
 
 RunEndNotice = Callable[[str, Mapping[str, float] | None], None]
 """Receives a run that has ended, and its estimates if it succeeded and they were encoded."""
@@ -56,8 +67,24 @@ class _LiveRun:
 
 
 @dataclass(slots=True)
+class JobSpeed:
+    """Start of a job in this dispatcher, from which its speed is measured; parcels share it.
+
+    Attributes
+    ----------
+    begun : float
+        Time of the first claim, by the stopwatch.
+    n_begun : int
+        Runs that had ended then, and those that were reused since.
+    """
+
+    begun: float
+    n_begun: int
+
+
+@dataclass(slots=True)
 class _PendingWrites:
-    """Rows of the next transaction."""
+    """Rows of the next transactions."""
 
     started: list[str] = field(default_factory=list)
     reused: dict[str, str] = field(default_factory=dict)
@@ -75,12 +102,51 @@ class _PendingWrites:
         """Whether a run has begun, ended or lost its worker."""
         return bool(self.outcomes or self.packs or self.started or self.reused or self.kills)
 
+    def count_ended(self) -> int:
+        """Count the runs that have ended."""
+        return len(self.outcomes) + len(self.reused) + sum(len(pack.runs) for pack in self.packs)
+
+    def append(self, later: "_PendingWrites") -> None:
+        """Append what came later."""
+        for item in fields(self):
+            mine = getattr(self, item.name)
+            if isinstance(mine, list):
+                mine.extend(getattr(later, item.name))
+            else:
+                mine.update(getattr(later, item.name))
+
+
+@dataclass(slots=True)
+class _Batch:
+    """What the next transactions write, taken at one moment.
+
+    Attributes
+    ----------
+    progress : JobProgress or None
+        Progress without the runs that are taken over in these transactions.
+    estimate_left : callable
+        The remaining time of the job (s), from its number of ended runs.
+    live : dict
+        Runs in progress whose history and checkpoint are written, with their states.
+    reused_outcomes : list
+        What was taken over from other runs.
+    """
+
+    taken_at: float
+    pending: _PendingWrites
+    progress: JobProgress | None
+    estimate_left: Callable[[int], float | None]
+    live: dict[str, tuple[_LiveRun, RunState]]
+    with_checkpoints: bool
+    reused_outcomes: list[RunOutcome] = field(default_factory=list)
+
 
 class RunRecorder:
-    """Writes one job's runs; implements `workers.protocol.RunObserver`.
+    """Writes the runs of one parcel; implements `workers.protocol.RunObserver`.
 
     Events are collected, and `write_due` writes them. Results are written at most every
     `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
+    One batch at a time may be written beside the main thread, while the next one is collected.
 
     Parameters
     ----------
@@ -90,6 +156,10 @@ class RunRecorder:
         Encodes complete runs as `PackedResults` in the worker.
     report_end : callable
         Receives each run that ended, and its estimates if it succeeded and they are encoded.
+    run_beside : callable, optional
+        Carries out a write. By default it is done at once.
+    speed : JobSpeed, optional
+        Shared by the parcels of the job. By default it begins now.
     stopwatch : callable
         Elapsed seconds of this process.
     """
@@ -102,27 +172,35 @@ class RunRecorder:
         encoder: Encoder,
         report_end: RunEndNotice,
         *,
+        run_beside: RunBeside | None = None,
+        speed: JobSpeed | None = None,
         stopwatch: Callable[[], float] = time.monotonic,
     ) -> None:
         self.lease = claim.lease
         self.encoder = encoder
-        self._report_end, self._stopwatch = report_end, stopwatch
         self.is_stopped = False
-        with database.write_session() as session:
-            before = summarize_attempts(session, claim.lease, MAX_REASONS)
-        self._reasons = list(before.failure_reasons)
+        self._report_end, self._stopwatch, self._run_beside = (
+            report_end,
+            stopwatch,
+            run_beside or run_at_once,
+        )
+        before, told = PreviousAttempts(), list[str]()
+        if not claim.is_new:
+            with database.write_session() as session:
+                before = summarize_attempts(session, claim.lease)
+                told = list_failure_reasons(session, claim.job.id, MAX_REASONS)
         # Evaluations of runs that have not continued yet.
         self._checkpoint_evaluations = before.checkpoint_evaluations
         self._database, self._store = database, store
         self._live: dict[str, _LiveRun] = {}
         self._pending = _PendingWrites()
-        self._n_runs, self._n_done = claim.job.n_runs, claim.job.n_done
+        self._written_beside: tuple[_Batch, Future[None]] | None = None
+        self._n_runs = claim.job.n_runs
         self._evaluations, self._generation = before.evaluations, before.generations
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
-        self._n_begun, self._begun = claim.job.n_done, self._stopwatch()
-        self._n_reused = 0
-        self._reused_outcomes: list[RunOutcome] = []  # from other runs, in the present transaction
+        self._speed = speed or JobSpeed(self._stopwatch(), claim.job.n_done)
+        self._reasons = told  # in the log
         self._progress_written_at = 0.0  # these three by the stopwatch
         self._results_written_at = 0.0
         self._checkpoints_written_at = 0.0
@@ -164,7 +242,6 @@ class RunRecorder:
         self._generation = max(self._generation, packed.generations)
         if packed.best_rms is not None:
             self._best = min(self._best, packed.best_rms)
-        self._n_done += len(packed.runs)
         self._has_new_progress = True
 
     def record_failure(self, run: str, failure: RunFailure) -> None:
@@ -188,7 +265,6 @@ class RunRecorder:
             self._reasons.append(failure.reason)
             self._pending.messages.append(f"{run} failed: {failure.reason}")
             _log.warning("%s failed: %s", run, failure.reason, extra={"run_id": run})
-        self._n_done += 1
         self._has_new_progress = True
 
     def record_reuse(self, run: str, source: str) -> None:
@@ -196,9 +272,7 @@ class RunRecorder:
         self._pending.reused[run] = source
         metrics.runs.labels("reused").inc()
         self._checkpoint_evaluations.pop(run, None)
-        self._n_done += 1
-        self._n_begun += 1  # reused runs do not count for the speed
-        self._n_reused += 1
+        self._speed.n_begun += 1  # reused runs do not count for the speed
         self._has_new_progress = True
 
     def _count_evaluations(self, run: str) -> int:
@@ -211,13 +285,17 @@ class RunRecorder:
         return self.is_stopped
 
     def write_due(self) -> None:
-        """Write everything that is due.
+        """Write everything that is due, after what is being written beside.
 
         Raises
         ------
         LeaseLost
-            If another dispatcher holds the job. Nothing was written.
+            If another dispatcher holds the parcel. Nothing was written.
         """
+        if self._written_beside is not None:
+            if self._pending.count_ended() < MAX_UNWRITTEN and not self._written_beside[1].done():
+                return
+            self._finish_batch()
         now = self._stopwatch()
         with_progress = (
             self._has_new_progress and now - self._progress_written_at > PROGRESS_SECONDS
@@ -226,84 +304,161 @@ class RunRecorder:
             bool(self._live) and now - self._checkpoints_written_at > CHECKPOINT_SECONDS
         )
         has_results = self._pending.has_runs and now - self._results_written_at > RESULTS_SECONDS
-        if with_progress or with_checkpoints or has_results:
-            self._commit_writes(now, with_progress=with_progress, with_checkpoints=with_checkpoints)
+        has_many = self._pending.count_ended() >= MAX_ENDED
+        if with_progress or with_checkpoints or has_results or has_many:
+            batch = self._take_batch(with_progress=with_progress, with_checkpoints=with_checkpoints)
+            written = self._run_beside(partial(retry_transient, partial(self._write_batch, batch)))
+            self._written_beside = batch, written
+            if written.done():
+                self._finish_batch()
 
     def write_all(self) -> None:
         """Write everything, including checkpoints, because the dispatcher stops."""
-        self._commit_writes(self._stopwatch(), with_progress=True, with_checkpoints=True)
+        self._write_now(with_checkpoints=True)
+
+    def write_results(self) -> None:
+        """Write the last results without ending the parcel."""
+        self._write_now()
+
+    def end_parcel(self) -> bool:
+        """Write the last results and end the parcel; return False if it is the last of its job.
+
+        The last one stays open until the job ends.
+        """
+        was_ended = False
+
+        def end(session: Session) -> None:
+            nonlocal was_ended
+            was_ended = LeaseQueue(session).end_parcel(self.lease)
+
+        self._write_now(last=end)
+        return was_ended
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
 
-        With `floors`, the results are already written (`write_results`), because the bounds refer
-        to them.
+        All other parcels of the job have ended. With `floors`, all results are already written,
+        because the bounds refer to them.
         """
-        self._prepare_writes()
-        with self._database.write_session() as session:
-            self._write_rows(session, with_progress=True, with_checkpoints=False)
+
+        def end(session: Session) -> None:
             queue = LeaseQueue(session)
             if floors is not None:
                 queue.write_floors(self.lease, floors)
-            job = queue.lock_job(self.lease)
-            session.refresh(job)
-            complaint = self._summarise_failures(job.n_failed, job.n_runs)
-            if self._n_reused:
-                text = f"{self._n_reused} of {job.n_runs} runs were taken over from earlier runs"
+            job = queue.lock_lease(self.lease).job
+            complaint = None
+            if job.n_failed:
+                complaint = self._summarise_failures(session, job.n_failed)
+            if job.n_reused:
+                text = f"{job.n_reused} of {job.n_runs} runs were taken over from earlier runs"
                 queue.append_event(self.lease, "log", {"message": text})
             if job.n_failed == job.n_runs:
                 queue.finish_job(self.lease, JobState.FAILED, complaint)
             else:
                 queue.finish_job(self.lease, JobState.SUCCEEDED, complaint)
 
-    def write_results(self) -> None:
-        """Write the last results without ending the job."""
-        self._commit_writes(self._stopwatch(), with_progress=True, with_checkpoints=False)
+        self._write_now(last=end)
 
-    def cancel_job(self) -> None:
-        """End the job as cancelled. Earlier results of its runs remain."""
-        self._prepare_writes()
-        with self._database.write_session() as session:
-            self._write_rows(session, with_progress=True, with_checkpoints=True)
-            LeaseQueue(session).finish_job(self.lease, JobState.CANCELLED)
+    def cancel_parcel(self) -> None:
+        """End the parcel as cancelled. Earlier results of its runs remain."""
+        self._write_now(
+            last=lambda session: LeaseQueue(session).cancel_parcel(self.lease),
+            with_checkpoints=True,
+        )
+
+    def _write_now(
+        self, last: Callable[[Session], None] | None = None, *, with_checkpoints: bool = False
+    ) -> None:
+        """Write everything in this thread; `last` is carried out in the last transaction."""
+        if self._written_beside is not None:
+            self._finish_batch()
+        batch = self._take_batch(with_progress=True, with_checkpoints=with_checkpoints)
+        written: Future[None] = run_at_once(partial(self._write_batch, batch, last))
+        self._written_beside = batch, written
+        self._finish_batch()
+
+    def _take_batch(self, *, with_progress: bool, with_checkpoints: bool) -> _Batch:
+        pending, self._pending = self._pending, _PendingWrites()
+        is_wanted = with_progress or with_checkpoints
+        live = {
+            run: (live, live.state)
+            for run, live in self._live.items()
+            if is_wanted and (with_progress or live.changed)
+        }
+        if with_progress:
+            self._has_new_progress = False
+        return _Batch(
+            self._stopwatch(),
+            pending,
+            self._compute_progress() if with_progress else None,
+            self._build_estimate(),
+            live,
+            with_checkpoints,
+        )
+
+    def _finish_batch(self) -> None:
+        """Wait for the batch that is being written, and note that it is; else keep its rows."""
+        assert self._written_beside is not None
+        batch, written = self._written_beside
+        self._written_beside = None
+        try:
+            written.result()
+        except BaseException:
+            batch.pending.append(self._pending)
+            self._pending = batch.pending
+            self._has_new_progress = True
+            raise
+        self._note_written(batch)
+
+    def _note_written(self, batch: _Batch) -> None:
+        self._pending.started[:0] = batch.pending.started  # those beyond `MAX_STARTED`
+        self._results_written_at = batch.taken_at
+        reused = batch.reused_outcomes
+        self._evaluations += sum(outcome.evaluations for outcome in reused)
+        self._generation = max([self._generation, *(outcome.generations for outcome in reused)])
+        self._best = min([self._best, *_list_rms(reused)])
+        if batch.progress is not None:
+            self._progress_written_at = batch.taken_at
+        if batch.with_checkpoints:
+            self._checkpoints_written_at = batch.taken_at
+        for live, state in batch.live.values():
+            if batch.progress is not None:
+                live.written = dict(enumerate(map(len, state.history)))
+                live.migrants = len(state.migrations)
+            if batch.with_checkpoints and live.state is state:
+                live.changed = False
 
     def _compute_progress(self) -> JobProgress:
-        """Compute the job's progress; its generation is that of the most advanced run."""
+        """Compute the parcel's progress; its generation is that of the most advanced run."""
         states = [live.state for live in self._live.values()]
-        best = min(
-            [self._best, *_list_rms(self._reused_outcomes), *(state.rms for state in states)]
-        )
+        best = min([self._best, *(state.rms for state in states)])
         return JobProgress(
             evaluations=self._evaluations
             + sum(self._checkpoint_evaluations.values())
-            + sum(outcome.evaluations for outcome in self._reused_outcomes)
             + sum(state.evaluations for state in states),
-            generation=max(
-                [
-                    self._generation,
-                    *(outcome.generations for outcome in self._reused_outcomes),
-                    *(state.generation for state in states),
-                ]
-            ),
+            generation=max([self._generation, *(state.generation for state in states)]),
             best_rms=best if math.isfinite(best) else None,
-            seconds_left=self._estimate_seconds_left(),
         )
 
-    def _estimate_seconds_left(self) -> float | None:
-        """Estimate the remaining time from the speed since the claim."""
+    def _build_estimate(self) -> Callable[[int], float | None]:
+        """Return the estimate of the remaining time of the job, by its speed since the claim."""
         total = self._generations * self._n_runs
         open_runs = sum(live.state.generation for live in self._live.values())
         before = sum(live.first_generation for live in self._live.values())
-        done = (self._n_done - self._n_begun) * self._generations + open_runs - before
-        left = total - self._n_done * self._generations - open_runs
-        elapsed = self._stopwatch() - self._begun
-        return max(0.0, elapsed * left / done) if done > 0 else None
+        n_begun, elapsed = self._speed.n_begun, self._stopwatch() - self._speed.begun
 
-    def _summarise_failures(self, n_failed: int, n_runs: int) -> str | None:
-        if n_failed == 0:
-            return None
-        reasons = "; ".join(self._reasons)
-        return reasons if n_runs == 1 else f"{n_failed} of {n_runs} runs failed: {reasons}"
+        def estimate(n_done: int) -> float | None:
+            done = (n_done - n_begun) * self._generations + open_runs - before
+            left = total - n_done * self._generations - open_runs
+            return max(0.0, elapsed * left / done) if done > 0 else None
+
+        return estimate
+
+    def _summarise_failures(self, session: Session, n_failed: int) -> str:
+        reasons = "; ".join(list_failure_reasons(session, self.lease.job_id, MAX_REASONS))
+        if self._n_runs == 1:
+            return reasons
+        return f"{n_failed} of {self._n_runs} runs failed: {reasons}"
 
     def _end_live_run(self, run: str) -> _LiveRun | None:
         """End a run in progress: the history up to its last state is written with its end."""
@@ -315,50 +470,40 @@ class RunRecorder:
             self._pending.migrants.extend(migrants)
         return live
 
-    def _prepare_writes(self) -> None:
-        """Store signals, and write results beyond those of one transaction in others before it."""
-        self._store_signals()
-        self._drop_ended_starts()
-        while surplus := self._take_surplus():
+    def _write_batch(self, batch: _Batch, last: Callable[[Session], None] | None = None) -> None:
+        """Write a batch: signals first, then about `MAX_ENDED` results in each transaction.
+
+        It may be repeated. What was committed is taken out of the batch.
+        """
+        pending = batch.pending
+        self._store_signals(pending)
+        _drop_ended_starts(pending)
+        while surplus := _take_surplus(pending):
             try:
                 with self._database.write_session() as session:
-                    self._write_rows(session, with_progress=False, with_checkpoints=False)
+                    reused = self._write_pending(session, pending)
             except BaseException:
-                self._pending.packs += surplus
+                pending.packs += surplus
                 raise
-            signals = self._pending.stored_signals, self._pending.lost_signals
-            self._mark_written(self._stopwatch(), with_progress=False, with_checkpoints=False)
-            self._pending.packs = surplus
-            self._pending.stored_signals, self._pending.lost_signals = signals
-
-    def _take_surplus(self) -> list[PackedResults]:
-        """Take the packs that are too many for one transaction; at least one stays."""
-        counts = accumulate(len(pack.runs) for pack in self._pending.packs)
-        n_kept = max(1, sum(count <= MAX_ENDED for count in counts))
-        surplus = self._pending.packs[n_kept:]
-        del self._pending.packs[n_kept:]
-        return surplus
-
-    def _drop_ended_starts(self) -> None:
-        """Leave out starts of runs that have ended, which their results tell."""
-        ended = set[str]().union(*(pack.runs for pack in self._pending.packs))
-        started = self._pending.started
-        self._pending.started = [run for run in started if run not in ended]
-
-    def _commit_writes(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
-        self._prepare_writes()
+            batch.reused_outcomes += reused
+            started = pending.started[MAX_STARTED:]
+            signals = pending.stored_signals, pending.lost_signals
+            pending = batch.pending = _PendingWrites(started, packs=surplus)
+            pending.stored_signals, pending.lost_signals = signals
         with self._database.write_session() as session:
-            self._write_rows(
-                session, with_progress=with_progress, with_checkpoints=with_checkpoints
-            )
-        self._mark_written(now, with_progress=with_progress, with_checkpoints=with_checkpoints)
+            reused = self._write_pending(session, pending)
+            self._write_live(session, batch, batch.reused_outcomes + reused)
+            if last is not None:
+                last(session)
+        batch.reused_outcomes += reused
+        batch.pending = _PendingWrites(pending.started[MAX_STARTED:])
 
-    def _store_signals(self) -> None:
+    def _store_signals(self, pending: _PendingWrites) -> None:
         """Store the signals of ended runs, before the rows that refer to them.
 
         Without its signals a result is written all the same.
         """
-        pending, runs, reason = self._pending, list[str](), ""
+        runs, reason = list[str](), ""
         for pack in pending.packs:
             name = pack.signals_sha256
             if name is None or name in pending.stored_signals or name in pending.lost_signals:
@@ -376,45 +521,62 @@ class RunRecorder:
             _log.error(text, extra={"run_id": runs[0]})
             pending.messages.append(text)
 
-    def _write_rows(self, session: Session, *, with_progress: bool, with_checkpoints: bool) -> None:
-        writer, pending = RunWriter(session, self.lease), self._pending
-        self._reused_outcomes = take_over_runs(session, self.lease, pending.reused)
+    def _write_pending(self, session: Session, pending: _PendingWrites) -> list[RunOutcome]:
+        """Write runs that began or ended; return the outcomes of those that were taken over."""
+        writer, queue = RunWriter(session, self.lease), LeaseQueue(session)
+        reused = take_over_runs(session, self.lease, pending.reused)
         writer.start_runs(pending.started[:MAX_STARTED])
         writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
-        writer.record_results(pending.packs, pending.lost_signals)
         writer.write_kills(pending.kills)
         for text in pending.messages:
-            LeaseQueue(session).append_event(self.lease, "log", {"message": text})
-        if with_progress:
-            for run, live in self._live.items():
-                points = to_history_points(run, live.state.history, live.written)
-                writer.append_history(
-                    points, to_migrant_points(run, live.state.migrations, live.migrants)
-                )
-            LeaseQueue(session).write_progress(self.lease, self._compute_progress())
-        if with_checkpoints:
-            changed = [(run, live) for run, live in self._live.items() if live.changed]
-            writer.save_checkpoints(
-                (run, live.state.evaluations, pack_state(live.state)) for run, live in changed
-            )
+            queue.append_event(self.lease, "log", {"message": text})
+        writer.record_results(pending.packs, pending.lost_signals)
+        return reused
 
-    def _mark_written(self, now: float, *, with_progress: bool, with_checkpoints: bool) -> None:
-        started = self._pending.started[MAX_STARTED:]
-        self._pending, self._results_written_at = _PendingWrites(started), now
-        self._evaluations += sum(outcome.evaluations for outcome in self._reused_outcomes)
-        self._generation = max(
-            [self._generation, *(outcome.generations for outcome in self._reused_outcomes)]
+    def _write_live(self, session: Session, batch: _Batch, reused: list[RunOutcome]) -> None:
+        """Write the progress of the parcel, and history and checkpoints of runs in progress."""
+        writer, queue = RunWriter(session, self.lease), LeaseQueue(session)
+        if batch.with_checkpoints:
+            changed = [(run, live, state) for run, (live, state) in batch.live.items()]
+            writer.save_checkpoints(
+                (run, state.evaluations, pack_state(state))
+                for run, live, state in changed
+                if live.changed
+            )
+        if batch.progress is None:
+            return
+        for run, (live, state) in batch.live.items():
+            writer.append_history(
+                to_history_points(run, state.history, live.written),
+                to_migrant_points(run, state.migrations, live.migrants),
+            )
+        known = batch.progress
+        best = min(
+            [math.inf if known.best_rms is None else known.best_rms, *_list_rms(reused)],
         )
-        self._best = min([self._best, *_list_rms(self._reused_outcomes)])
-        if with_progress:
-            self._progress_written_at, self._has_new_progress = now, False
-            for live in self._live.values():
-                live.written = dict(enumerate(map(len, live.state.history)))
-                live.migrants = len(live.state.migrations)
-        if with_checkpoints:
-            self._checkpoints_written_at = now
-            for live in self._live.values():
-                live.changed = False
+        progress = replace(
+            known,
+            evaluations=known.evaluations + sum(outcome.evaluations for outcome in reused),
+            generation=max([known.generation, *(outcome.generations for outcome in reused)]),
+            best_rms=best if math.isfinite(best) else None,
+            seconds_left=batch.estimate_left(queue.read_n_done(self.lease)),
+        )
+        queue.write_progress(self.lease, progress)
+
+
+def _take_surplus(pending: _PendingWrites) -> list[PackedResults]:
+    """Take the packs that are too many for one transaction; at least one stays."""
+    counts = accumulate(len(pack.runs) for pack in pending.packs)
+    n_kept = max(1, sum(count <= MAX_ENDED for count in counts))
+    surplus = pending.packs[n_kept:]
+    del pending.packs[n_kept:]
+    return surplus
+
+
+def _drop_ended_starts(pending: _PendingWrites) -> None:
+    """Leave out starts of runs that have ended, which their results tell."""
+    ended = set[str]().union(*(pack.runs for pack in pending.packs))
+    pending.started = [run for run in pending.started if run not in ended]
 
 
 def _list_rms(outcomes: list[RunOutcome]) -> list[float]:

@@ -156,7 +156,7 @@ class OpenChains:
 
 
 class WarmStarts:
-    """Warm starts of one claimed job.
+    """Warm starts of one claimed job, whose runs are one parcel if some wait for others.
 
     Results of its own runs are available before they are written.
     """
@@ -169,6 +169,8 @@ class WarmStarts:
 
     def open_chains(self) -> OpenChains | None:
         """Open the chains of the job where it was left; None if no run waits for another."""
+        if not self.may_wait:
+            return None
         wait_rule = _WaitRule(self._job)
         axes = SweepIn.model_validate(self._job.spec["sweep"]).axes
         chain = ChainLayout.from_axes(axes)
@@ -206,9 +208,7 @@ class WarmStarts:
     @property
     def may_wait(self) -> bool:
         """Whether runs of the job may start from runs before them."""
-        axes = self._job.spec["sweep"]["axes"]
-        swept = any(axis["path"] == WARM_START_PATH for axis in axes)
-        return swept or self._job.spec["warm_start"] == PREVIOUS
+        return may_wait(self._job)
 
     def record_end(self, run: str, values: Mapping[str, float] | None) -> None:
         """Record that a run of the job has ended; `values` are its estimates if it succeeded."""
@@ -240,6 +240,12 @@ class WarmStarts:
                 row = RunRepository(session, self._job.project_id).get(run)
                 self._earlier[run] = _to_values(row.estimates)
         return self._earlier[run]
+
+
+def may_wait(job: Job) -> bool:
+    """Return whether runs of a job may start from runs before them."""
+    swept = any(axis["path"] == WARM_START_PATH for axis in job.spec["sweep"]["axes"])
+    return swept or job.spec["warm_start"] == PREVIOUS
 
 
 class _WaitRule:

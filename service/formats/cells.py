@@ -2,13 +2,9 @@
 
 import re
 from collections.abc import Iterable
-from typing import Final, Literal
+from typing import Final
 
-CellKind = Literal["empty", "number", "flag", "stamp", "date", "clock", "text", "count"]
-"""``stamp`` is a date with a time of day, ``clock`` a time of day, ``flag`` true or false.
-
-``count`` is said of a column that numbers the rows.
-"""
+from sysid.data.table_rules import CellKind
 
 MISSING: Final = frozenset(
     (

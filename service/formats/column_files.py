@@ -4,7 +4,7 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,8 +12,6 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
-from service.formats.cells import CellKind
-from service.formats.errors import InvalidUpload
 from service.formats.limits import ReadOptions
 from service.formats.table_columns import (
     ColumnValues,
@@ -23,21 +21,21 @@ from service.formats.table_columns import (
     parse_texts,
 )
 from service.formats.table_layout import (
-    Heading,
+    PEEK_ROWS,
     TableColumn,
     assign_roles,
     classify_cells,
-    is_time_name,
-    split_headings,
+    read_headings,
 )
+from sysid.core.errors import UnreadableFile
 from sysid.core.types import IntArray
+from sysid.data.table_rules import CellKind, Heading, is_temperature_name, is_time_name
 
 if TYPE_CHECKING:
     import polars as pl
 
 PERIOD_NAMES: Final = ("ts", "dt", "sample_time", "sampletime", "sampling_time", "sample_period")
 RATE_NAMES: Final = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")
-PEEK_ROWS = 200
 _DAMAGES: Final = (
     *(ValueError, TypeError, KeyError, IndexError, OSError, EOFError, AttributeError),
     *(NotImplementedError, zlib.error, struct.error, zipfile.BadZipFile),
@@ -52,7 +50,7 @@ def read_numpy(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     except _DAMAGES as error:
         raise _build_damage_error("NumPy", error) from None
     if "" in arrays:
-        raise InvalidUpload(
+        raise UnreadableFile(
             "the .npy file holds one array without names; write np.savez(file, t=t, u=u, y=y)"
         )
     return _build_array_table(arrays, options, notes)
@@ -85,7 +83,7 @@ def read_matlab(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     for name, value in arrays.items():
         if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction):
             what = "an object" if name == "None" else f"the object {name!r}"
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the MATLAB file holds {what}, such as iddata or timetable, which only MATLAB "
                 "can read. Save its arrays: y = z.y; u = z.u; Ts = z.Ts; save('file.mat', 'y', "
                 "'u', 'Ts', '-v7')"
@@ -103,7 +101,7 @@ def _open_structure(arrays: Mapping[str, Any], notes: list[str]) -> dict[str, An
         return plain
     if len(structures) != 1:
         names = ", ".join(arrays) or "nothing"
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the file holds {names}; need arrays such as t, u and y, or one structure with them"
         )
     ((name, fields),) = structures.items()
@@ -129,7 +127,8 @@ def _open_simulink(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _build_array_table(arrays: Mapping[str, Any], options: ReadOptions, notes: list[str]) -> Table:
     columns, left_out = _collect_columns(arrays)
     sample_time = options.sample_time
-    if sample_time is None and not any(is_time_name(name) for name in columns):
+    times = [name for name in columns if is_time_name(name) and not is_temperature_name(name)]
+    if sample_time is None and not times:
         sample_time = _find_period(arrays, notes)
     if left_out:
         notes.append(f"{', '.join(left_out)} hold no samples of a signal and were left out")
@@ -163,7 +162,7 @@ def _is_signal(array: NDArray[Any]) -> bool:
 def _find_length(signals: Mapping[str, NDArray[Any]]) -> int:
     """Find the number of samples: that of the times, or the most common one."""
     if not signals:
-        raise InvalidUpload("the file holds no arrays of samples; need t, u and y, for example")
+        raise UnreadableFile("the file holds no arrays of samples; need t, u and y, for example")
     for name, array in signals.items():
         if is_time_name(name):
             return int(max(array.shape))
@@ -195,7 +194,7 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
         rows = int(scan.select(pl.len()).collect().item())
         limits = options.limits
         if len(names) > limits.channels + len(options.segments) + 1 or rows > limits.messages:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the file has {len(names)} columns and {rows} rows; at most {limits.channels} "
                 f"signals and {limits.messages} rows are read"
             )
@@ -203,15 +202,18 @@ def read_parquet(path: Path, options: ReadOptions, notes: list[str]) -> Table:
     except pl.exceptions.PolarsError as error:
         raise _build_damage_error("Parquet", error) from None
     columns: dict[str, ColumnValues] = {}
-    is_utc = False
+    in_utc, spans = set(), set()
     for series in frame:
         values = _convert_series(series)
         if values is None:
             notes.append(f"column {series.name!r} holds {series.dtype} and was left out")
             continue
         columns[series.name] = values
-        is_utc |= isinstance(series.dtype, pl.Datetime) and series.dtype.time_zone is not None
-    return build_column_table(columns, options, is_utc=is_utc)
+        if isinstance(series.dtype, pl.Datetime) and series.dtype.time_zone is not None:
+            in_utc.add(series.name)
+        if series.dtype == pl.Duration:
+            spans.add(series.name)
+    return build_column_table(columns, options, in_utc=in_utc, spans=spans)
 
 
 def _convert_series(series: "pl.Series") -> ColumnValues | None:
@@ -235,21 +237,32 @@ def _convert_series(series: "pl.Series") -> ColumnValues | None:
 
 
 def build_column_table(
-    columns: Mapping[str, ColumnValues], options: ReadOptions, *, is_utc: bool = False
+    columns: Mapping[str, ColumnValues],
+    options: ReadOptions,
+    *,
+    in_utc: Collection[str] = (),
+    spans: Collection[str] = (),
 ) -> Table:
     """Build the table of columns of equal length by their names.
 
+    Parameters
+    ----------
+    in_utc : collection of str
+        Columns of time stamps in UTC; others are local.
+    spans : collection of str
+        Columns of time spans, which are in s whatever their heading says.
+
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If there is no signal or no time, or a text is no number.
     """
     if not columns or not len(next(iter(columns.values()))):
-        raise InvalidUpload("the file holds no samples")
+        raise UnreadableFile("the file holds no samples")
     headings = [
-        Heading(name, unit, _classify_values(values, name))
-        for (name, unit), values in zip(
-            split_headings(list(columns)), columns.values(), strict=True
+        Heading(name, "s" if label in spans else unit, _classify_values(values, name))
+        for (name, unit), (label, values) in zip(
+            read_headings(list(columns)), columns.items(), strict=True
         )
     ]
     roles = assign_roles(
@@ -259,6 +272,9 @@ def build_column_table(
     values = tuple(
         _convert_values(role, column, rows)
         for role, column in zip(roles, columns.values(), strict=True)
+    )
+    is_utc = any(
+        role.role == "time" and label in in_utc for role, label in zip(roles, columns, strict=True)
     )
     return Table(roles, values, rows, options.sample_time, is_utc)
 
@@ -290,7 +306,7 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
         raise build_missing_time_error(text, int(rows[wrong[0]]), column.name)
     infinite = np.flatnonzero(np.isinf(numbers))
     if column.role == "value" and infinite.size:
-        raise InvalidUpload(
+        raise UnreadableFile(
             "the value is infinite; values must be finite (NaN is a missing value)",
             row=int(rows[infinite[0]]),
             column=column.name,
@@ -298,8 +314,8 @@ def _convert_values(column: TableColumn, values: ColumnValues, rows: IntArray) -
     return numbers
 
 
-def _build_damage_error(kind: str, error: Exception) -> InvalidUpload:
+def _build_damage_error(kind: str, error: Exception) -> UnreadableFile:
     reason = " ".join(str(error).split())
     if reason.startswith("Object arrays"):
         reason = "an array holds Python objects; write arrays of numbers"
-    return InvalidUpload(f"the {kind} file cannot be read: {reason[:120]}")
+    return UnreadableFile(f"the {kind} file cannot be read: {reason[:120]}")

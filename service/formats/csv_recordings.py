@@ -12,15 +12,13 @@ also written as CSV, block by block, and its numbers come back bit for bit.
 import csv
 from collections.abc import Iterator, Sequence
 from io import StringIO
-from itertools import chain, islice
+from itertools import chain
 from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
 
 from service.core.text import escape_formula
-from service.formats.errors import InvalidUpload
-from service.formats.file_kinds import GZIP_MAGIC, read_head
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.table_columns import read_lines
 from service.formats.table_layout import detect_layout
@@ -28,7 +26,9 @@ from service.formats.table_recordings import build_recording
 from service.formats.text_files import open_text
 from sysid.data.records import Channel, Recording
 
-PEEK_LINES = 200
+
+class HoldsStamps(Exception):
+    """The times of a text are date stamps, and its reader does not accept these."""
 
 
 def read_csv(
@@ -37,6 +37,7 @@ def read_csv(
     sample_time: float | None = None,
     segments: Sequence[str] = (),
     limits: UploadLimits = DEFAULT_LIMITS,
+    accepts_stamps: bool = True,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a text file of columns.
 
@@ -51,6 +52,8 @@ def read_csv(
         the time may restart with each segment. Segments follow each other on one axis.
     limits : UploadLimits
         Those of an MCAP file hold here too: signals, and rows as messages.
+    accepts_stamps : bool
+        Whether the times may be date stamps, which a large library parses.
 
     Returns
     -------
@@ -60,39 +63,19 @@ def read_csv(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file cannot be used. The error has the row of the file, from 1, and the column.
+    HoldsStamps
+        If the times are date stamps, and these are not accepted.
     """
     notes: list[str] = []
     with open_text(source, limits, notes) as lines:
-        first = _peek_lines(lines)
-        layout = detect_layout(first, segments, sample_time, limits.channels)
+        layout, first = detect_layout(lines, segments, sample_time, limits.channels)
+        if layout.has_stamps and not accepts_stamps:
+            raise HoldsStamps
         notes += layout.notes
         table = read_lines(chain(first, lines), layout, notes, limits.messages)
     return build_recording(table, notes), tuple(notes)
-
-
-def is_plain_text(
-    path: Path, sample_time: float | None, segments: Sequence[str], limits: UploadLimits
-) -> bool:
-    """Whether a text is not compressed, and has no date stamps; raises as `read_csv`.
-
-    Unpacking needs limits, and a large library parses date stamps.
-    """
-    if read_head(path).startswith(GZIP_MAGIC):
-        return False
-    with open_text(path, limits, []) as lines:
-        first = _peek_lines(lines)
-        return not detect_layout(first, segments, sample_time, limits.channels).has_stamps
-
-
-def _peek_lines(lines: Iterator[str]) -> list[str]:
-    first = list(islice(lines, PEEK_LINES))
-    if not first:
-        raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
-    if not any(map(str.strip, first)):
-        raise InvalidUpload("the first rows are empty; need a header such as t,u,y", row=1)
-    return first
 
 
 WRITTEN_BLOCK_ROWS = 5000

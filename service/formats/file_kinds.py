@@ -6,7 +6,7 @@ import zlib
 from pathlib import Path
 from typing import Literal
 
-from service.formats.errors import InvalidUpload
+from sysid.core.errors import UnreadableFile
 
 FileKind = Literal["csv", "mcap", "excel", "parquet", "numpy", "matlab"]
 """``csv`` is every table in text, also compressed by gzip."""
@@ -79,7 +79,7 @@ def detect_kind(path: Path, suffix: str = "") -> FileKind:
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is of a known kind that is not read; with the kind, and what to do.
     """
     return detect_head_kind(read_head(path), suffix.lower())
@@ -125,11 +125,11 @@ def _check_compressed(head: bytes) -> FileKind:
     try:
         inner = zlib.decompressobj(31).decompress(head, HEAD_BYTES)
     except zlib.error:
-        raise InvalidUpload("the gzip data are damaged") from None
+        raise UnreadableFile("the gzip data are damaged") from None
     if inner[257:262] == b"ustar":
         raise _build_refusal("a TAR archive", "unpack it")
     if inner.startswith(GZIP_MAGIC) or detect_head_kind(inner) != "csv":
-        raise InvalidUpload("gzip is read around text only; unpack the file")
+        raise UnreadableFile("gzip is read around text only; unpack the file")
     return "csv"
 
 
@@ -165,5 +165,5 @@ def _is_mat4(head: bytes) -> bool:
     return False
 
 
-def _build_refusal(what: str, advice: str) -> InvalidUpload:
-    return InvalidUpload(f"the file is {what}, which is not read; {advice}")
+def _build_refusal(what: str, advice: str) -> UnreadableFile:
+    return UnreadableFile(f"the file is {what}, which is not read; {advice}")

@@ -14,7 +14,6 @@ from typing import BinaryIO, Literal, Protocol, cast
 
 import numpy as np
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap_content import (
     McapChannel,
@@ -24,7 +23,6 @@ from service.formats.mcap_content import (
     sort_columns,
 )
 from service.formats.mcap_writer import McapWriter
-from service.formats.time_columns import find_clock_start
 from service.formats.topics import (
     DATASET_RECORD,
     TIME_FIELD,
@@ -37,9 +35,10 @@ from service.formats.topics import (
     make_topic,
     parse_manifest,
 )
-from sysid.core.errors import InvalidRecord
+from sysid.core.errors import InvalidRecord, UnreadableFile
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Record, Recording
+from sysid.data.table_rules import find_clock_start
 
 
 class ByteSink(Protocol):
@@ -185,12 +184,12 @@ _TopicColumns = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
 McapSource = str | os.PathLike[str] | bytes | BinaryIO
 
 
-def read_recording(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
+def read_mcap(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
     """Read a recording from an MCAP file (path, content, or seekable stream).
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is damaged, too large, or holds no signal.
     """
     return read_mcap_with_notes(source, limits)[0]
@@ -203,10 +202,10 @@ def read_fitted_outputs(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is damaged or of another kind.
     """
-    recording = read_recording(source, limits)
+    recording = read_mcap(source, limits)
     fits = []
     for channel in recording.channels:
         prefix, _, signal = channel.name.rpartition("/")
@@ -227,7 +226,7 @@ def read_fitted_outputs(
             )
         )
     if not fits:
-        raise InvalidUpload("the file holds no fitted signals")
+        raise UnreadableFile("the file holds no fitted signals")
     return tuple(fits)
 
 
@@ -238,7 +237,7 @@ def read_mcap_with_notes(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is damaged, too large, or holds no signal.
     """
     with _open_binary(source) as (binary, size):
@@ -268,7 +267,7 @@ def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> R
     try:
         manifest = parse_manifest(metadata)
     except ValueError as error:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the metadata record {DATASET_RECORD!r} cannot be used: {error}"
         ) from None
     topics: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
@@ -288,7 +287,7 @@ def _decode_topic(
     log_times, columns, _ = sort_columns(source)
     times = manifest.clocks[source.topic].to_times(log_times, columns.get(TIME_FIELD))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
-        raise InvalidUpload(f"the times of topic {source.topic!r} decrease or are not finite")
+        raise UnreadableFile(f"the times of topic {source.topic!r} decrease or are not finite")
     return times, columns
 
 
@@ -305,7 +304,7 @@ def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns)
     try:
         return replace(channel, history=history)
     except InvalidRecord as error:
-        raise InvalidUpload(str(error)) from None
+        raise UnreadableFile(str(error)) from None
 
 
 def _find_column(
@@ -313,7 +312,7 @@ def _find_column(
 ) -> tuple[FloatArray, FloatArray]:
     times, columns = topics.get(topic, (np.empty(0), {}))
     if field not in columns:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"{what} refers to field {field!r} of topic {topic!r}, which the file does not have"
         )
     return times, columns[field]
@@ -347,7 +346,7 @@ def _build_foreign_recording(
             name = _choose_free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
             channels[name] = Channel(name, times, values)
     if len(channels) > limits.channels:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the file has {len(channels)} signals; at most {limits.channels} are read"
         )
     clock = find_clock_start(start / 1e9)

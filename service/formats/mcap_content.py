@@ -8,7 +8,6 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import UploadLimits
 from service.formats.mcap_messages import (
     FlatLayout,
@@ -28,6 +27,7 @@ from service.formats.mcap_records import (
     iterate_records,
 )
 from service.formats.topics import LATEST_NS
+from sysid.core.errors import UnreadableFile
 
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
@@ -56,7 +56,7 @@ def read_content(binary: BinaryIO, size: int, limits: UploadLimits) -> McapConte
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is damaged, exceeds a limit, or contradicts itself; with the byte.
     """
     reader = _ContentReader(limits)
@@ -217,11 +217,11 @@ def sort_columns(
     return times[order], {name: values[order] for name, values in columns.items()}, True
 
 
-def build_no_signal_error(content: McapContent) -> InvalidUpload:
+def build_no_signal_error(content: McapContent) -> UnreadableFile:
     """Return the error of a file without a signal, with a reason for each topic."""
     reasons = [
         f"topic {source.topic!r}: {source.refusal or 'there is no message'}"
         for source in content.channels.values()
     ]
     listed = "; ".join(reasons[:5]) or "it has no channel"
-    return InvalidUpload(f"the file holds no signal ({listed})")
+    return UnreadableFile(f"the file holds no signal ({listed})")

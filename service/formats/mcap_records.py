@@ -15,9 +15,9 @@ import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import UploadLimits
 from service.formats.mcap_writer import FOOTER_BODY, MCAP_MAGIC
+from sysid.core.errors import UnreadableFile
 
 RECORD_HEAD: Final = struct.Struct("<BQ")
 _OPCODE_NAMES: Final = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
@@ -47,7 +47,7 @@ class RawRecord(NamedTuple):
 
     def raise_invalid(self, what: str) -> NoReturn:
         """Raise the error of this record."""
-        raise InvalidUpload(f"the {self.name} record {what}", byte=self.byte)
+        raise UnreadableFile(f"the {self.name} record {what}", byte=self.byte)
 
 
 def describe_opcode(opcode: int) -> str:
@@ -112,7 +112,7 @@ class _CheckedStream:
         left = self.size - self.at
         data = self._stream.read(length) if length <= left else b""
         if len(data) != length:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the file ends inside {what} ({length} bytes needed, {left} left); "
                 "it is truncated",
                 byte=self.at,
@@ -127,17 +127,17 @@ def iterate_records(binary: BinaryIO, size: int, limits: UploadLimits) -> Iterat
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         At the first invalid record; with the byte.
     """
     if size > limits.file_bytes:
-        raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
+        raise UnreadableFile(f"the file has {size} bytes; at most {limits.file_bytes} are read")
     stream = _CheckedStream(binary, size)
     if (
         size < len(MCAP_MAGIC)
         or stream.read_exactly(len(MCAP_MAGIC), "the magic bytes") != MCAP_MAGIC
     ):
-        raise InvalidUpload("the file does not begin with the magic bytes of MCAP", byte=0)
+        raise UnreadableFile("the file does not begin with the magic bytes of MCAP", byte=0)
     record = _read_record(stream, limits)
     if record.opcode != Opcode.HEADER:
         record.raise_invalid("stands where the header should be")
@@ -157,7 +157,7 @@ def _read_record(stream: _CheckedStream, limits: UploadLimits) -> RawRecord:
         stream.read_exactly(RECORD_HEAD.size, "the head of a record")
     )
     if opcode == 0:
-        raise InvalidUpload("a record has opcode 0, which is no record", byte=start)
+        raise UnreadableFile("a record has opcode 0, which is no record", byte=start)
     if length > limits.record_bytes:
         RawRecord(opcode, start, b"").raise_invalid(
             f"declares {length} bytes; at most {limits.record_bytes} are read"
@@ -186,9 +186,9 @@ def _check_end(stream: _CheckedStream, limits: UploadLimits) -> None:
     fields.read_u64()
     _check_crc(record, fields.read_u32(), zlib.crc32(head, crc), "summary")
     if stream.read_exactly(len(MCAP_MAGIC), "the closing magic bytes") != MCAP_MAGIC:
-        raise InvalidUpload("the file does not end with the magic bytes of MCAP", byte=stream.at)
+        raise UnreadableFile("the file does not end with the magic bytes of MCAP", byte=stream.at)
     if stream.at != stream.size:
-        raise InvalidUpload("there are bytes after the end of the file's content", byte=stream.at)
+        raise UnreadableFile("there are bytes after the end of the file's content", byte=stream.at)
 
 
 def _check_crc(record: RawRecord, stored: int, computed: int, what: str) -> None:
@@ -204,7 +204,7 @@ def decompress_chunk(record: RawRecord, limits: UploadLimits) -> bytes:
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If its declared or actual size is too large, if it is damaged, or if the compression is
         unknown.
     """

@@ -1,28 +1,36 @@
 """Read a recording from a file of any kind: the one reader of Python, command line and service."""
 
 import os
-import warnings
 from collections.abc import Sequence
-from numbers import Real
+from contextlib import suppress
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Protocol, runtime_checkable
 
-from service.formats.errors import InvalidUpload
-from service.formats.file_kinds import detect_kind
-from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+import numpy as np
+
+from service.core.temporary_files import make_temporary_prefix
+from service.formats.advice import build_period_error
+from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
+from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
+from sysid.data.table_rules import tell_notes
 
 
-class ReadingNote(UserWarning):
-    """What was guessed or found while a file was read."""
+@runtime_checkable
+class Readable(Protocol):
+    """An open file, or another object that can be read."""
+
+    def read(self) -> bytes | str:
+        """Return the content that is left."""
 
 
 def read_recording(
-    source: str | os.PathLike[str] | bytes,
+    source: str | os.PathLike[str] | bytes | Readable,
     *,
     sample_time: float | None = None,
-    segments: Sequence[str] = (),
-    limits: UploadLimits = DEFAULT_LIMITS,
+    segments: Sequence[str] | str = (),
 ) -> Recording:
     r"""Read a recording: text of columns, Excel, Parquet, NumPy, MATLAB or MCAP.
 
@@ -31,78 +39,88 @@ def read_recording(
 
     Parameters
     ----------
-    source : path or bytes
-        A file's path, or its content.
+    source : path, bytes or open file
+        A file's path, its content, or an object that can be read.
     sample_time : float or None
         Sampling period in s, for a file without a time column.
     segments : sequence of str
-        Columns of labels that divide the rows into segments, each measured on its own.
-    limits : UploadLimits
+        Columns of labels that divide the rows into segments, each measured on its own. A text
+        is one column.
 
     Raises
     ------
-    InvalidUpload
-        If the file cannot be used; in one line, with the row and the column.
+    UnreadableFile
+        If the file cannot be used; in one line, with the name, the row and the column.
     FileNotFoundError
         If there is no such file.
 
     Examples
     --------
     >>> content = b"t [ms],valve [%],flow [l/min]\n0,0,1.5\n100,50,1.6\n200,50,2.8\n"
+    >>> import warnings
     >>> with warnings.catch_warnings(action="ignore"):
     ...     recording = read_recording(content)
     >>> recording.names, recording.channel("flow").unit, recording.duration
     (('valve', 'flow'), 'l/min', 0.2)
     """
-    recording, notes = read_with_notes(
-        source, sample_time=sample_time, segments=segments, limits=limits
-    )
-    for note in notes:
-        warnings.warn(note, ReadingNote, stacklevel=2)
+    recording, notes = read_with_notes(source, sample_time=sample_time, segments=segments)
+    tell_notes(notes)
     return recording
 
 
 def read_with_notes(
-    source: str | os.PathLike[str] | bytes,
+    source: str | os.PathLike[str] | bytes | Readable,
     *,
     sample_time: float | None = None,
-    segments: Sequence[str] = (),
-    limits: UploadLimits | None = None,
+    segments: Sequence[str] | str = (),
+    limits: UploadLimits = DEFAULT_LIMITS,
 ) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and return the notes with it; see `read_recording`.
 
     Plain text is read by this process, every other file by a child with limits.
     """
-    if isinstance(source, bytes):
-        with NamedTemporaryFile(prefix="lagid-") as file:
-            file.write(source)
+    if sample_time is not None and not isinstance(sample_time, int | float | np.number):
+        raise build_period_error(sample_time)
+    labels = (segments,) if isinstance(segments, str) else tuple(segments)
+    options = ReadOptions(sample_time, labels, limits)
+    content = source.read() if isinstance(source, Readable) else source
+    if isinstance(content, str) and content is not source:
+        content = content.encode()
+    if isinstance(content, bytes):
+        with NamedTemporaryFile(prefix=make_temporary_prefix()) as file:
+            file.write(content)
             file.flush()
-            return read_with_notes(
-                file.name, sample_time=sample_time, segments=segments, limits=limits
-            )
-    _check_arguments(source, sample_time, segments)
-    path, limits = Path(source), DEFAULT_LIMITS if limits is None else limits
-    if path.is_dir():
-        raise InvalidUpload(f"{path} is a folder; need a file")
-    from service.formats.csv_recordings import is_plain_text, read_csv
+            return _read_file(Path(file.name), options)
+    if not isinstance(source, str | os.PathLike):
+        raise UnreadableFile(
+            f"found {source!r}; need the path of a file, its content as bytes, or an open file"
+        )
+    try:
+        return _read_file(Path(source), options)
+    except UnreadableFile as error:
+        error.name = str(source)
+        raise
 
-    if detect_kind(path, path.suffix) == "csv" and is_plain_text(
-        path, sample_time, segments, limits
-    ):
-        return read_csv(path, sample_time=sample_time, segments=segments, limits=limits)
+
+def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:
+    if path.is_dir():
+        raise UnreadableFile("it is a folder; need a file")
+    from service.formats.csv_recordings import HoldsStamps, read_csv
+
+    sample_time, segments, limits = options.sample_time, options.segments, options.limits
+    is_packed = read_head(path).startswith(GZIP_MAGIC)  # unpacking needs limits
+    if detect_kind(path, path.suffix) == "csv" and not is_packed:
+        with suppress(HoldsStamps):
+            return read_csv(
+                path,
+                sample_time=sample_time,
+                segments=segments,
+                limits=limits,
+                accepts_stamps=False,
+            )
     from service.formats.sandbox import read_untrusted
 
     upload = read_untrusted(
         path, limits, suffix=path.suffix, sample_time=sample_time, segments=segments
     )
     return upload.recording, upload.notes
-
-
-def _check_arguments(source: object, sample_time: object, segments: object) -> None:
-    """Refuse arguments of another kind, which Python lets through."""
-    if not isinstance(source, str | os.PathLike):
-        raise InvalidUpload(f"found {source!r}; need the path of a file, or its content as bytes")
-    if sample_time is not None and not isinstance(sample_time, Real):
-        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
-    if isinstance(segments, str):
-        raise InvalidUpload(f"segments is {segments!r}; need a list of columns: [{segments!r}]")

@@ -16,11 +16,11 @@ from typing import Any
 
 from service.core import temporary_files
 from service.core.errors import Unavailable
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import detect_kind
 from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
+from sysid.core.errors import Advice, UnreadableFile
 from sysid.data.records import Recording
 
 OUT_OF_MEMORY = ("MemoryError", "memory allocation of", "failed to allocate", "bad_alloc")
@@ -63,7 +63,7 @@ def read_untrusted(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file cannot be used for any reason.
     Unavailable
         If the disk of temporary files is full.
@@ -71,7 +71,7 @@ def read_untrusted(
     source = Path(path)
     size = source.stat().st_size
     if size > limits.file_bytes:
-        raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
+        raise UnreadableFile(f"the file has {size} bytes; at most {limits.file_bytes} are read")
     with source.open("rb") as stream:
         sha256 = file_digest(stream, "sha256").hexdigest()
     with TemporaryDirectory(prefix=temporary_files.make_temporary_prefix()) as folder:
@@ -85,7 +85,7 @@ def read_untrusted(
             "limits": asdict(limits),
         }
         notes = _parse_answer(_run_child(task, limits, folder), limits)
-        return UploadedRecording(read_recording(clean, limits), notes, sha256)
+        return UploadedRecording(read_mcap(clean, limits), notes, sha256)
 
 
 def _run_child(
@@ -110,7 +110,7 @@ def _parse_answer(
     try:
         answer = json.loads(child.stdout)
         if "error" in answer:
-            raise InvalidUpload(**answer["error"])
+            raise _build_error(**answer["error"])
         if answer.get("is_disk_full"):
             raise Unavailable(temporary_files.FULL_DISK_MESSAGE)
         return tuple(answer["notes"])
@@ -118,13 +118,17 @@ def _parse_answer(
         errors = child.stderr.decode(errors="replace")
         reason = (errors.strip().splitlines() or ["no message"])[-1]
         if any(word in errors for word in OUT_OF_MEMORY) or child.returncode == -9:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"
             ) from None
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the file crashes its reader (exit code {child.returncode}: {reason[:200]})"
         ) from None
 
 
-def _build_timeout_error(limits: UploadLimits) -> InvalidUpload:
-    return InvalidUpload(f"reading the file takes more than {limits.seconds:g} s")
+def _build_error(what: str, advice: Sequence[str] | None = None, **place: Any) -> UnreadableFile:
+    return UnreadableFile(what, None if advice is None else Advice(*advice), **place)
+
+
+def _build_timeout_error(limits: UploadLimits) -> UnreadableFile:
+    return UnreadableFile(f"reading the file takes more than {limits.seconds:g} s")

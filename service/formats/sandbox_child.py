@@ -10,13 +10,13 @@ import numpy as np
 
 from service.core.temporary_files import FULL_DISK_ERRORS
 from service.formats.csv_recordings import read_csv
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import FileKind
 from service.formats.limits import MIB, ReadOptions, UploadLimits
 from service.formats.mcap import read_mcap_with_notes, write_recording
 from service.formats.table_columns import Table
 from service.formats.table_recordings import build_recording
 from sysid.core.child_processes import limit_resources
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 
 
@@ -35,8 +35,8 @@ def main() -> int:
     )
     try:
         answer: dict[str, Any] = {"notes": _convert_file(task, limits)}
-    except InvalidUpload as error:
-        answer = {"error": _describe_invalid_upload(error)}
+    except UnreadableFile as error:
+        answer = {"error": _describe_error(error)}
     except OSError as error:
         if error.errno not in FULL_DISK_ERRORS:
             raise
@@ -53,7 +53,7 @@ def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     try:
         write_recording(recording, task["target"])
     except ValueError as error:
-        raise InvalidUpload(str(error)) from None
+        raise UnreadableFile(str(error)) from None
     return messages
 
 
@@ -93,7 +93,7 @@ def _check_finite_values(recording: Recording) -> list[str]:
     for channel in recording.channels:
         infinite = np.flatnonzero(np.isinf(channel.values))
         if infinite.size:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"channel {channel.name!r} is infinite at t = {channel.times[infinite[0]]:g} s; "
                 "values must be finite (NaN is a missing value)"
             )
@@ -107,8 +107,9 @@ def _check_finite_values(recording: Recording) -> list[str]:
     return notes
 
 
-def _describe_invalid_upload(error: InvalidUpload) -> dict[str, Any]:
-    return {"what": error.what, "row": error.row, "column": error.column, "byte": error.byte}
+def _describe_error(error: UnreadableFile) -> dict[str, Any]:
+    place = {"row": error.row, "column": error.column, "byte": error.byte}
+    return {"what": error.what, "advice": error.advice, **place}
 
 
 def _describe_memory_limit(limits: UploadLimits) -> str:

@@ -5,12 +5,11 @@ from pathlib import Path
 
 from python_calamine import CalamineError, CalamineSheet, CalamineWorkbook
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import ReadOptions
 from service.formats.table_columns import Table, read_rows
 from service.formats.table_layout import TableLayout, detect_sheet_layout
+from sysid.core.errors import UnreadableFile
 
-PEEK_ROWS = 200
 _EXACT_INTEGER = 2.0**53
 
 
@@ -19,36 +18,36 @@ def read_sheets(path: Path, options: ReadOptions, notes: list[str]) -> Table:
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If no sheet can be read; the fault is that of the first one.
     """
     try:
         book = CalamineWorkbook.from_path(path)
         sheets = [book.get_sheet_by_name(name) for name in book.sheet_names]
     except CalamineError as error:
-        raise InvalidUpload(f"the spreadsheet cannot be opened ({error})") from None
+        raise UnreadableFile(f"the spreadsheet cannot be opened ({error})") from None
     full = [sheet for sheet in sheets if sheet.height]
     faults, limits = [], options.limits
     for sheet in full:
         if sheet.height * max(sheet.width, 1) > limits.messages:
-            raise InvalidUpload(f"sheet {sheet.name!r} has more than {limits.messages} cells")
+            raise UnreadableFile(f"sheet {sheet.name!r} has more than {limits.messages} cells")
         try:
             rows, layout = _find_table(sheet, options)
-        except InvalidUpload as fault:
+        except UnreadableFile as fault:
             faults.append(fault)
             continue
         if len(full) > 1:
             notes.append(f"sheet {sheet.name!r} was read, one of {len(full)} sheets")
         notes += layout.notes
         return read_rows(iter(rows[layout.skipped :]), layout, notes, limits.messages)
-    raise faults[0] if faults else InvalidUpload("the spreadsheet is empty")
+    raise faults[0] if faults else UnreadableFile("the spreadsheet is empty")
 
 
 def _find_table(sheet: CalamineSheet, options: ReadOptions) -> tuple[list[list[str]], TableLayout]:
     rows = [[_write_cell(cell) for cell in row] for row in sheet.to_python(skip_empty_area=False)]
     rows = _cut_empty_columns(rows)
     layout = detect_sheet_layout(
-        rows[:PEEK_ROWS], options.segments, options.sample_time, options.limits.channels
+        rows, options.segments, options.sample_time, options.limits.channels
     )
     return rows, layout
 

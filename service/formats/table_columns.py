@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.text import unescape_formula
-from service.formats.cells import FLAGS, MISSING
-from service.formats.errors import InvalidUpload
+from service.formats.cells import FLAGS, MISSING, classify_cell
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.table_layout import (
     MAX_FOOTER_ROWS,
@@ -21,6 +20,7 @@ from service.formats.table_layout import (
     is_comment,
     split_blanks,
 )
+from sysid.core.errors import Advice, UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 
 BLOCK_ROWS = 50_000
@@ -42,7 +42,7 @@ class Table:
     sample_time : float or None
         Sampling period in s, if it was given.
     is_utc : bool
-        Whether time stamps are in UTC; else they are local.
+        Whether the time stamps of the times are in UTC; else they are local.
     """
 
     columns: tuple[TableColumn, ...]
@@ -68,7 +68,7 @@ def read_lines(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a row is ragged, a number is a text or infinite, or a time is missing; with row and
         column. Also if there are no rows, or more than `max_rows`.
     """
@@ -80,7 +80,7 @@ def read_lines(
         return read_rows(reader, layout, notes, max_rows)
     except csv.Error as error:
         row = layout.skipped + reader.line_num
-        raise InvalidUpload(f"this row cannot be read ({error})", row=row) from None
+        raise UnreadableFile(f"this row cannot be read ({error})", row=row) from None
 
 
 def read_rows(
@@ -91,18 +91,20 @@ def read_rows(
 ) -> Table:
     """Read the rows of the body, which are split into fields; raises as `read_lines`."""
     blocks = []
-    comments = 0
+    comments, sign = 0, "." if layout.separator == "," else ""
     for fields, numbers, skipped in _iterate_blocks(rows, layout, notes):
         comments += skipped
         if numbers.size and numbers[-1] > max_rows + layout.skipped:
-            raise InvalidUpload(f"the file has more than {max_rows} rows")
+            raise UnreadableFile(f"the file has more than {max_rows} rows")
         if fields:
-            blocks.append((_parse_block(fields, layout, numbers), numbers))
+            fit = _fit_rows(fields, layout, numbers)
+            sign = sign or _find_decimal_sign(fit, layout)
+            blocks.append((_parse_block(fit, layout, numbers, sign == ","), numbers))
     if not blocks:
-        raise InvalidUpload("there are no rows below the header")
+        raise UnreadableFile("there are no rows below the header")
     if comments:
         notes.append(f"comments in {comments} of the rows were skipped")
-    if layout.has_decimal_commas:
+    if sign == ",":
         notes.append("decimal commas were read as decimal points")
     values = tuple(
         np.concatenate([block[i] for block, _ in blocks]) for i in range(len(layout.columns))
@@ -153,17 +155,40 @@ def _cut_footer(
     return fields[:stop], numbers[:stop]
 
 
-def _parse_block(
+def _fit_rows(
     fields: list[list[str]], layout: TableLayout, numbers: IntArray
-) -> list[ColumnValues]:
+) -> list[tuple[str, ...]]:
+    """Return the columns of rows, which all have the width of the header."""
     width = len(layout.columns)
     for place, (row, number) in enumerate(zip(fields, numbers, strict=True)):
         if len(row) != width:
             fields[place] = _pad_row(row, layout, int(number))
-    convert = _parse_decimal_comma if layout.has_decimal_commas else _parse_decimal_point
+    return list(zip(*fields, strict=True))
+
+
+def _find_decimal_sign(texts: Sequence[tuple[str, ...]], layout: TableLayout) -> str:
+    """Find the decimal sign of the first number that has one; empty if all are whole."""
+    numeric = [
+        cells for column, cells in zip(layout.columns, texts, strict=True) if holds_numbers(column)
+    ]
+    if not any(sign in "".join(cells) for cells in numeric for sign in ".,"):
+        return ""
+    signs = (
+        "," if "," in cell else "."
+        for row in zip(*numeric, strict=True)
+        for cell in row
+        if ("," in cell or "." in cell) and classify_cell(cell) == "number"
+    )
+    return next(signs, "")
+
+
+def _parse_block(
+    texts: Sequence[tuple[str, ...]], layout: TableLayout, numbers: IntArray, has_commas: bool
+) -> list[ColumnValues]:
+    convert = _parse_decimal_comma if has_commas else _parse_decimal_point
     return [
-        _parse_column(column, texts, convert, numbers)
-        for column, texts in zip(layout.columns, zip(*fields, strict=True), strict=True)
+        _parse_column(column, cells, convert, numbers)
+        for column, cells in zip(layout.columns, texts, strict=True)
     ]
 
 
@@ -177,7 +202,7 @@ def _pad_row(row: list[str], layout: TableLayout, number: int) -> list[str]:
     hint = ""
     if layout.separator == "," and len(row) > width:
         hint = "; if commas are decimal signs, separate the columns by semicolons"
-    raise InvalidUpload(
+    raise UnreadableFile(
         f"this row has {len(row)} fields, but the header has {width}{hint}", row=number
     )
 
@@ -225,14 +250,14 @@ def _parse_field(
     try:
         value = nan if word in MISSING else FLAGS[word] if word in FLAGS else convert(text)
     except ValueError:
-        raise InvalidUpload(
-            f"found {shorten_text(text)}, which is not a number"
-            f"{_suggest_cause(text, column, convert)}",
+        raise UnreadableFile(
+            f"found {shorten_text(text)}, which is not a number; ",
+            _suggest_cause(text, column, convert),
             row=row,
             column=column.name,
         ) from None
     if isinf(value):
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"found {shorten_text(text)}; values must be finite "
             "(an empty field is a missing value)",
             row=row,
@@ -243,9 +268,9 @@ def _parse_field(
     return value
 
 
-def build_missing_time_error(text: str, row: int, column: str) -> InvalidUpload:
+def build_missing_time_error(text: str, row: int, column: str) -> UnreadableFile:
     """Return the error of a row without its time."""
-    return InvalidUpload(
+    return UnreadableFile(
         f"the time is missing (found {shorten_text(text)}); every row needs a time",
         row=row,
         column=column,
@@ -269,14 +294,19 @@ def shorten_text(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], float]) -> str:
-    if convert is _parse_decimal_comma and "." in text and not any(map(str.isalpha, text)):
-        return "; decimal points and commas are mixed: other numbers of the file have commas"
+def _suggest_cause(text: str, column: TableColumn, convert: Callable[[str], float]) -> Advice:
+    if classify_cell(text) == "number" and ("." in text or "," in text):
+        others = "commas" if convert is _parse_decimal_comma else "points"
+        return Advice(
+            f"decimal points and commas are mixed: other numbers of the file have {others}"
+        )
     if "," in text and "." in text:
-        return "; decimal points and commas are mixed: write numbers without thousands separators"
+        return Advice(
+            "decimal points and commas are mixed: write numbers without thousands separators"
+        )
     if column.role == "time":
-        return "; times are in seconds, or are date stamps in all rows"
-    return (
-        "; leave the field empty if the value is missing; if the column is a label, name it in "
-        "segments"
+        return Advice("times are in seconds, or are date stamps in all rows")
+    return Advice(
+        "leave the field empty if the value is missing; if the column is a label, name it in ",
+        "segments",
     )

@@ -10,65 +10,46 @@ import csv
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Final, Literal, NamedTuple
+from itertools import islice
+from typing import Final, Literal, NamedTuple, TypeVar
 
 from service.core.text import unescape_formula
-from service.formats.cells import CellKind, begins_like_number, classify_cell, classify_column
-from service.formats.errors import InvalidUpload
+from service.formats.advice import GIVE_PERIOD, build_period_error
+from service.formats.cells import begins_like_number, classify_cell, classify_column
 from service.formats.limits import DEFAULT_LIMITS
-from sysid.core.errors import suggest_name
-from sysid.core.units import find_conversion_factor, is_known_unit
+from sysid.core.errors import Advice, UnreadableFile, suggest_name
+from sysid.data.table_rules import (
+    INDEX_NAMES,
+    STAMP_KINDS,
+    CellKind,
+    Heading,
+    counts_rows,
+    find_time_column,
+    find_time_unit,
+    find_unit_seconds,
+    is_nameless,
+    is_plain_time_name,
+    is_time_name,
+    is_unit,
+    split_headings,
+)
 
 SEPARATORS: Final = ("\t", ";", ",", "|", " ")
 COMMENT_SIGNS: Final = ("#", "%", "//")
-TIME_NAMES: Final = ("t", "time")
-TIME_WORDS: Final = frozenset(
-    (
-        *TIME_NAMES,
-        *("timestamp", "time stamp", "datetime", "date time", "date/time", "date"),
-        *("elapsed", "elapsed time", "time elapsed", "sec", "secs", "seconds"),
-        *("zeit", "zeitstempel", "uhrzeit", "datum", "datum/zeit", "datum/uhrzeit"),
-        *("datum zeit", "datum uhrzeit", "temps", "tiempo", "tempo", "tijd", "tid", "x value"),
-    )
-)
-_DATE_WORDS: Final = frozenset(("date", "datum"))
-NO_NAMES: Final = ("", "unnamed: 0", "__index_level_0__")
-INDEX_NAMES: Final = (*NO_NAMES, "index", "no", "no.", "nr", "nr.", "#")
-"""Names of a column that is left out if it counts rows, in small letters."""
-SECOND_NAMES: Final = ("", "s", "sec", "secs", "second", "seconds")
-_LONG_UNITS: Final = {
-    **dict.fromkeys(("minute", "minutes", "mins"), "min"),
-    **dict.fromkeys(("hour", "hours", "hrs"), "h"),
-    **dict.fromkeys(("millisecond", "milliseconds", "msec", "msecs"), "ms"),
-    **dict.fromkeys(("microsecond", "microseconds", "usec", "usecs", "μs"), "us"),
-    **dict.fromkeys(("nanosecond", "nanoseconds", "nsec"), "ns"),
-    "days": "day",
-}
-MAX_TIME_UNIT = 86_400.0
-"""Longest unit of time in s (a day); a longer one is taken for a mistake."""
-PEEK_CELLS = 20_000
+PEEK_ROWS = 200
+"""First rows that are looked at, and twice as many while they hold no data."""
+MAX_PEEK_ROWS = 3200
+PEEK_CELLS = 40_000
 """Most cells of the first rows that are looked at."""
 MAX_FOOTER_ROWS = 20
 """Most rows of words below the data, such as mean values; more are faults."""
 _MAX_UNIT_CHARACTERS = 12
 
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$", re.DOTALL)
-_PARENTHESES = re.compile(r"^(?P<name>.*?)\s*\((?P<unit>[^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
-_SLASH = re.compile(r"^(?P<name>[^/]+?)\s*(?:/|\s+in\s+)\s*\(?(?P<unit>[^()]+?)\)?$", re.DOTALL)
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
-_DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
 
+_T = TypeVar("_T")
 ColumnRole = Literal["time", "date", "label", "value", "nameless", "text"]
 """``date`` completes a time of day; ``nameless`` and ``text`` are left out of the recording."""
-
-
-class Heading(NamedTuple):
-    """Name and unit of a column, and what its first cells hold."""
-
-    name: str
-    unit: str
-    kind: CellKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +71,6 @@ class TableLayout:
     columns : tuple of TableColumn
     separator : str
         Of the fields in a line; ``" "`` is any blanks, and empty if the rows are fields already.
-    has_decimal_commas : bool
     header_row : int
         Row of the header in the file, from 1.
     skipped : int
@@ -102,7 +82,6 @@ class TableLayout:
 
     columns: tuple[TableColumn, ...]
     separator: str
-    has_decimal_commas: bool
     header_row: int = 1
     skipped: int = 1
     sample_time: float | None = None
@@ -141,39 +120,67 @@ class _DataBlock(NamedTuple):
 
 
 def detect_layout(
-    lines: Sequence[str],
+    lines: Iterator[str],
     segments: Sequence[str],
     sample_time: float | None,
     max_channels: int = DEFAULT_LIMITS.channels,
-) -> TableLayout:
-    """Detect the layout of a text from its first lines.
+) -> tuple[TableLayout, list[str]]:
+    """Detect the layout of a text, and return the first lines, which were read for it.
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If there is no usable header, if it has too many signals, or if the time is missing or given
-        twice.
+        twice. Also if the text is empty.
     """
+    first: list[str] = []
+    for first in _peek(lines):
+        if not any(map(str.strip, first)):
+            continue
+        blocks = list(_find_text_blocks(first, len(segments), max_channels))
+        if any(block.data for block in blocks):
+            break
+    if not first:
+        raise UnreadableFile("the file is empty; need a header and rows, such as t,u,y")
+    if not any(map(str.strip, first)):
+        raise UnreadableFile("the first rows are empty; need a header such as t,u,y", row=1)
+    block = _choose_block(blocks, first)
+    return _build_layout(block, segments, sample_time, max_channels), first
+
+
+def _find_text_blocks(lines: Sequence[str], labels: int, max_channels: int) -> Iterator[_DataBlock]:
+    """Find the data under each separator."""
     hint = re.match(r'"?sep=(.)"?\s*$', lines[0], re.IGNORECASE)
-    blocks = []
     for separator in (hint[1],) if hint else SEPARATORS:
         if hint or separator == " " or any(separator in line for line in lines):
             rows = _split_lines(lines[1:] if hint else lines, separator, int(bool(hint)))
-            _check_width(rows, len(segments), max_channels)
-            blocks.append(_find_block(rows, separator))
-    return _build_layout(_choose_block(blocks, lines), segments, sample_time, max_channels)
+            _check_width(rows, labels, max_channels)
+            yield _find_block(rows, separator)
 
 
 def detect_sheet_layout(
-    rows: Sequence[list[str]],
+    rows: Iterable[list[str]],
     segments: Sequence[str],
     sample_time: float | None,
     max_channels: int = DEFAULT_LIMITS.channels,
 ) -> TableLayout:
     """Detect the layout of rows that are split already; raises as `detect_layout`."""
-    numbered = [_Row(place, fields) for place, fields in enumerate(rows)]
-    _check_width(numbered, len(segments), max_channels)
-    return _build_layout(_find_block(numbered, ""), segments, sample_time, max_channels)
+    block = _DataBlock("", [], [])
+    for first in _peek(iter(rows)):
+        numbered = [_Row(place, fields) for place, fields in enumerate(first)]
+        _check_width(numbered, len(segments), max_channels)
+        block = _find_block(numbered, "")
+        if block.data:
+            break
+    return _build_layout(block, segments, sample_time, max_channels)
+
+
+def _peek(rows: Iterator[_T]) -> Iterator[list[_T]]:
+    """Yield the first rows, and all of more and more first rows while they are asked for."""
+    first: list[_T] = []
+    while len(first) < MAX_PEEK_ROWS and (more := list(islice(rows, len(first) or PEEK_ROWS))):
+        first += more
+        yield first
 
 
 def split_blanks(lines: Iterable[str]) -> Iterator[str]:
@@ -196,7 +203,7 @@ def _split_lines(lines: Sequence[str], separator: str, first: int) -> list[_Row]
             if cells > PEEK_CELLS:
                 break
     except csv.Error as error:
-        raise InvalidUpload(f"the first rows cannot be read ({error})") from None
+        raise UnreadableFile(f"the first rows cannot be read ({error})") from None
     return rows
 
 
@@ -214,7 +221,7 @@ def _join_units(fields: list[str]) -> list[str]:
 def _check_width(rows: Sequence[_Row], labels: int, max_channels: int) -> None:
     """Refuse a table that is too wide before its cells are looked at."""
     if rows and len(rows[0].fields) - labels - 1 > max_channels:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the header has {len(rows[0].fields)} columns; at most {max_channels} signals are "
             "read",
             row=rows[0].place + 1,
@@ -318,7 +325,7 @@ def _build_layout(
     names, cells = _align_header(names, cells)
     headings = [
         Heading(name, unit, classify_cells([row[i] for row in cells], name))
-        for i, (name, unit) in enumerate(split_headings(names, units))
+        for i, (name, unit) in enumerate(read_headings(names, units))
     ]
     row = header.place + 1
     if len(headings) == 1 and (sample_time is None or _is_number(names[0])):
@@ -330,9 +337,8 @@ def _build_layout(
         notes.append(f"the header is in row {row}; the lines before it were skipped")
     if units:
         notes.append(f"row {row + 1} was read as the units of the columns")
-    commas = block.separator != "," and any(_DECIMAL_COMMA.match(c) for r in cells for c in r)
     skipped = block.data[0].place if block.data else header.place + 1
-    return TableLayout(columns, block.separator, commas, row, skipped, sample_time, tuple(notes))
+    return TableLayout(columns, block.separator, row, skipped, sample_time, tuple(notes))
 
 
 def classify_cells(cells: Sequence[str], name: str) -> CellKind:
@@ -360,21 +366,21 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
         if len(names) == block.width and not all(map(_is_number, names)):
             return row, [], names
     if not block.data:
-        raise InvalidUpload("there are no rows below the header")
+        raise UnreadableFile("there are no rows below the header")
     first = block.data[0]
     if block.width == 1:
         raise _build_narrow_error(first.fields[0])
     raise _build_header_error(first.place + 1)
 
 
-def _build_header_error(row: int | None) -> InvalidUpload:
-    return InvalidUpload(
+def _build_header_error(row: int | None) -> UnreadableFile:
+    return UnreadableFile(
         "the first row holds numbers; need a header that names the columns, such as t,u,y", row=row
     )
 
 
-def _build_narrow_error(name: str) -> InvalidUpload:
-    return InvalidUpload(
+def _build_narrow_error(name: str) -> UnreadableFile:
+    return UnreadableFile(
         f"there is only one column ({name.strip()!r}); need a time column and a signal, separated "
         "by comma, semicolon, tab or blanks"
     )
@@ -400,15 +406,15 @@ def _is_unit_row(fields: Sequence[str], names: Sequence[str]) -> bool:
     times = [
         unit
         for unit, name in zip(units, names, strict=False)
-        if _find_time_word(_split_heading(name, slashes=True)[0]) is not None
+        if is_time_name(split_headings([name])[0][0])
     ]
-    if not times and any(_find_time_word(unit) in TIME_NAMES for unit in full):
+    if not times and any(map(is_plain_time_name, full)):
         return False  # it names the time, and the row above does not
     return (
         bool(full)
         and all(len(unit) <= _MAX_UNIT_CHARACTERS for unit in full)
         and (not times or any(find_unit_seconds(unit) is not None for unit in times))
-        and 2 * sum(map(_is_unit, full)) > len(full)
+        and 2 * sum(map(is_unit, full)) > len(full)
     )
 
 
@@ -428,46 +434,15 @@ def _align_header(names: list[str], cells: list[list[str]]) -> tuple[list[str], 
     return names, cells if width == len(names) else []
 
 
-def counts_rows(texts: Sequence[str]) -> bool:
-    """Whether cells count rows from 0 or from 1."""
-    first = texts[0].strip() if texts else ""
-    return (
-        len(texts) > 1
-        and first in ("0", "1")
-        and all(text.strip() == str(number) for number, text in enumerate(texts, int(first)))
-    )
-
-
-def split_headings(names: Sequence[str], units: Sequence[str] = ()) -> list[tuple[str, str]]:
+def read_headings(names: Sequence[str], units: Sequence[str] = ()) -> list[tuple[str, str]]:
     """Split the names of columns into name and unit; `units` are those of a row below them."""
-    slashes = any(
-        _find_time_word(name) is not None and find_unit_seconds(unit) is not None and unit
-        for name, unit in (_split_heading(text, slashes=True) for text in names)
-    )
-    split = [_split_heading(text, slashes=slashes) for text in names]
+    split = split_headings([unescape_formula(name.strip()) for name in names])
     if not units:
         return split
     return [
         (name, unit or _strip_brackets(below))
         for (name, unit), below in zip(split, units, strict=False)
     ]
-
-
-def _split_heading(field: str, *, slashes: bool) -> tuple[str, str]:
-    """Split ``u [V]``, ``u (V)`` or, as a standard writes it, ``u/V`` into name and unit."""
-    text = unescape_formula(field.strip())
-    if match := _BRACKETS.match(text):
-        return match["name"], match["unit"].strip()
-    if (match := _PARENTHESES.match(text)) and _is_unit(match["unit"]) and match["name"]:
-        return match["name"].rstrip(" /"), match["unit"].strip()
-    if slashes and (match := _SLASH.match(text)) and _is_unit(match["unit"]):
-        return match["name"], match["unit"].strip()
-    return text, ""
-
-
-@lru_cache(maxsize=1024)
-def _is_unit(text: str) -> bool:
-    return is_known_unit(text) or (bool(text.strip()) and find_unit_seconds(text) is not None)
 
 
 def _is_number(field: str) -> bool:
@@ -489,12 +464,12 @@ def assign_roles(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a name is missing or occurs twice, a label column is missing, or there is no signal or no
         time. Also if the time is given twice.
     """
     named = [
-        TableColumn(*heading, role="nameless" if _is_nameless(heading) else "value")
+        TableColumn(*heading, role="nameless" if is_nameless(heading) else "value")
         for heading in headings
     ]
     _check_names(named, row)
@@ -505,14 +480,12 @@ def assign_roles(
     names = [column.name for column in columns]
     for label in segments:
         if label not in names:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"there is no label column {label!r}{suggest_name(label, names)}", row=row
             )
     columns = _assign_time(columns, sample_time, row)
     columns = [
-        replace(c, role="text")
-        if c.role == "value" and c.kind in ("text", "stamp", "date", "clock")
-        else c
+        replace(c, role="text") if c.role == "value" and c.kind in ("text", *STAMP_KINDS) else c
         for c in columns
     ]
     for number, column in enumerate(columns, 1):
@@ -520,23 +493,18 @@ def assign_roles(
             raise build_nameless_error(number, row)
     signals = sum(column.role == "value" for column in columns)
     if signals == 0 and not any(column.role == "text" for column in columns):
-        raise InvalidUpload("there is no signal: every column is time or a label")
+        raise UnreadableFile("there is no signal: every column is time or a label")
     if signals > max_channels:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the header has {len(headings)} columns; at most {max_channels} signals are read",
             row=row,
         )
     return tuple(columns)
 
 
-def build_nameless_error(number: int, row: int | None = 1) -> InvalidUpload:
+def build_nameless_error(number: int, row: int | None = 1) -> UnreadableFile:
     """Return the error of a column of values without a name."""
-    return InvalidUpload(f"column {number} of the header has no name", row=row)
-
-
-def _is_nameless(heading: Heading) -> bool:
-    """Whether a column has no name of its own: that of an index, or none."""
-    return heading.kind == "count" or heading.name.lower() in NO_NAMES
+    return UnreadableFile(f"column {number} of the header has no name", row=row)
 
 
 def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
@@ -545,7 +513,7 @@ def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
     seen: set[str] = set()
     for column in columns:
         if column.name in seen and column.name:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 "two columns have this name; names must differ", row=row, column=column.name
             )
         seen.add(column.name)
@@ -555,30 +523,39 @@ def _assign_time(
     columns: Sequence[TableColumn], sample_time: float | None, row: int | None
 ) -> list[TableColumn]:
     """Give their roles to the column of times, and to that of dates beside times of day."""
-    time = _find_time_column(columns)
+    time = find_time_column(
+        [
+            Heading(column.name, column.unit, column.kind)
+            if column.role in ("value", "nameless")
+            else None
+            for column in columns
+        ],
+        has_period=sample_time is not None,
+    )
     if sample_time is not None and not 0 < sample_time < float("inf"):
-        raise InvalidUpload(f"sample_time is {sample_time!r}; need a positive number of seconds")
+        raise build_period_error(sample_time)
     if time is None:
         if sample_time is None:
             names = ", ".join(column.name for column in columns if column.name)
-            raise InvalidUpload(
-                f"there is no time column; found {names}. Name one of them t (in seconds), or give "
-                "the sampling period with sample_time.",
+            raise UnreadableFile(
+                f"there is no time column; found {names}. Name one of them t (in seconds), or ",
+                GIVE_PERIOD,
                 row=row,
             )
         return list(columns)
     column = columns[time]
-    name, unit = _split_time_name(column.name, column.unit)
-    if sample_time is not None and column.kind not in ("stamp", "date", "clock"):
-        raise InvalidUpload(
-            "the file has this time column, and sample_time is given too; remove one of them",
+    name, unit = column.name, find_time_unit(column.name, column.unit)
+    if sample_time is not None and column.kind not in STAMP_KINDS:
+        raise UnreadableFile(
+            "the file has this time column. Remove it, or ",
+            Advice("leave out ", "sample_time"),
             row=row,
             column=name,
         )
-    if column.kind in ("stamp", "date", "clock"):
+    if column.kind in STAMP_KINDS:
         unit = ""
     elif find_unit_seconds(unit) is None:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
             row=row,
             column=name,
@@ -594,34 +571,6 @@ def _assign_time(
     return roles
 
 
-def _find_time_column(columns: Sequence[TableColumn]) -> int | None:
-    """Find the column of times: by a usual name, or because it holds time stamps."""
-    free = [(i, column) for i, column in enumerate(columns) if column.role in ("value", "nameless")]
-    ranks = []
-    for i, column in free:
-        word = _find_time_word(column.name)
-        is_stamp = column.kind in ("stamp", "date", "clock")
-        if word in TIME_NAMES and column.role == "value":
-            ranks.append((0 if column.name != "T" else 5, i))  # T is often a temperature
-        elif word is not None and (is_stamp or word not in _DATE_WORDS):
-            ranks.append((1 if column.kind == "stamp" else 2, i))
-        elif is_stamp:
-            ranks.append((3 if column.kind == "stamp" else 4, i))
-        elif column.role == "nameless" and column.kind == "number" and (i == 0 or column.name):
-            ranks.append((6, i))  # the index of a table, which is its time
-    return min(ranks)[1] if ranks else None
-
-
-def is_plain_time_name(name: str) -> bool:
-    """Whether a column is called ``t`` or ``time``, so that its unit is s unless it has one."""
-    return _find_time_word(name) in TIME_NAMES
-
-
-def is_time_name(name: str) -> bool:
-    """Whether a column of this name holds times."""
-    return _find_time_word(name) is not None
-
-
 def _find_other_half(columns: Sequence[TableColumn], time: int) -> int | None:
     """Find the column of dates of a column of times of day, or the reverse."""
     wanted = {"clock": "date", "date": "clock"}.get(columns[time].kind)
@@ -633,29 +582,3 @@ def _find_other_half(columns: Sequence[TableColumn], time: int) -> int | None:
         ),
         None,
     )
-
-
-def _find_time_word(name: str) -> str | None:
-    """Return the usual name of time that a name is, without a unit at its end."""
-    text = " ".join(re.sub(r"[_-]", " ", name.lower()).split())
-    if text in TIME_WORDS:
-        return text
-    word, _, unit = text.rpartition(" ")
-    return word if unit and word in TIME_WORDS and find_unit_seconds(unit) is not None else None
-
-
-def _split_time_name(name: str, unit: str) -> tuple[str, str]:
-    """Split a unit from the name of a time column, such as ``time_ms``."""
-    end = re.split(r"[ _-]", name)[-1].lower()
-    if unit or end in SECOND_NAMES or end == name.lower() or find_unit_seconds(end) is None:
-        return name, unit
-    return name, end
-
-
-def find_unit_seconds(unit: str) -> float | None:
-    """Return the seconds in one unit of a time column; None if it is no unit of time."""
-    lower = unit.strip().lower()
-    if lower in SECOND_NAMES:
-        return 1.0
-    seconds = find_conversion_factor(_LONG_UNITS.get(lower, unit.strip()), "s")
-    return seconds if seconds is not None and 0 < seconds <= MAX_TIME_UNIT else None

@@ -1,28 +1,37 @@
 """Make a recording of the columns of a table: times, segments, channels, and notes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import floor, log10
 
 import numpy as np
 
+from service.formats.advice import GIVE_PERIOD
 from service.formats.cells import begins_like_number, classify_cell
-from service.formats.errors import InvalidUpload
-from service.formats.table_columns import ColumnValues, Table, holds_numbers, shorten_text
-from service.formats.table_layout import (
-    TableColumn,
-    build_nameless_error,
-    counts_rows,
+from service.formats.table_columns import (
+    ColumnValues,
+    Table,
+    holds_numbers,
+    parse_texts,
+    shorten_text,
 )
+from service.formats.table_layout import TableColumn, build_nameless_error
 from service.formats.time_columns import (
-    ClockTimes,
     join_dates,
     parse_stamps,
     read_clock_times,
-    read_number_times,
     read_stamp_times,
 )
+from sysid.core.errors import Advice, UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
+from sysid.data.table_rules import (
+    INDEX_NAMES,
+    NO_NAMES,
+    TimeAxis,
+    counts_rows,
+    read_number_times,
+)
 
 SegmentLabels = Mapping[str, float | str]
 
@@ -67,14 +76,15 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the columns cannot be used, with the row and the column.
     """
+    table = _name_signals(table, notes)
     _check_left_out(table, notes)
     labels = [column.name for column in table.columns if column.role == "label"]
     starts = _find_segment_starts(table, labels)
     clock = _build_times(table, starts, notes)
-    times, spans = clock.times, tuple[Segment, ...]()
+    times, spans = clock.seconds, tuple[Segment, ...]()
     if labels:
         times, spans = _build_segments(table, labels, times, starts, notes)
     else:
@@ -92,10 +102,26 @@ def build_recording(table: Table, notes: list[str]) -> Recording:
         _report_missing_values(column.name, numbers, table, notes)
         channels.append(Channel(column.name, times, numbers, column.unit or "1"))
     if not channels:
-        raise InvalidUpload("every value is missing; leave the column out", column=empty[0])
+        raise UnreadableFile("every value is missing; leave the column out", column=empty[0])
     if empty:
         notes.append(f"columns without any value were left out: {', '.join(empty)}")
     return Recording(tuple(channels), spans, clock.started_at)
+
+
+def _name_signals(table: Table, notes: list[str]) -> Table:
+    """Return the table with an index that does not count rows as a signal, and tell it."""
+    columns, values = list(table.columns), list(table.values)
+    for place, column in enumerate(columns):
+        if column.name.lower() not in INDEX_NAMES or column.name.lower() in NO_NAMES:
+            continue
+        texts = [str(value).removesuffix(".0") for value in values[place].tolist()]
+        if column.role == "nameless" and any(texts) and not counts_rows(texts):
+            columns[place] = replace(column, role="value", kind="number")
+            if values[place].dtype.kind == "U":
+                values[place] = parse_texts(columns[place], texts, table.rows)
+        if columns[place].role == "value":
+            notes.append(f"column {column.name!r} does not count the rows, so it is a signal")
+    return replace(table, columns=tuple(columns), values=tuple(values))
 
 
 def _check_left_out(table: Table, notes: list[str]) -> None:
@@ -128,7 +154,7 @@ def _check_text(
         wrong = next((i for i, text in enumerate(texts) if begins_like_number(text)), None)
         place = place if wrong is None else wrong
         if wrong is not None or is_needed:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"found {shorten_text(texts[place])}{_explain_text(texts[place])}",
                 row=int(table.rows[place]),
                 column=column.name,
@@ -151,7 +177,7 @@ def _explain_text(text: str) -> str:
     return ", which is not a number; write numbers alone, and their unit in the header: u [V]"
 
 
-def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes:
+def _build_times(table: Table, starts: IntArray, notes: list[str]) -> TimeAxis:
     """Build the times in s before segments are placed on one axis."""
     sample_time = table.sample_time
     time = next((column for column in table.columns if column.role == "time"), None)
@@ -164,15 +190,15 @@ def _build_times(table: Table, starts: IntArray, notes: list[str]) -> ClockTimes
                 f"samples are {sample_time:g} s apart; column {time.name!r} gives the start"
             )
         start = None if clock is None else clock.started_at
-        return ClockTimes(np.concatenate(counts) * sample_time, start)
+        return TimeAxis(np.concatenate(counts) * sample_time, start)
     assert time is not None  # checked with the layout
     assert clock is not None
-    _check_increasing(clock.times, starts, table, time)
-    _report_repeated_times(clock.times, starts, notes)
+    _check_increasing(clock.seconds, starts, table, time)
+    _report_repeated_times(clock.seconds, starts, notes)
     return clock
 
 
-def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -> ClockTimes:
+def _read_times(table: Table, time: TableColumn, tell: bool, notes: list[str]) -> TimeAxis:
     """Read the column of times; without `tell` only its first one counts."""
     values, told = table.find_values(time.name), notes if tell else []
     rows = table.rows
@@ -197,10 +223,10 @@ def _build_segments(
     sizes = np.diff(np.append(starts, times.size))
     singles = int(np.count_nonzero(sizes == 1))
     if starts.size > 1 and 2 * singles > starts.size:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the labels {', '.join(labels)} divide {times.size} rows into {starts.size} segments, "
-            f"of which {singles} have one sample. A label stays the same during a measurement; "
-            "leave columns of times and signals out of segments."
+            f"of which {singles} have one sample. A label stays the same during a measurement; ",
+            Advice("leave columns of times and signals out of ", "segments", "."),
         )
     values = {label: _parse_labels(table.find_values(label)) for label in labels}
     segment_labels: list[SegmentLabels] = [
@@ -239,14 +265,16 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     wrong = np.flatnonzero(stays)
     if wrong.size == 0:
         return
-    advice = "For repeated measurements, name their label columns with segments."
+    hint = "For repeated measurements, "
+    advice = Advice("name their label columns with ", "segments", ".")
     if is_stamp:
-        advice = "If the stamps are too coarse, give the sampling period with sample_time."
+        hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
-    raise InvalidUpload(
+    raise UnreadableFile(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
-        f"row to row. {advice}",
+        f"row to row. {hint}",
+        advice,
         row=int(table.rows[wrong[0] + 1]),
         column=time.name,
     )

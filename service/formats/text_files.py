@@ -9,9 +9,9 @@ from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import GZIP_MAGIC, HEAD_BYTES
 from service.formats.limits import UploadLimits
+from sysid.core.errors import UnreadableFile
 
 MAX_LINE_CHARACTERS = 1_000_000
 _BLOCK_BYTES = 1 << 20
@@ -40,7 +40,7 @@ class _LimitedGzip(gzip.GzipFile):
 
     def _check(self, data: bytes) -> bytes:
         if self.tell() > self._limit:
-            raise InvalidUpload(
+            raise UnreadableFile(
                 f"the unpacked file has more than {self._limit} bytes; split the recording"
             )
         return data
@@ -54,7 +54,7 @@ def open_text(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If the file is no text, is damaged, or exceeds a limit. Also while its lines are read.
     """
     with BytesIO(source) if isinstance(source, bytes) else Path(source).open("rb") as file:
@@ -69,7 +69,7 @@ def open_text(
             with TextIOWrapper(binary, encoding=encoding, newline="") as stream:
                 yield _iterate_lines(stream)
         except (EOFError, gzip.BadGzipFile, zlib.error):
-            raise InvalidUpload("the gzip data are damaged or cut off") from None
+            raise UnreadableFile("the gzip data are damaged or cut off") from None
 
 
 def _detect_encoding(binary: BinaryIO, notes: list[str]) -> str:
@@ -91,7 +91,7 @@ def _detect_encoding(binary: BinaryIO, notes: list[str]) -> str:
 def _refuse_control_signs(head: bytes) -> None:
     odd = next((i for i, byte in enumerate(head) if byte < 32 and byte not in b"\t\n\r\f\x1a"), -1)
     if odd >= 0:
-        raise InvalidUpload("the file is not text; need CSV or another text of columns", byte=odd)
+        raise UnreadableFile("the file is not text; need CSV or another text of columns", byte=odd)
 
 
 def _find_other_encoding(binary: BinaryIO, head: bytes) -> str | None:
@@ -118,7 +118,7 @@ def _detect_utf16(head: bytes) -> str:
         signs = head[1 - first :: 2].count(0)
         if half and head[first::2].count(0) >= _MIN_NUL_SHARE * half and not signs:
             return encoding
-    raise InvalidUpload(
+    raise UnreadableFile(
         "the file is not text; need CSV or another text of columns", byte=head.index(b"\0")
     )
 
@@ -129,12 +129,12 @@ def _iterate_lines(stream: TextIOWrapper) -> Iterator[str]:
         while line := stream.readline(MAX_LINE_CHARACTERS + 1):
             number += 1
             if len(line) > MAX_LINE_CHARACTERS:
-                raise InvalidUpload(
+                raise UnreadableFile(
                     f"the row is longer than {MAX_LINE_CHARACTERS} characters", row=number
                 )
             yield line.removesuffix("\x1a")
     except UnicodeError:
-        raise InvalidUpload(
+        raise UnreadableFile(
             f"the file is not {stream.encoding.upper()} text; save it as CSV in UTF-8",
             row=number + 1,
         ) from None

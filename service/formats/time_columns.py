@@ -1,127 +1,36 @@
-"""Columns of times as seconds from the first sample: numbers, date stamps, times of day.
-
-A clock that counts from 1970 or has dates also gives the moment of time 0 s.
-"""
+"""Texts of date stamps and times of day as seconds from the first sample."""
 
 import re
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.formats.advice import GIVE_PERIOD
 from service.formats.cells import CLOCK_TIME, DATE_ONLY, MISSING, STAMP
-from service.formats.errors import InvalidUpload
 from service.formats.table_columns import (
     ColumnValues,
     build_missing_time_error,
     shorten_text,
 )
-from service.formats.table_layout import find_unit_seconds, is_plain_time_name
+from sysid.core.errors import UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import measure_sampling
+from sysid.data.table_rules import TimeAxis, count_from_first, format_moment
 
 if TYPE_CHECKING:
     import polars as pl
 
-EPOCH_THRESHOLD_SECONDS: Final = 1e8
-"""Times (s) that begin later than this (three years) are clock times since some epoch."""
-_PLAUSIBLE_CLOCK: Final = (6.3e8, 4.2e9)  # s since 1970: the years 1990 to 2103
-_EPOCH_UNITS: Final = (("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds"))
-_DAY_SECONDS: Final = 86_400.0
-_SERIAL_DAYS: Final = (36_526.0, 73_050.0)  # of a spreadsheet: the years 2000 to 2099
-_SERIAL_ORIGIN: Final = np.datetime64("1899-12-30T00:00:00", "us")
-_EXACT_INTEGER: Final = 2.0**53
 _ZONE_FORM: Final = "%#z"
-_EXACT_DECIMALS: Final = 6  # of s since 1970 in a number of 53 bits
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClockTimes:
-    """Times in s, and the moment of time 0 s if it is known."""
-
-    times: FloatArray
-    started_at: datetime | None = None
-
-
-def find_clock_start(seconds: float) -> datetime | None:
-    """Return the moment of a clock that counts seconds since 1970; None if it cannot be one."""
-    first, last = _PLAUSIBLE_CLOCK
-    return datetime.fromtimestamp(seconds, UTC) if first <= seconds <= last else None
-
-
-def read_number_times(values: FloatArray, name: str, unit: str, notes: list[str]) -> ClockTimes:
-    """Convert a column of numbers to seconds; a clock is counted from the first sample.
-
-    Numbers without a unit are s, unless they can only be a finer clock since 1970, or the days
-    since 1900 that a spreadsheet counts.
-    """
-    if _are_serial_dates(values, unit):
-        notes.append(f"column {name!r} holds serial dates of a spreadsheet, in days")
-        return read_stamp_times(_read_serial_dates(values), name, False, notes)
-    first = float(np.min(values))
-    if not unit:
-        for symbol, word in _EPOCH_UNITS:
-            size = find_unit_seconds(symbol) or 1.0
-            if _PLAUSIBLE_CLOCK[0] <= first * size <= _PLAUSIBLE_CLOCK[1]:
-                notes.append(f"column {name!r} was read as {word} since 1970")
-                unit = symbol
-    if not unit and not is_plain_time_name(name):
-        notes.append(f"column {name!r} was read as the time in s")
-    size = find_unit_seconds(unit) or 1.0
-    if first * size < EPOCH_THRESHOLD_SECONDS:
-        if size != 1.0:
-            notes.append(
-                f"times were converted from {unit} to s: delays and time constants are in s"
-            )
-        return ClockTimes(_scale_times(values, size))
-    origin = float(values[0])
-    shown = f"{origin:.0f}" if origin >= _EXACT_INTEGER else repr(origin)
-    shifted = np.round(_scale_times(values - origin, size), _EXACT_DECIMALS if size == 1.0 else 9)
-    start = find_clock_start(float(_scale_times(np.array([origin]), size)[0]))
-    moment = "" if start is None else f" ({format_moment(start)})"
-    notes.append(
-        f"times are counted from the first sample, at {shown} {unit or 's'} of the file's clock"
-        f"{moment}"
-    )
-    return ClockTimes(shifted, start)
-
-
-def _are_serial_dates(values: FloatArray, unit: str) -> bool:
-    """Whether numbers are dates of a spreadsheet; without a unit, if they stay within a day."""
-    first, last = float(np.min(values)), float(np.max(values))
-    is_day = find_unit_seconds(unit) == _DAY_SECONDS
-    is_possible = is_day or (not unit and 0 < last - first < 1.0)
-    return is_possible and _SERIAL_DAYS[0] <= first <= last <= _SERIAL_DAYS[1]
-
-
-def _read_serial_dates(values: FloatArray) -> NDArray[np.datetime64]:
-    """Convert days to time stamps, rounded to 10 µs: a number of that size has no finer ones."""
-    ticks = np.round(values * (_DAY_SECONDS * 1e5)).astype(np.int64) * 10
-    return _SERIAL_ORIGIN + ticks.astype("timedelta64[us]")
-
-
-def _scale_times(times: FloatArray, size: float) -> FloatArray:
-    if size == 1.0:
-        return times
-    # Division by a whole number of units per second is correctly rounded, a product is not.
-    converted: FloatArray = times * size if size > 1.0 else times / round(1.0 / size)
-    return converted
-
-
-def format_moment(moment: datetime) -> str:
-    """Format a moment for notes: ``2026-01-31 12:00:00``, with UTC if that is its zone."""
-    return moment.replace(tzinfo=None).isoformat(" ") + (" UTC" if moment.tzinfo else "")
+_DAY_SECONDS: Final = 86_400.0
 
 
 def read_stamp_times(
     stamps: NDArray[np.datetime64], name: str, is_utc: bool, notes: list[str]
-) -> ClockTimes:
+) -> TimeAxis:
     """Convert time stamps to seconds from the first one, with a note on how they were read."""
-    ticks = stamps.astype("datetime64[ns]").astype(np.int64)
-    times = (ticks - ticks[0]) / 1e9
-    start: datetime = stamps[0].astype("datetime64[us]").item()
+    times, start = count_from_first(stamps)
     if is_utc:
         start = start.replace(tzinfo=UTC)
     zone = "UTC" if is_utc else "local"
@@ -129,12 +38,12 @@ def read_stamp_times(
         f"column {name!r} read as {zone} time stamps, {_describe_period(times)}, from "
         f"{format_moment(start)}"
     )
-    return ClockTimes(times, start)
+    return TimeAxis(times, start)
 
 
 def read_clock_times(
     texts: NDArray[np.str_], rows: IntArray, name: str, notes: list[str]
-) -> ClockTimes:
+) -> TimeAxis:
     """Convert times of day or elapsed times, ``12:30:00.5``; after midnight they go on."""
     matches = [CLOCK_TIME.fullmatch(text) for text in texts.tolist()]
     if None in matches:
@@ -148,7 +57,7 @@ def read_clock_times(
     notes.append(
         f"column {name!r} read as times of day, {_describe_period(times)}, from {texts[0]}"
     )
-    return ClockTimes(times)
+    return TimeAxis(times)
 
 
 def _read_clock(match: re.Match[str]) -> float:
@@ -185,7 +94,7 @@ def parse_stamps(
 
     Raises
     ------
-    InvalidUpload
+    UnreadableFile
         If a stamp is missing or has another form; with its row.
     """
     first = next((text for text in texts.tolist() if STAMP.fullmatch(text)), str(texts[0]))
@@ -262,13 +171,13 @@ def _rank_reading(stamps: NDArray[np.datetime64]) -> tuple[bool, int]:
 
 def _build_stamp_error(
     texts: NDArray[np.str_], place: int, rows: IntArray, name: str, wanted: str
-) -> InvalidUpload:
+) -> UnreadableFile:
     text, row = str(texts[place]), int(rows[place])
     if text.lower() in MISSING:
         return build_missing_time_error(text, row, name)
-    return InvalidUpload(
-        f"found {shorten_text(text)}; need {wanted}. Write all time stamps in one form, or give "
-        "the sampling period with sample_time.",
+    return UnreadableFile(
+        f"found {shorten_text(text)}; need {wanted}. Write all time stamps in one form, or ",
+        GIVE_PERIOD,
         row=row,
         column=name,
     )

@@ -1,6 +1,6 @@
 """Heartbeats of the dispatchers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
 from typing import Literal
 
@@ -24,6 +24,10 @@ STARTING_KEY = "starting"
 """Key of what a dispatcher waits for before its first job; absent once it is ready."""
 
 
+CLUSTER_KEY = "cluster"
+"""Key of the identity of a shared Ray cluster, in the same place."""
+
+
 class DispatcherRepository:
     """The dispatchers in one session."""
 
@@ -33,17 +37,22 @@ class DispatcherRepository:
     def add_dispatcher(self, owner: str, details: Document) -> None:
         """Record what a dispatcher tells, and delete those without a heartbeat for a day."""
         now, before = self._clock(), self._session.get(DispatcherHeartbeat, owner)
-        started = now if before is None else before.started_at
-        row = {"owner": owner, "details": details, "started_at": started, "seen_at": now}
+        row = {
+            "owner": owner,
+            "details": details,
+            "started_at": now if before is None else before.started_at,
+            "seen_at": now,
+            "wanted_cores": 0,
+        }
         upsert(self._session, DispatcherHeartbeat, [row])
         self._session.execute(
             delete(DispatcherHeartbeat).where(DispatcherHeartbeat.seen_at < now - _FORGET_AFTER)
         )
 
-    def record_heartbeat(self, owner: str) -> None:
+    def record_heartbeat(self, owner: str, wanted_cores: int = 0) -> None:
         """Record a heartbeat of a dispatcher, together with the renewal of its leases."""
         statement = update(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner)
-        self._session.execute(statement.values(seen_at=self._clock()))
+        self._session.execute(statement.values(seen_at=self._clock(), wanted_cores=wanted_cores))
 
     def remove_dispatcher(self, owner: str) -> None:
         """Record that a dispatcher has stopped."""
@@ -63,6 +72,17 @@ class DispatcherRepository:
             for dispatcher in self.list_all()
             if dispatcher.seen_at >= now - (find_lease_length(dispatcher) or DEFAULT_LEASE)
         ]
+
+
+def count_wanted_cores(
+    dispatchers: Iterable[DispatcherHeartbeat], cluster: str | None
+) -> dict[str, int]:
+    """Return the cores that the dispatchers of a cluster have work for, by name."""
+    return {
+        one.owner: one.wanted_cores
+        for one in dispatchers
+        if cluster is not None and one.details.get(CLUSTER_KEY) == cluster
+    }
 
 
 def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta | None:

@@ -7,16 +7,16 @@ nothing.
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple, Self, final
 
 from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
-from service.core.states import JobState
-from service.queue.admission import Admission, is_in_state
+from service.queue.admission import Admission, is_open
 from service.repositories.jobs import QUEUE_CHANNEL
 from service.storage.sessions import Database
-from service.storage.tables import Job
+from service.storage.tables import Job, Parcel
 
 if TYPE_CHECKING:
     import psycopg
@@ -129,30 +129,55 @@ class _PostgresqlNotifier(Notifier):
 
 
 # Built once: building a statement costs more than executing it.
-# Only the key, so that the indexes alone can answer.
-_QUEUED_JOBS = select(Job.id).where(is_in_state(JobState.QUEUED))
-_CANCELLED_JOBS = select(Job.id).where(
-    Job.lease_owner == bindparam("owner"), Job.state == JobState.RUNNING, Job.cancel_requested
+_WAITING_PARCELS = (
+    select(Parcel.job_id)
+    .join(Job, Job.id == Parcel.job_id)
+    .where(Parcel.lease_owner.is_(None), is_open(), ~Job.cancel_requested)
 )
-_ANY_QUEUED = select(_QUEUED_JOBS.exists())
+_CANCELLED_JOBS = (
+    select(Job.id)
+    .join(Parcel, Parcel.job_id == Job.id)
+    .where(Parcel.lease_owner == bindparam("owner"), is_open(), Job.cancel_requested)
+)
+_OF_THESE = Parcel.job_id.in_(bindparam("jobs", expanding=True))
+_ANY_WAITING = select(_WAITING_PARCELS.exists())
+_ANY_OTHER_WAITING = select(_WAITING_PARCELS.where(~_OF_THESE).exists())
+_HELD_WAITING = _WAITING_PARCELS.where(_OF_THESE).distinct()
 
 
 class QueueStatus(NamedTuple):
-    """Whether a job waits, and which jobs of a dispatcher are to be cancelled."""
+    """What waits for a dispatcher.
+
+    Attributes
+    ----------
+    has_waiting_job : bool
+        Whether a job that it does not hold has a parcel for it.
+    jobs_to_cancel : frozenset of str
+        Jobs that it holds and that are to be cancelled.
+    jobs_to_extend : frozenset of str
+        Jobs that it holds and that have another parcel for it.
+    """
 
     has_waiting_job: bool
     jobs_to_cancel: frozenset[str]
+    jobs_to_extend: frozenset[str] = frozenset()
 
 
 def read_queue_status(
-    session: Session, owner: str, admission: Admission | None = None
+    session: Session,
+    owner: str,
+    admission: Admission | None = None,
+    held: Collection[str] = (),
 ) -> QueueStatus:
-    """Read whether `admission` accepts a waiting job, and which own jobs are to be cancelled."""
-    admitted = (
-        _ANY_QUEUED
-        if admission is None
-        else select(_QUEUED_JOBS.where(admission.admits(Job)).exists())
-    )
-    is_waiting = session.scalar(admitted)
+    """Read whether `admission` accepts a waiting job, and what becomes of the `held` ones."""
+    jobs = {"jobs": list(held)}
+    if admission is not None:
+        query = _WAITING_PARCELS.where(~_OF_THESE, admission.admits(Job))
+        is_waiting = session.scalar(select(query.exists()), jobs)
+    elif held:
+        is_waiting = session.scalar(_ANY_OTHER_WAITING, jobs)
+    else:
+        is_waiting = session.scalar(_ANY_WAITING)
     cancelled = session.scalars(_CANCELLED_JOBS, {"owner": owner})
-    return QueueStatus(bool(is_waiting), frozenset(cancelled))
+    to_extend = session.scalars(_HELD_WAITING, jobs) if held else ()
+    return QueueStatus(bool(is_waiting), frozenset(cancelled), frozenset(to_extend))

@@ -1,4 +1,4 @@
-"""Progress of a leased job in its earlier attempts, and its deletion."""
+"""Progress of a leased parcel in its earlier attempts, and its deletion."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -14,43 +14,47 @@ from service.storage.tables import Checkpoint, MigrationLog, Run, RunHistory
 
 @dataclass(frozen=True, slots=True)
 class PreviousAttempts:
-    """Progress of a claimed job in its earlier attempts.
+    """Progress of a claimed parcel in its earlier attempts.
 
     Attributes
     ----------
     evaluations, generations : int
         Over the finished runs: the sum, and the largest number.
-    failure_reasons : tuple of str
-        Some distinct reasons why runs failed.
     checkpoint_evaluations : dict
         Evaluations in the checkpoints of unfinished runs, by run.
     """
 
     evaluations: int = 0
     generations: int = 0
-    failure_reasons: tuple[str, ...] = ()
     checkpoint_evaluations: dict[str, int] = field(default_factory=dict)
 
 
-def summarize_attempts(session: Session, lease: Lease, n_reasons: int) -> PreviousAttempts:
+def summarize_attempts(session: Session, lease: Lease) -> PreviousAttempts:
     """Summarize the results of earlier attempts; `LeaseLost` if the lease is not held."""
-    LeaseQueue(session).lock_job(lease)
-    of_job = Run.job_id == lease.job_id
+    parcel, _ = LeaseQueue(session).lock_lease(lease)
+    in_parcel = (
+        Run.job_id == lease.job_id,
+        Run.number >= parcel.first,
+        Run.number < parcel.stop,
+    )
     sums = select(
         func.coalesce(func.sum(Run.evaluations), 0), func.coalesce(func.max(Run.generations), 0)
-    ).where(of_job, Run.state.not_in(OPEN_STATES))
+    ).where(*in_parcel, Run.state.not_in(OPEN_STATES))
     evaluations, generations = session.execute(sums).one()
-    failed = select(Run.error).where(of_job, Run.state == JobState.FAILED, Run.error.is_not(None))
+    checkpoints = select(Checkpoint.run_id, Checkpoint.evaluations).join(
+        Run, Run.id == Checkpoint.run_id
+    )
+    of_job = checkpoints.where(Checkpoint.job_id == lease.job_id, *in_parcel)
+    return PreviousAttempts(int(evaluations), int(generations), dict(session.execute(of_job).all()))
+
+
+def list_failure_reasons(session: Session, job_id: str, n_reasons: int) -> list[str]:
+    """List some distinct reasons why runs of a job failed, those of the first runs first."""
+    failed = select(Run.error).where(
+        Run.job_id == job_id, Run.state == JobState.FAILED, Run.error.is_not(None)
+    )
     first = failed.group_by(Run.error).order_by(func.min(Run.number)).limit(n_reasons)
-    checkpoints = select(Checkpoint.run_id, Checkpoint.evaluations).where(
-        Checkpoint.job_id == lease.job_id
-    )
-    return PreviousAttempts(
-        int(evaluations),
-        int(generations),
-        tuple(str(reason) for reason in session.scalars(first)),
-        dict(session.execute(checkpoints).all()),
-    )
+    return [str(reason) for reason in session.scalars(first)]
 
 
 def delete_progress(session: Session, lease: Lease, run_ids: Collection[str]) -> None:
@@ -58,7 +62,7 @@ def delete_progress(session: Session, lease: Lease, run_ids: Collection[str]) ->
 
     Another version of the program may give other numbers, and history is only appended.
     """
-    LeaseQueue(session).lock_job(lease)
+    LeaseQueue(session).lock_lease(lease)
     for chunk in split_chunks(run_ids):
         for table in (Checkpoint, RunHistory, MigrationLog):
             session.execute(delete(table).where(table.run_id.in_(chunk)))

@@ -77,7 +77,7 @@ def take_over_runs(session: Session, lease: Lease, sources: Mapping[str, str]) -
         for table in (RunHistory, MigrationLog):
             insert_missing(session, table, _copy_rows(session, table, pairs))
         reused_count = (
-            update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
+            update(Job).where(Job.id == lease.job_id).values(n_reused=Job.n_reused + len(written))
         )
         session.execute(reused_count, execution_options=RETURNING_OPTIONS)
         all_outcomes += outcomes

@@ -1,26 +1,27 @@
-"""Writes of the dispatcher to runs. Every write holds the lease of the job; most are in bulk."""
+"""Writes of the dispatcher to runs. Every write holds the lease of a parcel; most are in bulk."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, delete, func, select, update
+from sqlalchemy import Connection, Select, delete, event, func, select, update
 from sqlalchemy.orm import Session
 
 from service.core.states import OPEN_STATES, JobState
 from service.queue.clocks import Clock
-from service.queue.leases import FinalState, Lease, LeaseQueue, choose_smaller_rms
+from service.queue.leases import FinalState, Lease, LeaseQueue, LockedParcel, choose_smaller_rms
 from service.queue.packed_results import (
     COPY_END,
     COPY_HEAD,
     LAYOUTS,
     RESULT_ROWS,
+    ColumnKind,
     PackedResults,
     RowLayout,
 )
 from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
-from service.storage.columns import Document, UtcDateTime, utc_now
+from service.storage.columns import Document, UtcDateTime, to_json, utc_now
 from service.storage.statements import (
     CHUNK_ROWS,
     RETURNING_OPTIONS,
@@ -87,31 +88,49 @@ class RunOutcome:
 
 
 class RunWriter:
-    """Writes to the runs of one leased job, in one writing session.
+    """Writes to the runs of one leased parcel, in one writing session.
 
-    The first method that is called locks the row of the job, or raises `LeaseLost` if the lease is
-    not held. Nobody else can change the row until the session ends.
+    The first method that is called locks the row of the parcel, or raises `LeaseLost` if the lease
+    is not held. Nobody else can change the row until the session ends. The row of the job is
+    changed last, because the dispatchers of its other parcels change it too.
     """
 
     def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
         self._session, self._lease, self._clock = session, lease, clock
         self._queue = LeaseQueue(session, clock)
-        self._held: Job | None = None
+        self._held: LockedParcel | None = None
 
-    def create_runs(self, cells: Iterable[NewRun]) -> None:
-        """Create the runs of the job; existing runs stay, so a second call is harmless."""
-        insert_runs(self._session, self._lock_job(), cells)
+    def create_runs(self, cells: Iterable[NewRun]) -> list[WaitingRun]:
+        """Create runs of the parcel; existing runs stay, so a second call is harmless.
 
-    def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[WaitingRun]:
-        """List unfinished runs with a `number` above `after`, in order."""
-        self._lock_job()
-        pending = self._select_open().where(Run.number > after)
+        Return them as they wait; if some exist already, only `list_pending` tells what waits.
+        """
+        return insert_runs(self._session, self._lock_parcel().job, cells)
+
+    def count_runs(self, numbers: range) -> int:
+        """Count the runs of these numbers that exist, in any state."""
+        self._lock_parcel()
+        of_job = Run.job_id == self._lease.job_id
+        query = select(func.count()).where(
+            of_job, Run.number >= numbers.start, Run.number < numbers.stop
+        )
+        return self._session.scalar(query) or 0
+
+    def list_pending(
+        self, limit: int = CHUNK_ROWS, after: int = -1, before: int | None = None
+    ) -> list[WaitingRun]:
+        """List unfinished runs of the parcel with a `number` above `after`, in order."""
+        parcel = self._lock_parcel().parcel
+        stop = parcel.stop if before is None else min(before, parcel.stop)
+        pending = self._select_open().where(
+            Run.number > max(after, parcel.first - 1), Run.number < stop
+        )
         rows = self._session.execute(pending.order_by(Run.number).limit(limit))
         return list(map(WaitingRun._make, rows))
 
     def list_unfinished(self, numbers: Sequence[int]) -> list[WaitingRun]:
         """List the unfinished runs of these numbers, in their order."""
-        self._lock_job()
+        self._lock_parcel()
         runs: list[WaitingRun] = []
         for chunk in split_chunks(numbers):
             rows = self._session.execute(self._select_open().where(Run.number.in_(chunk)))
@@ -124,7 +143,7 @@ class RunWriter:
 
     def start_runs(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
-        self._lock_job()
+        self._lock_parcel()
         for chunk in split_chunks(run_ids):
             statement = (
                 update(Run)
@@ -139,7 +158,7 @@ class RunWriter:
 
     def write_kills(self, kills: Mapping[str, int]) -> None:
         """Write how often in a row a worker died in each of these runs."""
-        self._lock_job()
+        self._lock_parcel()
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
             update_by_id(self._session, Run, rows)
@@ -154,7 +173,7 @@ class RunWriter:
 
         A run that has ended already keeps its result. Return the identifiers of the written runs.
         """
-        self._lock_job()
+        self._lock_parcel()
         open_ids = self._find_open_ids([outcome.run_id for outcome in outcomes])
         fresh = [outcome for outcome in outcomes if outcome.run_id in open_ids]
         self._insert_history(history, migrants)
@@ -166,9 +185,9 @@ class RunWriter:
             Run,
             (_build_outcome_values(outcome, now, attempt) for outcome in fresh),
         )
-        self._update_counts(fresh)
         for chunk in split_chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
+        self._update_counts(fresh)
         return tuple(outcome.run_id for outcome in fresh)
 
     def record_results(
@@ -181,7 +200,7 @@ class RunWriter:
         lost_signals : collection of str
             Objects that could not be stored. Their runs have no signals.
         """
-        self._lock_job()
+        self._lock_parcel()
         if not packs:
             return
         if self._session.get_bind().dialect.name == "sqlite":
@@ -194,14 +213,14 @@ class RunWriter:
             self._session.execute(
                 update(Run).where(lost).values(signals), execution_options=RETURNING_OPTIONS
             )
-        rms = [pack.best_rms for pack in packs if pack.best_rms is not None]
-        self._add_to_counts(n_ended, 0, min(rms, default=None))
         is_open = Run.state.in_(OPEN_STATES)
         ended = select(Run.id).where(Run.id == Checkpoint.run_id, ~is_open)
         self._session.execute(
             delete(Checkpoint).where(Checkpoint.job_id == self._lease.job_id, ended.exists()),
             execution_options={"synchronize_session": False},
         )
+        rms = [pack.best_rms for pack in packs if pack.best_rms is not None]
+        self._add_to_counts(n_ended, 0, min(rms, default=None))
 
     def _record_in_sqlite(self, packs: Sequence[PackedResults]) -> int:
         """Hand the rows to SQLite, and return how many runs were open."""
@@ -225,14 +244,18 @@ class RunWriter:
     def _record_in_postgres(self, packs: Sequence[PackedResults]) -> int:
         """Copy the rows into temporary tables, and from there to their places."""
         self._session.flush()
-        driver: Any = self._session.connection().connection.driver_connection
+        connection = self._session.connection()
+        driver: Any = connection.connection.driver_connection
         n_ended = 0
         with driver.cursor() as cursor:
+            if not connection.info.get(_HAS_TABLES):
+                for layout in LAYOUTS:
+                    cursor.execute(_build_temporary_table(layout))
+                _remember_tables(self._session, connection)
             # Each row is looked up by its key, whatever the planner knows of these tables.
             for method in ("hashjoin", "mergejoin", "seqscan"):
                 cursor.execute(f"SET LOCAL enable_{method} = off")
             for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
-                cursor.execute(_build_temporary_table(layout))
                 with cursor.copy(f"COPY packed_{layout.table} FROM STDIN (FORMAT BINARY)") as copy:
                     copy.write(b"".join((COPY_HEAD, *blocks, COPY_END)))
                 if layout is RESULT_ROWS:
@@ -251,12 +274,12 @@ class RunWriter:
         A run that continues from a checkpoint computes the same points again, bit for bit. They
         count once.
         """
-        self._lock_job()
+        self._lock_parcel()
         self._insert_history(history, migrants)
 
     def save_checkpoints(self, states: Iterable[tuple[str, int, bytes]]) -> None:
         """Replace the checkpoints of runs, passed as (run, evaluations, state)."""
-        self._lock_job()
+        self._lock_parcel()
         now = self._clock()
         rows = (
             {
@@ -272,16 +295,22 @@ class RunWriter:
         upsert(self._session, Checkpoint, rows)
 
     def read_checkpoints(self) -> dict[str, bytes]:
-        """Read the checkpoints of the unfinished runs of the job, by run."""
-        self._lock_job()
-        query = select(Checkpoint.run_id, Checkpoint.state).where(
-            Checkpoint.job_id == self._lease.job_id
+        """Read the checkpoints of the unfinished runs of the parcel, by run."""
+        parcel = self._lock_parcel().parcel
+        query = (
+            select(Checkpoint.run_id, Checkpoint.state)
+            .join(Run, Run.id == Checkpoint.run_id)
+            .where(
+                Checkpoint.job_id == self._lease.job_id,
+                Run.number >= parcel.first,
+                Run.number < parcel.stop,
+            )
         )
         return dict(self._session.execute(query).all())
 
-    def _lock_job(self) -> Job:
+    def _lock_parcel(self) -> LockedParcel:
         if self._held is None:
-            self._held = self._queue.lock_job(self._lease)
+            self._held = self._queue.lock_lease(self._lease)
         return self._held
 
     def _filter_runs(self, run_ids: Collection[str]) -> Any:
@@ -312,10 +341,28 @@ class RunWriter:
         }
         if best_rms is not None:
             values["best_rms"] = choose_smaller_rms(best_rms)
-        changed = update(Job).where(*self._lease.fence()).values(values)
+        self._lock_parcel().parcel.n_ended += n_ended
+        self._session.flush()
+        changed = update(Job).where(Job.id == self._lease.job_id).values(values)
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
 
 
+_CELL_COLUMNS: Mapping[str, ColumnKind] = {
+    "number": "integer",
+    "cell": "jsonb",
+    "labels": "jsonb",
+    "spec_hash": "text",
+    "method": "text",
+    "seed": "bigint",
+    "sigma": "double precision",
+}
+_INSERT_IN_POSTGRES = (
+    f"INSERT INTO runs (project_id, job_id, created_at, {', '.join(_RUN_DEFAULTS)}, "
+    f"id, {', '.join(_CELL_COLUMNS)}) "
+    f"SELECT {', '.join(['%s'] * (3 + len(_RUN_DEFAULTS)))}, * "
+    f"FROM unnest(%s::text[], {', '.join(f'%s::{kind}[]' for kind in _CELL_COLUMNS.values())}) "
+    "ON CONFLICT DO NOTHING"
+)
 _OPEN_LIST = ", ".join(repr(state.value) for state in OPEN_STATES)
 _RESULT_NAMES = [name for name in RESULT_ROWS.columns if name != "id"]
 _UPDATE_IN_SQLITE = (
@@ -328,10 +375,11 @@ _UPDATE_IN_POSTGRES = (
     f"UPDATE runs SET state = {JobState.SUCCEEDED.value!r}, attempt = %s, finished_at = %s, "
     "started_at = coalesce(started_at, %s), "
     + ", ".join(f"{name} = packed.{name}" for name in _RESULT_NAMES)
-    # The subquery is not merged into the join: it finds each row by its key.
-    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id FROM runs AS own "
-    "WHERE own.id = packed.id AND own.job_id = %s "
-    f"AND own.state IN ({_OPEN_LIST}) OFFSET 0) AS open WHERE runs.id = open.id"
+    # The subquery is not merged into the join. It finds each row by its key, and not by its job:
+    # an index of the job would be read as a whole for each run.
+    + " FROM packed_runs AS packed CROSS JOIN LATERAL (SELECT id, job_id, state FROM runs AS own "
+    "WHERE own.id = packed.id OFFSET 0) AS found "
+    f"WHERE found.job_id = %s AND found.state IN ({_OPEN_LIST}) AND runs.id = found.id"
 )
 
 
@@ -350,29 +398,81 @@ def _build_postgres_insert(layout: RowLayout) -> str:
 
 
 def _build_temporary_table(layout: RowLayout) -> str:
+    """Return the statements that create a table for this session, as it is not yet there.
+
+    Its values are not compressed, because they are copied at once.
+    """
+    table = f"packed_{layout.table}"
     columns = ", ".join(f"{name} {kind}" for name, kind in layout.columns.items())
+    large = [name for name, kind in layout.columns.items() if kind in ("jsonb", "bytea")]
+    storage = ", ".join(f"ALTER COLUMN {name} SET STORAGE EXTERNAL" for name in large)
     return (
-        f"CREATE TEMPORARY TABLE IF NOT EXISTS packed_{layout.table} ({columns}) "
-        "ON COMMIT DELETE ROWS"
+        f"CREATE TEMPORARY TABLE IF NOT EXISTS {table} ({columns}) ON COMMIT DELETE ROWS; "
+        f"ALTER TABLE {table} {storage}"
     )
 
 
-def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
+_HAS_TABLES = "lagid_has_packed_tables"
+
+
+def _remember_tables(session: Session, connection: Connection) -> None:
+    """Note that this connection has its temporary tables, once they are committed."""
+    info = connection.info
+    event.listen(session, "after_commit", lambda _: info.update({_HAS_TABLES: True}), once=True)
+
+
+def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[WaitingRun]:
     """Create the queued runs of a job in bulk; existing runs stay unchanged."""
-    now = utc_now()
+    is_sqlite = session.get_bind().dialect.name == "sqlite"
+    insert, waiting = _insert_in_sqlite if is_sqlite else _insert_in_postgres, list[WaitingRun]()
     for chunk in split_chunks(cells):
-        rows = [
-            {
-                **_build_run_values(cell),
-                **_RUN_DEFAULTS,
-                "id": run_id,
-                "project_id": job.project_id,
-                "job_id": job.id,
-                "created_at": now,
-            }
-            for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
+        ids = new_ids("run", len(chunk))
+        insert(session, job, ids, chunk)
+        waiting += [
+            WaitingRun(run, cell.number, cell.cell, 0) for run, cell in zip(ids, chunk, strict=True)
         ]
-        insert_missing(session, Run, rows)
+    return waiting
+
+
+def _insert_in_sqlite(
+    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+) -> None:
+    constants = {
+        **_RUN_DEFAULTS,
+        "project_id": job.project_id,
+        "job_id": job.id,
+        "created_at": utc_now(),
+    }
+    rows = (
+        {**_build_run_values(cell), **constants, "id": run}
+        for cell, run in zip(cells, ids, strict=True)
+    )
+    insert_missing(session, Run, rows)
+
+
+def _insert_in_postgres(
+    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+) -> None:
+    """Insert by one statement, which takes each column as an array."""
+    session.flush()
+    driver: Any = session.connection().connection.driver_connection
+    columns = [
+        [getattr(cell, name) for cell in cells] if kind != "jsonb" else _list_json(cells, name)
+        for name, kind in _CELL_COLUMNS.items()
+    ]
+    constants = [job.project_id, job.id, utc_now(), *_RUN_DEFAULTS.values()]
+    with driver.cursor() as cursor:
+        cursor.execute(_INSERT_IN_POSTGRES, [*constants, list(ids), *columns])
+
+
+def _list_json(cells: Sequence[NewRun], name: str) -> list[str]:
+    """Return one document of each cell as text; equal objects are written once."""
+    texts: dict[int, str] = {}
+    documents = [getattr(cell, name) for cell in cells]
+    for document in documents:
+        if id(document) not in texts:
+            texts[id(document)] = to_json(document)
+    return [texts[id(document)] for document in documents]
 
 
 def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from service.storage.statements import (
     make_page,
     new_id,
 )
-from service.storage.tables import IdempotencyKey, Job, Run, StoredSummary
+from service.storage.tables import IdempotencyKey, Job, Parcel, Run, StoredSummary
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -133,6 +133,8 @@ class JobRepository:
         RowConflict
             If the job has already succeeded or failed. A cancelled job stays unchanged.
         """
+        if self._read_state(job_id) is JobState.QUEUED:
+            lock_parcels(self._session, job_id)  # before its row: a dispatcher may claim one
         job = self._lock_job(job_id)
         if job.state is JobState.CANCELLED:
             return job
@@ -143,6 +145,7 @@ class JobRepository:
         job.cancel_requested = True
         if job.state is JobState.QUEUED:
             job.state, job.finished_at = JobState.CANCELLED, utc_now()
+            self._session.execute(delete(Parcel).where(Parcel.job_id == job_id))
             end_open_runs(self._session, job_id, JobState.CANCELLED, None)
             EventRepository(self._session).append_state(job)
         record_action(self._session, "job.cancel", job_id, self._project_id)
@@ -169,6 +172,7 @@ class JobRepository:
         job.error = job.finished_at = None
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
+        self._add_parcel(job)
         self._session.execute(delete(StoredSummary).where(StoredSummary.job_id == job_id))
         record_action(self._session, "job.resume", job_id, self._project_id)
         EventRepository(self._session).append_state(job)
@@ -186,6 +190,21 @@ class JobRepository:
 
     def _filter_project(self) -> tuple[Any, ...]:
         return Job.project_id == self._project_id, Job.deleted_at.is_(None)
+
+    def _read_state(self, job_id: str) -> JobState | None:
+        query = select(Job.state).where(Job.id == job_id, *self._filter_project())
+        return self._session.scalar(query)
+
+    def _add_parcel(self, job: Job) -> None:
+        """Add one parcel of all runs. Dispatchers divide it as they claim."""
+        parcel = Parcel(
+            job_id=job.id,
+            first=0,
+            stop=job.n_runs,
+            attempt=job.attempt,
+            evaluations=job.evaluations,
+        )
+        self._session.add(parcel)
 
     def _lock_job(self, job_id: str) -> Job:
         lock = (
@@ -209,10 +228,12 @@ class JobRepository:
             max_attempts=new.max_attempts,
             state=JobState.QUEUED,
             attempt=0,
+            evaluations=0,
         )
         self._session.add(job)
         self._session.flush()
         record_action(self._session, "job.submit", job.id, self._project_id)
+        self._add_parcel(job)
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
         return job
@@ -228,9 +249,23 @@ class JobRepository:
         return self._session.get_one(Job, used.job_id)
 
 
-def end_open_runs(session: Session, job_id: str, state: JobState, error: str | None) -> None:
-    """Move the unfinished runs of a job to a terminal state."""
+def lock_parcels(session: Session, job_id: str) -> None:
+    """Lock all parcels of a job, in their order, before the row of the job is locked."""
+    query = select(Parcel.first).where(Parcel.job_id == job_id).order_by(Parcel.first)
+    session.execute(query.with_for_update(key_share=True)).all()
+
+
+def end_open_runs(
+    session: Session,
+    job_id: str,
+    state: JobState,
+    error: str | None,
+    numbers: range | None = None,
+) -> None:
+    """Move the unfinished runs of a job, or those of these numbers, to a terminal state."""
     unfinished = update(Run).where(Run.job_id == job_id, Run.state.in_(OPEN_STATES))
+    if numbers is not None:
+        unfinished = unfinished.where(Run.number >= numbers.start, Run.number < numbers.stop)
     session.execute(
         unfinished.values(state=state, error=error, finished_at=utc_now()),
         execution_options=RETURNING_OPTIONS,

@@ -22,6 +22,8 @@ DEFAULT_PROJECT = "proj_default"
 
 OPEN_CONDITION = "state IN ('queued', 'running')"
 """Condition of the index of open jobs. SQLite uses the index only for queries with this text."""
+WAITING_CONDITION = "lease_owner IS NULL"
+"""Condition of the index of parcels that no dispatcher holds."""
 TOLD_CONDITION = "kind <> 'progress'"
 """Condition of the index of the events that a page lists."""
 
@@ -184,21 +186,20 @@ class ModelVersion(Base):
 
 
 class Job(Base):
-    """A submitted job: one or more runs, and the lease of its dispatcher.
+    """A submitted job: one or more runs. While it is open, its `Parcel` rows hold its leases.
 
-    `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers that
-    stopped without progress; at `max_attempts` of them the job fails. `evaluations`, `generation`
-    and `seconds_left` are the progress over all runs. `best_rms` is the smallest RMS of any run so
-    far. `n_reused` counts the runs taken over from other jobs. `n_done_at_claim` is `n_done` at the
-    last claim, so that progress since then needs no look at the runs. `floors` is the document that
-    `service.dispatch.cramer_rao` computes for a job with noise.
+    `attempt` counts the claims of its parcels and gives each claim its fencing token. `lost_leases`
+    is that of the parcel that was lost last. `evaluations`, `generation` and `seconds_left` are the
+    progress over all runs. `best_rms` is the smallest RMS of any run so far. `n_reused` counts the
+    runs taken over from other jobs. `floors` is the document that `service.dispatch.cramer_rao`
+    computes for a job with noise.
     """
 
     __tablename__ = "jobs"
     __table_args__ = (
         Index("ix_jobs_project_id_id", "project_id", "id"),
         _partial_index("ix_jobs_by_state", "deleted_at IS NULL", "project_id", "state", "id"),
-        # These two hold all columns that a dispatcher reads to poll and to claim. Ended jobs are
+        # It holds all columns of jobs that a dispatcher reads to poll and to claim. Ended jobs are
         # not among them, so that their number costs nothing.
         _partial_index(
             "ix_jobs_open",
@@ -208,15 +209,8 @@ class Job(Base):
             "id",
             "project_id",
             "n_runs",
-            "n_done",
-        ),
-        _partial_index(
-            "ix_jobs_owned",
-            "lease_owner IS NOT NULL",
-            "lease_owner",
-            "state",
             "cancel_requested",
-            "id",
+            "n_done",
         ),
         _partial_index(  # for the evaluations of a day
             "ix_jobs_finished",
@@ -236,12 +230,9 @@ class Job(Base):
     max_attempts: Mapped[int] = mapped_column(default=3)
     attempt: Mapped[int] = mapped_column(default=0)
     lost_leases: Mapped[int] = mapped_column(default=0)
-    lease_owner: Mapped[str | None]
-    lease_until: Mapped[datetime | None]
     cancel_requested: Mapped[bool] = mapped_column(default=False)
     n_runs: Mapped[int]
     n_done: Mapped[int] = mapped_column(default=0)
-    n_done_at_claim: Mapped[int] = mapped_column(default=0)
     n_failed: Mapped[int] = mapped_column(default=0)
     n_reused: Mapped[int] = mapped_column(default=0)
     best_rms: Mapped[float | None]
@@ -254,6 +245,35 @@ class Job(Base):
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
+
+
+class Parcel(Base):
+    """A part of an open job: its unfinished runs with numbers from `first` to before `stop`.
+
+    It is what a dispatcher leases, and it waits while `lease_owner` is None. `attempt` is the
+    fencing token of its last claim, 0 before the first. `lost_leases` counts the dispatchers that
+    stopped without progress; at the job's `max_attempts` of them the job fails. `n_ended` counts
+    the runs that ended since the claim. `evaluations` is what its runs add to those of the job. The
+    row is deleted when its runs have ended, the last one with the end of the job.
+    """
+
+    __tablename__ = "parcels"
+    __table_args__ = (
+        _partial_index("ix_parcels_waiting", WAITING_CONDITION, "job_id", "first"),
+        _partial_index(
+            "ix_parcels_owned", "lease_owner IS NOT NULL", "lease_owner", "job_id", "attempt"
+        ),
+    )
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    first: Mapped[int] = mapped_column(primary_key=True)
+    stop: Mapped[int]
+    attempt: Mapped[int] = mapped_column(default=0)
+    lost_leases: Mapped[int] = mapped_column(default=0)
+    lease_owner: Mapped[str | None]
+    lease_until: Mapped[datetime | None]
+    n_ended: Mapped[int] = mapped_column(default=0)
+    evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
 
 
 class Run(Base):
@@ -410,7 +430,10 @@ class IdempotencyKey(Base):
 
 
 class DispatcherHeartbeat(Base):
-    """Heartbeat of a dispatcher, so that the health check can report whether one is alive."""
+    """Heartbeat of a dispatcher: whether it is alive, and for how many cores it has work.
+
+    `details` tells its process and its Ray cluster (`service.dispatch.leases`).
+    """
 
     __tablename__ = "dispatchers"
 
@@ -418,3 +441,4 @@ class DispatcherHeartbeat(Base):
     details: Mapped[Document]
     started_at: Mapped[datetime]
     seen_at: Mapped[datetime]
+    wanted_cores: Mapped[int] = mapped_column(default=0)

@@ -104,7 +104,7 @@ def store_summary(database: Database, lease: Lease) -> None:
         job = session.get_one(Job, lease.job_id)
         document = _to_document(_compute_summary(session, job, _read_table(session, job)))
     with database.write_session() as session:
-        write_summary(session, LeaseQueue(session).lock_job(lease), document)
+        write_summary(session, LeaseQueue(session).lock_lease(lease).job, document)
 
 
 def _pending(job: Job) -> JobState:

@@ -5,12 +5,14 @@
     - InvalidModel         a model document has faults (each with its pointer)
     - UnknownModel         no built-in model has that name
     - InvalidRecord        a recording cannot be used: channels, times or values
+    - UnreadableFile       a file of a recording cannot be used (with row and column, or byte)
     - RecordTooShort       a record is shorter than the model's memory
     - InvalidSettings      a setting of the search or of the problem is invalid
     - DivergedEverywhere   every candidate of a search diverged
     - NothingIdentifiable  no free parameter has an effect on the output
     - UnknownParameter     a result has no parameter of that name
     - UnreadableResult     a file of a result or of an identified model cannot be used
+    - UnwritableFile       a file cannot be written
     - MissingLibrary       a call needs a library that is not installed
 
 A message says what was wrong, what was read, and what would be right. Numerical kernels never
@@ -20,6 +22,7 @@ raise. They return ``nan`` or ``inf``, and the caller decides.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
+from typing import NamedTuple
 
 _MAX_NAMES = 30
 """Most valid names that a message lists; there may be thousands of datasets."""
@@ -90,6 +93,76 @@ class InvalidRecord(SysidError, ValueError):
     """A recording cannot be used: its channels, times or values."""
 
 
+class Advice(NamedTuple):
+    """What to do: the text, the option of the reader that helps, the text after it."""
+
+    before: str
+    option: str = ""
+    after: str = ""
+
+    def __str__(self) -> str:
+        return "".join(self)
+
+
+class UnreadableFile(SysidError, ValueError):
+    """A file of a recording cannot be used.
+
+    Attributes
+    ----------
+    detail : str
+        What was wrong, where, and what would be right; one line, without the name of the file.
+    name : str
+        Name of the file; empty if its content was given.
+    row : int or None
+        Row of a table, from 1; the header of a plain CSV file is row 1.
+    column : str or None
+        Name of the column of a table.
+    byte : int or None
+        Position in an MCAP file, from 0.
+    advice : Advice or None
+        End of the detail: what to do by an option, which each border names in its own way.
+
+    Examples
+    --------
+    >>> error = UnreadableFile("found '5 V'; write numbers alone", row=3, column="u")
+    >>> print(error)
+    row 3, column 'u': found '5 V'; write numbers alone
+    """
+
+    def __init__(
+        self,
+        what: str,
+        advice: Advice | None = None,
+        *,
+        row: int | None = None,
+        column: str | None = None,
+        byte: int | None = None,
+    ) -> None:
+        self.what, self.advice, self.name = what, advice, ""
+        self.row, self.column, self.byte = row, column, byte
+        self.detail = f"{self._format_place()}{what}{advice or ''}"
+        super().__init__(self.detail)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.detail}" if self.name else self.detail
+
+    @property
+    def pointer(self) -> str:
+        """JSON pointer of the place, such as ``/rows/2/u`` or ``/bytes/90``."""
+        if self.byte is not None:
+            return f"/bytes/{self.byte}"
+        parts = [] if self.row is None else ["rows", str(self.row)]
+        parts += [] if self.column is None else [self.column]
+        return join_pointer(*parts)
+
+    def _format_place(self) -> str:
+        if self.byte is not None:
+            return f"at byte {self.byte}: "
+        parts = [] if self.row is None else [f"row {self.row}"]
+        parts += [] if self.column is None else [f"column {self.column!r}"]
+        return f"{', '.join(parts)}: " if parts else ""
+
+
 class RecordTooShort(SysidError, ValueError):
     """A record is shorter than the model's memory."""
 
@@ -136,8 +209,11 @@ class NothingIdentifiable(SysidError, ValueError):
 class UnknownParameter(SysidError, KeyError):
     """A result has no parameter of that name."""
 
-    def __init__(self, name: str, valid: Iterable[str]) -> None:
-        self.message = f"there is no parameter {name!r}{suggest_name(name, valid)}"
+    def __init__(self, name: object, valid: Iterable[str]) -> None:
+        hint = f"; the names are {', '.join(valid)}"
+        if isinstance(name, str):
+            hint = suggest_name(name, valid)
+        self.message = f"there is no parameter {name!r}{hint}"
         super().__init__(self.message)
 
     def __str__(self) -> str:
@@ -145,10 +221,17 @@ class UnknownParameter(SysidError, KeyError):
 
 
 class UnreadableResult(SysidError, ValueError):
-    """A file of a result or of an identified model cannot be read or written."""
+    """A file of a result or of an identified model cannot be used."""
 
     def __init__(self, path: object, detail: str) -> None:
         super().__init__(f"{path}: {detail}")
+
+
+class UnwritableFile(SysidError):
+    """A file cannot be written; what was there before is whole."""
+
+    def __init__(self, path: object, detail: str) -> None:
+        super().__init__(f"{path}: it cannot be written: {detail}")
 
 
 class MissingLibrary(SysidError, ImportError):

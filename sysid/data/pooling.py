@@ -141,7 +141,13 @@ def _collect_samples(
     if rows.size == 0:
         return None
     ordered = rows[np.argsort(times[rows], kind="stable")]
-    return replace(channel, times=times[ordered], values=channel.values[ordered], history=None)
+    return replace(
+        channel,
+        times=times[ordered],
+        values=channel.values[ordered],
+        history=None,
+        started_at=None,  # repeats have no common clock
+    )
 
 
 def _pool_input(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,9 +17,10 @@ from sysid.data.holds import HoldSetting as HoldSetting
 from sysid.data.tables import (
     Column,
     Labelled,
-    align_starts,
     describe_object,
+    find_first_start,
     is_labelled,
+    measure_distance,
     read_columns,
     read_numbers,
     read_times,
@@ -96,6 +97,9 @@ class Channel:
         Samples recorded before the first one. Only delayed inputs read it: simulation and
         comparison begin at the first sample. None: not recorded; the first value is assumed for
         all earlier times.
+    started_at : datetime or None
+        Moment of time 0 s; the first date if the times were dates. A `Record` or a `Recording`
+        keeps the distance of channels that have one.
 
     Raises
     ------
@@ -115,8 +119,8 @@ class Channel:
     unit: str = "1"
     hold: HoldSetting = "auto"
     history: History | None = None
+    started_at: datetime | None = None
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
-    _started_at: datetime | None = field(default=None, init=False, repr=False)
 
     if TYPE_CHECKING:
 
@@ -128,6 +132,7 @@ class Channel:
             unit: str = "1",
             hold: HoldSetting = "auto",
             history: History | None = None,
+            started_at: datetime | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -159,7 +164,8 @@ class Channel:
             axis = read_times(times, f"the times of {owner}")
         object.__setattr__(self, "times", axis.seconds)
         object.__setattr__(self, "values", read_numbers(values, owner))
-        object.__setattr__(self, "_started_at", axis.started_at)
+        if axis.started_at is not None:
+            object.__setattr__(self, "started_at", axis.started_at)
         if unit is not None and self.unit == "1":
             object.__setattr__(self, "unit", unit)
         if self.history is not None:
@@ -259,20 +265,33 @@ _MAX_LISTED = 12  # channels in the text of a record
 def to_channels(groups: Sequence[tuple[Channels, str]]) -> list[tuple[Channel, ...]]:
     """Read groups of channels on one time axis; each group has a name for messages.
 
-    Series of dates keep their distance: all are in seconds from the first date of any of them.
+    Channels with a `started_at` keep their distance: all are in seconds from the first of these.
 
     Raises
     ------
     InvalidRecord
-        If an object is no channel and has none, or times or values cannot be read.
+        If an object is no channel and has none, or times or values cannot be read. If only some
+        channels have a `started_at`, or only some of these have a time zone.
     """
     read = [tuple(_iterate_channels(group, owner)) for group, owner in groups]
-    starts = [channel._started_at for group in read for channel in group]
-    shifts = align_starts(starts)
-    if any(shifts):
-        shifted = iter(shifts)
-        read = [tuple(_shift_clock(channel, next(shifted)) for channel in one) for one in read]
-    return read
+    return _align_clocks(read, find_first_start(c.started_at for one in read for c in one))
+
+
+def _align_clocks(
+    groups: list[tuple[Channel, ...]], origin: datetime | None
+) -> list[tuple[Channel, ...]]:
+    """Return groups of channels with times in s from one moment."""
+    if origin is None:
+        return groups
+    channels = [channel for group in groups for channel in group]
+    without = next((c for c in channels if c.started_at is None), None)
+    if without is not None:
+        dated = next(channel for channel in channels if channel.started_at is not None)
+        raise InvalidRecord(
+            f"channel {dated.name!r} has dates, and channel {without.name!r} has seconds of an "
+            "unknown start; give it dates too, or its `started_at`"
+        )
+    return [tuple(_count_from(channel, origin) for channel in group) for group in groups]
 
 
 def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
@@ -298,22 +317,19 @@ def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
 
 def to_channel(column: Column, otherwise: str = "") -> Channel:
     """Read a column of a table as a channel; `otherwise` is its name if it has none."""
-    axis = column.axis
-    channel = Channel(column.name or otherwise, axis.seconds, column.values, column.unit)
-    object.__setattr__(channel, "_started_at", axis.started_at)
-    return channel
+    name, (times, start) = column.name or otherwise, column.axis
+    return Channel(name, times, column.values, column.unit, started_at=start)
 
 
-def _shift_clock(channel: Channel, seconds: float) -> Channel:
-    """Return the same channel with its times from an earlier date."""
-    if channel._started_at is None or not seconds:
-        return channel
+def _count_from(channel: Channel, origin: datetime) -> Channel:
+    """Return the same channel with its times in s from another moment."""
+    shift = measure_distance(channel.started_at or origin, origin)
+    if not shift:
+        return channel if channel.started_at == origin else replace(channel, started_at=origin)
     history = channel.history
     if history is not None:
-        history = history._replace(times=history.times + seconds)
-    shifted = replace(channel, times=channel.times + seconds, history=history)
-    object.__setattr__(shifted, "_started_at", channel._started_at - timedelta(seconds=seconds))
-    return shifted
+        history = history._replace(times=history.times + shift)
+    return replace(channel, times=channel.times + shift, history=history, started_at=origin)
 
 
 def _describe_samples(channel: Channel) -> str:
@@ -374,7 +390,7 @@ class Recording:
     segments : tuple of Segment
     started_at : datetime or None
         Time 0 s on the clock that recorded; None if it is not known. Without a zone it is local
-        time of an unknown zone.
+        time of an unknown zone. All channels have the same.
 
     Examples
     --------
@@ -398,12 +414,16 @@ class Recording:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        channels = to_channels([(self.channels, "the recording")])[0]
-        object.__setattr__(self, "channels", channels)
-        if self.started_at is None:
-            starts = (channel._started_at for channel in channels)
-            first = next((start for start in starts if start is not None), None)
-            object.__setattr__(self, "started_at", first)
+        channels = tuple(_iterate_channels(self.channels, "the recording"))
+        origin = self.started_at
+        if origin is None:
+            origin = find_first_start(channel.started_at for channel in channels)
+        else:
+            channels = tuple(
+                replace(c, started_at=origin) if c.started_at is None else c for c in channels
+            )
+        object.__setattr__(self, "channels", _align_clocks([channels], origin)[0])
+        object.__setattr__(self, "started_at", origin)
 
     def __repr__(self) -> str:
         parts = f", {len(self.segments)} segments" if self.segments else ""
@@ -518,7 +538,10 @@ class Recording:
         return tuple(part.to_record(inputs, outputs, name) for part in self.split_segments())
 
     def split_segments(self) -> tuple["Recording", ...]:
-        """Return every segment as a recording on its own times; without segments, this one."""
+        """Return every segment as a recording on its own times; without segments, this one.
+
+        A segment has no `started_at`: its times may count from its own start.
+        """
         if not self.segments:
             return (self,)
         return tuple(self._cut_segment(segment) for segment in self.segments)
@@ -562,7 +585,8 @@ def _shift_to_segment(channel: Channel, segment: Segment) -> Channel:
     history = channel.history
     if history is not None:
         history = history._replace(times=to_segment_time(history.times, segment))
-    return replace(channel, times=to_segment_time(channel.times, segment), history=history)
+    times = to_segment_time(channel.times, segment)
+    return replace(channel, times=times, history=history, started_at=None)
 
 
 def _to_input(channel: Channel, role: str) -> Channel:
@@ -600,8 +624,8 @@ class Record:
     """One experiment of a model: inputs and outputs, each one channel or several.
 
     A side may be a channel, a sequence of channels, or a table or series of pandas, xarray or
-    polars. If the times are dates, all channels are in seconds from the first date of any of them.
-    Only a `Recording` keeps the date. Channels usually have the names of the model's signals.
+    polars. If the times are dates, all channels are in seconds from the first date of any of them,
+    their `started_at`. Channels usually have the names of the model's signals.
 
     Examples
     --------

@@ -1,13 +1,10 @@
 """Read arrays and tables of other libraries as channels: pandas, xarray, polars, lists.
 
 No such library is imported. An object is recognised by what it offers: a table has `columns`, a
-series has an `index`, an array of xarray has `dims`. A name such as ``P1 [bar]`` is split into
-name and unit; of xarray and pandas the attribute ``units`` is the unit.
-
-Times are seconds. Dates become seconds from the first of them, and time spans become seconds.
+series has an `index`, an array of xarray has `dims`. Names, units and times are read as in files,
+by the rules of `sysid.data.table_rules`. Of xarray and pandas the attribute ``units`` is the unit.
 """
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, TypeAlias
@@ -18,28 +15,38 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
-from sysid.core.units import find_conversion_factor
+from sysid.data.table_rules import (
+    INDEX_NAMES,
+    NO_NAMES,
+    CellKind,
+    Heading,
+    TimeAxis,
+    count_from_first,
+    find_time_column,
+    find_time_unit,
+    find_unit_seconds,
+    is_time_name,
+    read_number_times,
+    read_spans,
+    split_headings,
+    tell_notes,
+)
 
 Labelled: TypeAlias = Any
 """A table, series or array of another library, with names and times."""
 
-_NAME_WITH_UNIT = re.compile(r"(.*\S)\s*\[([^\[\]]+)\]\s*")
-_TIME_NAMES = ("t", "time")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MIXED_ZONES = "some dates have a time zone and others have none; give all of them one"
 _NEED_TIMES = "need seconds, dates or time spans"
 
 
-class TimeAxis(NamedTuple):
-    """Times (s), and the first date if they were dates; it has a zone if they have."""
-
-    seconds: FloatArray
-    started_at: datetime | None = None
-
-
 class Column(NamedTuple):
-    """A named series of values with its times; the values are not read yet."""
+    """A named series of values with its times; the values are not read yet.
 
+    The label is the name before its unit was split off.
+    """
+
+    label: str
     name: str
     unit: str
     axis: TimeAxis
@@ -120,7 +127,7 @@ def read_times(source: Any, owner: str) -> TimeAxis:
     if kind == "m":
         spans = np.asarray(source, dtype="timedelta64[ns]").ravel()
         _refuse_missing(spans, owner)
-        return TimeAxis(np.asarray(spans.astype(np.int64) * 1e-9, dtype=np.float64))
+        return TimeAxis(read_spans(spans))
     if kind in "UST":
         first = str(next(iter(np.asarray(source).flat)))
         raise InvalidRecord(
@@ -136,13 +143,11 @@ def _read_dates(source: Any, owner: str) -> TimeAxis:
     _refuse_missing(dates, owner)
     if not dates.size:
         return TimeAxis(np.zeros(0))
-    nanoseconds = dates.astype(np.int64)
-    first = _EPOCH + timedelta(microseconds=int(nanoseconds[0]) // 1000)
+    seconds, first = count_from_first(dates)
     kind = getattr(source, "dtype", None)
     named = getattr(kind, "time_zone", None)  # of polars; pandas has the zone itself
     zone = ZoneInfo(named) if isinstance(named, str) else getattr(kind, "tz", None)
-    started = first.replace(tzinfo=None) if zone is None else first.astimezone(zone)
-    return TimeAxis(np.asarray((nanoseconds - nanoseconds[0]) * 1e-9, dtype=np.float64), started)
+    return TimeAxis(seconds, first if zone is None else first.replace(tzinfo=UTC).astimezone(zone))
 
 
 def _read_date_objects(source: Any, owner: str) -> TimeAxis:
@@ -239,12 +244,6 @@ def _find_reader(source: Any) -> Callable[[Any, str], list[Column]] | None:
     return _read_structured if getattr(getattr(source, "dtype", None), "names", None) else None
 
 
-def split_unit(name: str) -> tuple[str, str | None]:
-    """Split a name such as ``P1 [bar]`` into name and unit."""
-    match = _NAME_WITH_UNIT.fullmatch(name)
-    return (match[1], match[2].strip()) if match else (name, None)
-
-
 def _read_series(series: Any, owner: str) -> list[Column]:
     axis = _read_index(series.index, owner)
     if axis is None:
@@ -252,8 +251,7 @@ def _read_series(series: Any, owner: str) -> list[Column]:
             f"{owner}: the index of the series counts its rows. Set the time as its index, in "
             "seconds or as dates."
         )
-    name, unit = _name_column(series.name, series, "")
-    return [Column(name, unit, axis, series)]
+    return [_name_column(series.name, series, "", axis)]
 
 
 def _read_frame(frame: Any, owner: str) -> list[Column]:
@@ -276,48 +274,77 @@ def _read_mapping(
     table: Mapping[Any, Any], owner: str, axis: TimeAxis | None = None
 ) -> list[Column]:
     """Read columns over an axis, else over the column that has the times."""
-    names = list(table)
+    labels = list(table)
+    split = split_headings([str(label) for label in labels])
+    headings = [
+        Heading(name, unit, _classify_column(name, table[label]))
+        for label, (name, unit) in zip(labels, split, strict=True)
+    ]
+    time = None
     if axis is None:
-        name = _find_time_column(table)
-        if name is None:
+        time = find_time_column(headings)
+        if time is None:
             raise InvalidRecord(
                 f"{owner} has no times. Name the column of seconds or dates 't' or 'time', or make "
-                f"it the index. Columns: {', '.join(map(str, names)) or 'none'}"
+                f"it the index. Columns: {', '.join(map(str, labels)) or 'none'}"
             )
-        axis = _read_labelled_times(name, table[name], f"the times of {owner}")
-        names.remove(name)
-    named = [(*_name_column(name, table[name], str(name)), table[name]) for name in names]
-    return [Column(name, unit, axis, values) for name, unit, values in named]
+        axis = _read_labelled_times(headings[time], table[labels[time]], f"the times of {owner}")
+    columns = []
+    for place, (label, heading) in enumerate(zip(labels, headings, strict=True)):
+        if place == time:
+            continue
+        if heading.kind == "count":
+            tell_notes(
+                [f"column {str(label) or 'no name'} of {owner} counts rows and was left out"]
+            )
+            continue
+        if heading.name.lower() in INDEX_NAMES and heading.name.lower() not in NO_NAMES:
+            tell_notes([f"column {heading.name!r} does not count the rows, so it is a signal"])
+        unit = heading.unit or _find_unit_attribute(table[label])
+        columns.append(Column(str(label), heading.name, unit, axis, table[label]))
+    return columns
 
 
-def _find_time_column(table: Mapping[Any, Any]) -> Any | None:
-    """Find the column of times by its name, else the only one that has dates."""
-    for name in table:
-        if split_unit(str(name))[0].lower() in _TIME_NAMES:
-            return name
-    dated = [name for name, values in table.items() if _find_kind(values) == "M"]
-    return dated[0] if len(dated) == 1 else None
+def _classify_column(name: str, values: Any) -> CellKind:
+    """Return what a column holds, as for a file; texts and other objects are not looked into."""
+    kind = _find_kind(values)
+    if kind == "M":
+        return "stamp"
+    if name.lower() in INDEX_NAMES and kind in "iuf" and _counts_rows(np.asarray(values).ravel()):
+        return "count"
+    return "number"
+
+
+def _counts_rows(values: NDArray[Any]) -> bool:
+    """Whether numbers count from 0 or 1."""
+    is_count = values.size > 1 and values[0] in (0, 1)
+    return is_count and np.array_equal(values, values[0] + np.arange(values.size))
 
 
 def _read_index(index: Any, owner: str) -> TimeAxis | None:
     """Read the times of an index; None if it only counts rows."""
-    name = getattr(index, "name", None)
-    label = "" if name is None else str(name)
-    counts_rows = _find_kind(index) in "iu" and split_unit(label)[0].lower() not in _TIME_NAMES
-    if counts_rows or getattr(index, "nlevels", 1) > 1:
+    label = getattr(index, "name", None)
+    ((name, unit),) = split_headings(["" if label is None else str(label)])
+    numbers_rows = _find_kind(index) in "iu" and not is_time_name(name)
+    if numbers_rows or getattr(index, "nlevels", 1) > 1:
         return None
-    return _read_labelled_times(label, index, f"the index of {owner}: its times")
+    heading = Heading(name or "t", unit, "number")  # an index without a name is one of times
+    return _read_labelled_times(heading, index, f"the index of {owner}: its times")
 
 
-def _read_labelled_times(label: Any, source: Any, owner: str) -> TimeAxis:
-    """Read times whose label may have their unit, such as ``t [ms]``."""
-    axis, unit = read_times(source, owner), split_unit(str(label))[1]
-    if unit is None or axis.started_at is not None or _find_kind(source) == "m":
+def _read_labelled_times(heading: Heading, source: Any, owner: str) -> TimeAxis:
+    """Read times whose heading may have their unit, such as ``t [ms]``."""
+    axis = read_times(source, owner)
+    finite = axis.seconds.size > 0 and bool(np.all(np.isfinite(axis.seconds)))
+    if axis.started_at is not None or not finite or _find_kind(source) == "m":
         return axis
-    size = find_conversion_factor(unit, "s")
-    if size is None:
+    unit = find_time_unit(heading.name, heading.unit)
+    if find_unit_seconds(unit) is None:
         raise InvalidRecord(f"{owner} are in {unit!r}, which is no unit of time such as s or min")
-    return TimeAxis(axis.seconds * size)
+    notes: list[str] = []
+    axis = read_number_times(axis.seconds, heading.name, unit, notes)
+    tell_notes(notes)
+    return axis
 
 
 def _read_dataset(dataset: Any, owner: str) -> list[Column]:
@@ -336,49 +363,56 @@ def _read_data_array(array: Any, owner: str) -> list[Column]:
             f"{label} has dimensions {', '.join(map(str, array.dims)) or 'none'}; need one of time "
             "with its coordinate, and at most one of channels"
         )
-    axis = _read_labelled_times(times[0], array.coords[times[0]], f"the times of {label}")
+    ((name, unit),) = split_headings([str(times[0])])
+    heading = Heading(name, unit, "number")
+    axis = _read_labelled_times(heading, array.coords[times[0]], f"the times of {label}")
     if not others:
-        return [Column(*_name_column(array.name, array, ""), axis, array)]
+        return [_name_column(array.name, array, "", axis)]
     parts = [array.isel({others[0]: number}) for number in range(array.sizes[others[0]])]
     names = (
         [str(part.coords[others[0]].item()) for part in parts]
         if others[0] in array.coords
         else [f"{array.name or others[0]}{number + 1}" for number in range(len(parts))]
     )
-    return [
-        Column(*_name_column(name, part, name), axis, part)
-        for name, part in zip(names, parts, strict=True)
-    ]
+    return [_name_column(name, part, name, axis) for name, part in zip(names, parts, strict=True)]
 
 
 def _is_time(array: Any, name: Any) -> bool:
     if name not in array.coords:
         return False
-    is_named = split_unit(str(name))[0].lower() in _TIME_NAMES
+    is_named = is_time_name(split_headings([str(name)])[0][0])
     return is_named or _find_kind(array.coords[name]) in "mMf"
 
 
-def _name_column(name: Any, values: Any, otherwise: str) -> tuple[str, str]:
-    """Name and unit of a column, from its label and its attributes."""
-    plain, unit = split_unit(otherwise if name is None else str(name))
+def _name_column(label: Any, values: Any, otherwise: str, axis: TimeAxis) -> Column:
+    """Build a column with name and unit of its label, and the unit of its attributes."""
+    text = otherwise if label is None else str(label)
+    ((name, unit),) = split_headings([text])
+    return Column(text, name, unit or _find_unit_attribute(values), axis, values)
+
+
+def _find_unit_attribute(values: Any) -> str:
     attributes = getattr(values, "attrs", None) or {}
-    unit = unit or attributes.get("units") or attributes.get("unit")
-    return plain, str(unit or "1")
+    return str(attributes.get("units") or attributes.get("unit") or "1")
 
 
-def align_starts(starts: Iterable[datetime | None]) -> list[float]:
-    """Compute the seconds by which series of dates start after the first of them.
-
-    Series of seconds are not shifted.
+def find_first_start(starts: Iterable[datetime | None]) -> datetime | None:
+    """Find the first of some moments; None if there is none.
 
     Raises
     ------
     InvalidRecord
-        If only some of the dates have a time zone.
+        If only some of them have a time zone.
     """
-    known = list(starts)
     try:
-        first = min((start for start in known if start is not None), default=_EPOCH)
-        return [0.0 if start is None else (start - first).total_seconds() for start in known]
+        return min((start for start in starts if start is not None), default=None)
+    except TypeError:
+        raise InvalidRecord(_MIXED_ZONES) from None
+
+
+def measure_distance(later: datetime, earlier: datetime) -> float:
+    """Measure the seconds from one moment to another; raises as `find_first_start`."""
+    try:
+        return (later - earlier).total_seconds()
     except TypeError:
         raise InvalidRecord(_MIXED_ZONES) from None

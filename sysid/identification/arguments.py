@@ -3,15 +3,15 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import isfinite
 from numbers import Integral, Real
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
-from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns, split_unit
+from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns
 from sysid.models.model import Model
-from sysid.models.signals import assign_channels, assign_record
+from sysid.models.signals import Assignment, assign_channels, assign_record
 
 Data: TypeAlias = Record | Recording | Labelled
 """One recording: a record, a recording without roles, or a table of another library."""
@@ -19,10 +19,18 @@ Change: TypeAlias = Mapping[str, Any] | Sequence[float] | float
 """Change of a parameter: its fields, its two bounds, or its fixed value."""
 
 
+class ReadRecords(NamedTuple):
+    """Records of a model, notes about what was assumed, and the channel of each signal."""
+
+    records: tuple[Record, ...]
+    notes: tuple[str, ...]
+    channels: Mapping[str, str]
+
+
 def read_records(
     model: Model, data: Data | Sequence[Data], channels: Mapping[str, str] | None
-) -> tuple[tuple[Record, ...], tuple[str, ...]]:
-    """Read recordings as records of a model, with notes about what was assumed.
+) -> ReadRecords:
+    """Read recordings as records of a model.
 
     A recording of several segments gives one record for each.
 
@@ -36,22 +44,26 @@ def read_records(
     check_kinds({"channels": channels})
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
-    notes = dict.fromkeys(note for _, note in parts if note)
-    return tuple(record for record, _ in parts), tuple(notes)
+    notes = dict.fromkeys(assigned.note for _, assigned in parts if assigned.note)
+    by_signal = parts[0][1].by_signal if parts else {}
+    return ReadRecords(tuple(record for record, _ in parts), tuple(notes), by_signal)
 
 
 def _read_one(
     model: Model, data: Data, channels: Mapping[str, str] | None
-) -> Iterator[tuple[Record, str]]:
+) -> Iterator[tuple[Record, Assignment]]:
     if isinstance(data, Record):
-        yield assign_record(model, data, channels)
+        record, note = assign_record(model, data, channels)
+        pairs = zip((*record.inputs, *record.outputs), (*data.inputs, *data.outputs), strict=True)
+        yield record, Assignment({named.name: channel.name for named, channel in pairs}, note)
         return
     if isinstance(data, Recording):
         assigned = assign_channels(model, data.names, channels)
         recording = data
     elif is_labelled(data):
         columns = read_columns(data, "the table")
-        plain = {key: split_unit(str(name))[0] for key, name in (channels or {}).items()}
+        by_label = {column.label: column.name for column in columns}
+        plain = {key: by_label.get(str(name), name) for key, name in (channels or {}).items()}
         assigned = assign_channels(model, [column.name for column in columns], plain)
         used = set(assigned.by_signal.values())
         recording = Recording(tuple(to_channel(c) for c in columns if c.name in used))
@@ -60,7 +72,7 @@ def _read_one(
     inputs = {signal.name: assigned.by_signal[signal.name] for signal in model.inputs}
     outputs = {output.name: assigned.by_signal[output.name] for output in model.outputs}
     for record in recording.to_records(inputs, outputs):
-        yield record, assigned.note
+        yield record, assigned
 
 
 def _describe_wrong_data(data: object) -> str:
@@ -85,9 +97,23 @@ def check_kinds(values: Mapping[str, object]) -> None:
         is_left_out = value is None and name not in _NEEDED
         is_flag = isinstance(value, bool) and bool not in kinds
         if not is_left_out and (is_flag or not isinstance(value, kinds)):
-            raise InvalidSettings(f"/{name}", f"found {value!r}; need {need}")
+            found = f"found {_describe_value(value)}; need {need}"
+            if name == "settings" and _is_signal(value):
+                found += ". To identify from two series, join them: Record(inputs, outputs)"
+            raise InvalidSettings(f"/{name}", found)
 
 
+def _describe_value(value: object) -> str:
+    """Describe a wrong value: as it is written if that is short, else by its kind."""
+    text = repr(value) if getattr(value, "shape", None) is None else ""
+    return text if 0 < len(text) <= _MAX_VALUE and "\n" not in text else describe_object(value)
+
+
+def _is_signal(value: object) -> bool:
+    return isinstance(value, Channel | list | tuple) or hasattr(value, "shape")
+
+
+_MAX_VALUE = 60
 _KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
     "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),

@@ -43,7 +43,10 @@ _USUAL: tuple[FigureName, ...] = ("response", "residuals", "correlation", "water
 
 
 def plot_result(
-    found: Identification, names: Sequence[FigureName], experiment: int, theme: Theme
+    found: Identification,
+    names: Sequence[FigureName | Sequence[FigureName]],
+    experiment: int,
+    theme: Theme,
 ) -> Any:
     """Draw figures of a result as one figure of Plotly; without names the usual ones.
 
@@ -52,13 +55,21 @@ def plot_result(
     MissingLibrary
         If Plotly is not installed.
     InvalidSettings
-        If there is no such figure or experiment.
+        If there is no such figure, experiment or theme, or a named figure has no data.
     """
-    for name in names:
-        if name not in FIGURES:
-            detail = f"there is no figure {name!r}{suggest_name(str(name), FIGURES)}"
-            raise InvalidSettings("/names", detail)
-    titled = draw_figures(found, names or _USUAL, experiment)
+    wanted = tuple(_iterate_names(names))
+    if theme not in get_args(Theme):
+        raise InvalidSettings(
+            "/theme", f"found {theme!r}; need one of {', '.join(get_args(Theme))}"
+        )
+    if isinstance(experiment, bool) or not isinstance(experiment, int | np.integer):
+        raise InvalidSettings("/experiment", f"found {experiment!r}; need a whole number, from 0")
+    for name in wanted:
+        if not draw_figures(found, [name], experiment):
+            raise InvalidSettings("/names", _describe_missing_figure(name))
+    titled = draw_figures(found, wanted or _USUAL, experiment)
+    if not titled:
+        raise InvalidSettings("/names", "the result has no signals to draw")
     try:
         import plotly.graph_objects as go
     except ImportError:
@@ -66,6 +77,24 @@ def plot_result(
     figure = titled[0][1] if len(titled) == 1 else stack_figures(titled)
     layout = {key: value for key, value in figure["layout"].items() if key != "meta"}
     return go.Figure(apply_theme({"data": figure["data"], "layout": layout}, theme))
+
+
+def _iterate_names(names: Sequence[FigureName | Sequence[FigureName]]) -> Iterator[FigureName]:
+    """Yield checked names of figures; a list of them stands for its names."""
+    for name in names:
+        if isinstance(name, list | tuple):
+            yield from _iterate_names(name)
+        elif name in FIGURES:
+            yield name
+        else:
+            detail = f"there is no figure {name!r}{suggest_name(str(name), FIGURES)}"
+            raise InvalidSettings("/names", detail)
+
+
+def _describe_missing_figure(name: FigureName) -> str:
+    if name == "posterior":
+        return "no posterior was sampled; call identify(…, posterior=True)"
+    return f"the result has no data for the figure {name!r}"
 
 
 def draw_figures(

@@ -138,9 +138,10 @@ def identify(
     )
     algorithm = settings or GeneticAlgorithm()
     model = resolve_model(model)
-    whole, notes = read_records(model, records, channels)
+    read = read_records(model, records, channels)
+    whole = read.records
     validation_records = (
-        None if validation is None else read_records(model, validation, channels)[0]
+        None if validation is None else read_records(model, validation, channels).records
     )
     changes = read_changes(parameters)
     check_unused_settings(model, len(whole), changes, weights)
@@ -157,7 +158,8 @@ def identify(
         posterior=posterior,
     )
     data = collect_fitted_data(model, prepared, problems, found)
-    return replace(found, warnings=(*notes, *found.warnings), data=data)
+    data = replace(data, channels=read.channels)
+    return replace(found, warnings=(*read.notes, *found.warnings), data=data)
 
 
 def _run_search(

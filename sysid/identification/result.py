@@ -1,7 +1,7 @@
 """Result of an identification: estimates with their uncertainty, and the evidence."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -125,6 +125,8 @@ class FittedData:
     correlations : tuple of CorrelationFunction
         Correlation functions of the residuals that were tested.
     loss : {"squares", "soft-l1"}
+    channels : mapping of str to str
+        Channel of each signal in the first recording: model's name → channel's name.
     """
 
     model: Model
@@ -133,6 +135,7 @@ class FittedData:
     is_part: bool
     correlations: tuple[CorrelationFunction, ...]
     loss: LossKind = "squares"
+    channels: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -231,11 +234,34 @@ class Identification:
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
-        raise UnknownParameter(str(name), [estimate.name for estimate in self.estimates])
+        raise UnknownParameter(name, list(self))
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the names of the parameters, so that ``"L" in found`` holds."""
         return (estimate.name for estimate in self.estimates)
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self.estimates)
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the parameters."""
+        return self._by_name().keys()
+
+    def values(self) -> ValuesView[Estimate]:
+        """Return the estimates."""
+        return self._by_name().values()
+
+    def items(self) -> ItemsView[str, Estimate]:
+        """Return the names of the parameters with their estimates."""
+        return self._by_name().items()
+
+    def get(self, name: str, default: Estimate | None = None) -> Estimate | None:
+        """Return the estimate of a parameter, or a default if there is none."""
+        return self._by_name().get(name, default)
+
+    def _by_name(self) -> dict[str, Estimate]:
+        return {estimate.name: estimate for estimate in self.estimates}
 
     def __repr__(self) -> str:
         from sysid.identification.summary import summarise_result
@@ -252,7 +278,12 @@ class Identification:
         """Values of all parameters by name, as `simulate` takes them."""
         return {estimate.name: estimate.value for estimate in self.estimates}
 
-    def plot(self, *names: "FigureName", experiment: int = 0, theme: "Theme" = "light") -> Any:
+    def plot(
+        self,
+        *names: "FigureName | Sequence[FigureName]",
+        experiment: int = 0,
+        theme: "Theme" = "light",
+    ) -> Any:
         """Draw figures one below the other, as a figure of Plotly.
 
         Without names: measured against identified output with the residuals, their correlation
@@ -262,7 +293,7 @@ class Identification:
         ----------
         *names : {"response", "residuals", "correlation", "waterfall", "history", "convergence", \
 "posterior"}
-            The figures to draw.
+            The figures to draw, also as a list.
         experiment : int
             Which record, from 0, if there are several.
         theme : {"light", "dark"}
@@ -272,7 +303,7 @@ class Identification:
         MissingLibrary
             If Plotly is not installed.
         InvalidSettings
-            If there is no such figure or record.
+            If there is no such figure, record or theme, or a named figure has no data.
         """
         from sysid.identification.figures import plot_result
 
@@ -295,7 +326,7 @@ class Identification:
 
         Raises
         ------
-        UnreadableResult
+        UnwritableFile
             If the file cannot be written.
         """
         from sysid.identification.saved_result import write_result

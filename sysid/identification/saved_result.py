@@ -8,6 +8,7 @@ against the declared types, so that a damaged file is told by the place of its f
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
+from datetime import datetime
 from functools import cache
 from os import PathLike
 from pathlib import Path
@@ -16,7 +17,14 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from sysid.core.errors import InvalidModel, InvalidRecord, UnreadableResult, join_pointer
+from sysid.core.errors import (
+    InvalidModel,
+    InvalidRecord,
+    UnreadableResult,
+    UnwritableFile,
+    join_pointer,
+)
+from sysid.core.files import write_whole
 from sysid.identification.result import Identification
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
@@ -33,15 +41,15 @@ def write_result(found: Identification, path: str | PathLike[str]) -> None:
 
     Raises
     ------
-    UnreadableResult
-        If the file cannot be written.
+    UnwritableFile
+        If the file cannot be written; what was there before is whole.
     """
     document = {"format": FORMAT, **_encode(found)}
     text = json.dumps(document, ensure_ascii=False, allow_nan=False) + "\n"
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        write_whole(Path(path), text)
     except OSError as error:
-        raise UnreadableResult(path, f"it cannot be written: {error.strerror}") from None
+        raise UnwritableFile(path, error.strerror or str(error)) from None
 
 
 def read_result(path: str | PathLike[str]) -> Identification:
@@ -111,6 +119,8 @@ def _encode(value: Any) -> Any:
         return [_encode(item) for item in value]
     if isinstance(value, float) and not np.isfinite(value):
         return "nan" if np.isnan(value) else "inf" if value > 0 else "-inf"
+    if isinstance(value, datetime):
+        return value.isoformat()
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -208,10 +218,19 @@ def _decode_scalar(hint: Any, value: Any, pointer: str) -> Any:
             return _NOT_FINITE[value]
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         return float(_require(is_number, value, pointer, "a number"))
+    if hint is datetime:
+        return _decode_moment(value, pointer)
     if hint is int:
         return _require(type(value) is int, value, pointer, "a whole number")
     names = {str: "a text", bool: "true or false"}
     return _require(type(value) is hint, value, pointer, names.get(hint, str(hint)))
+
+
+def _decode_moment(value: Any, pointer: str) -> datetime:
+    try:
+        return datetime.fromisoformat(value)
+    except (TypeError, ValueError):
+        raise _Misfit(pointer, value, "a date such as 2026-01-31T12:00:00") from None
 
 
 def _require(holds: bool, value: Any, pointer: str, need: str) -> Any:

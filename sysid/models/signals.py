@@ -90,6 +90,46 @@ def assign_record(
     return replace(record, inputs=renamed[0], outputs=renamed[1]), _describe_order(by_order)
 
 
+def name_inputs(
+    model: Model,
+    channels: tuple[Channel, ...],
+    given: Mapping[str, str] | None = None,
+    usual: Mapping[str, str] | None = None,
+) -> tuple[Channel, ...]:
+    """Name channels as the inputs of a model: as given, else by name, else as usual.
+
+    A single channel may have any name if the model has one input. Other channels follow.
+
+    Parameters
+    ----------
+    given, usual : mapping of str to str, optional
+        Model's name → channel's name. Outputs in them are ignored.
+
+    Raises
+    ------
+    InvalidSettings
+        If `given` names a signal or channel that does not exist.
+    """
+    signals = [signal.name for signal in model.inputs]
+    names = [channel.name for channel in channels]
+    outputs = [output.name for output in model.outputs]
+    chosen = {key: name for key, name in (given or {}).items() if key not in outputs}
+    _check_given(chosen, signals, names)
+    missing = [name for name in signals if name not in {*names, *chosen}]
+    chosen |= {key: name for key, name in (usual or {}).items() if key in missing and name in names}
+    assigned, left, free = match_names(signals, names, chosen)
+    if len(signals) == len(left) == len(free) == 1:
+        assigned = {left[0]: free[0]}
+    named = [
+        replace(channel, name=signal)
+        for signal, name in assigned.items()
+        for channel in channels
+        if channel.name == name
+    ]
+    used = {*assigned, *assigned.values()}
+    return (*named, *(channel for channel in channels if channel.name not in used))
+
+
 def _check_sides(model: Model, record: Record, given: Mapping[str, str]) -> None:
     """Check that an input is given a channel of the inputs, and an output one of the outputs."""
     inputs = {signal.name for signal in model.inputs}

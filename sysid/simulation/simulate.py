@@ -13,7 +13,8 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Channels, Record, Recording, to_channels
-from sysid.data.tables import read_times
+from sysid.data.table_rules import TimeAxis, split_headings
+from sysid.data.tables import describe_object, measure_distance, read_times
 from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.model import (
@@ -27,6 +28,7 @@ from sysid.models.model import (
 )
 from sysid.models.parameters import Parameter
 from sysid.models.parse import keep_terms
+from sysid.models.signals import name_inputs
 from sysid.models.ties import resolve_ties
 from sysid.simulation.problem import build_simulation_problem
 
@@ -48,6 +50,7 @@ def simulate(
     inputs: Channels | Record | Recording,
     values: Mapping[str, float] | Identified,
     *,
+    channels: Mapping[str, str] | None = None,
     times: ArrayLike | None = None,
 ) -> Recording:
     """Simulate the outputs of a model at some times.
@@ -62,12 +65,14 @@ def simulate(
     model : Model, str, Path or mapping
         A name of the catalogue, a YAML or JSON file, a document, or a model.
     inputs : Channel, sequence of Channel, table, Record or Recording
-        One for each input of the model, of the same name; others are ignored. A single one may
-        have any name if the model has one input.
+        One for each input of the model; others are ignored. A single one may have any name if the
+        model has one input.
     values : mapping of str to float, Identification or IdentifiedModel
         Every parameter, inside or outside its bounds, and initial values such as ``x(0)``. Initial
         values that the model fixes are optional and replace its own. Parameters that the model
         fixes or ties to others are optional.
+    channels : mapping of str to str, optional
+        Model's input → channel's name. Default: by name, else as the result was identified.
     times : array of shape (N,), optional
         Seconds, not decreasing. For a difference equation they are regular and set its period.
         Default: the times of the first input.
@@ -98,7 +103,8 @@ def simulate(
     5.999
     """
     model = resolve_model(model)
-    signals = _read_inputs(model, inputs)
+    kept = getattr(getattr(values, "data", None), "channels", None)
+    signals = name_inputs(model, _read_inputs(inputs), _split_names(channels), kept)
     measured = _find_measured(inputs, values)
     if not isinstance(values, Mapping):
         model, signals, values = _restore(model, signals, values)
@@ -111,9 +117,15 @@ def simulate(
         _fix_initial(start, state.name, values, is_measured=bool(measured))
         for start, state in zip(model.initial, model.states, strict=True)
     )
-    at = _choose_times(signals, times)
+    at, start = _choose_times(signals, times)
     outputs = tuple(
-        Channel(output.name, at, _read_measured(measured, output.name, at), output.unit)
+        Channel(
+            output.name,
+            at,
+            _read_measured(measured, output.name, at),
+            output.unit,
+            started_at=start,
+        )
         for output in model.outputs
     )
     problem = build_simulation_problem(
@@ -123,16 +135,22 @@ def simulate(
     return Recording(tuple(replace(c, values=simulated[c.name].copy()) for c in outputs))
 
 
-def _read_inputs(model: Model, inputs: Channels | Record | Recording) -> tuple[Channel, ...]:
+def _read_inputs(inputs: Channels | Record | Recording) -> tuple[Channel, ...]:
     if isinstance(inputs, Record):
-        channels = inputs.inputs
-    elif isinstance(inputs, Recording):
-        channels = inputs.channels
-    else:
-        channels = to_channels([(inputs, "the inputs")])[0]
-    if len(channels) == len(model.inputs) == 1:
-        return (replace(channels[0], name=model.inputs[0].name),)
-    return channels
+        return inputs.inputs
+    if isinstance(inputs, Recording):
+        return inputs.channels
+    return to_channels([(inputs, "the inputs")])[0]
+
+
+def _split_names(channels: object) -> dict[str, str]:
+    """Return names of channels without the unit that a table has in them."""
+    if channels is None:
+        return {}
+    if not isinstance(channels, Mapping):
+        detail = f"found {describe_object(channels)}; need a mapping of signals to channels"
+        raise InvalidSettings("/channels", detail)
+    return {key: split_headings([str(name)])[0][0] for key, name in channels.items()}
 
 
 def _find_measured(
@@ -182,13 +200,21 @@ def _restore(
     return model, held, {k: v for k, v in numbers.items() if not others.fullmatch(k)}
 
 
-def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> FloatArray:
+def _choose_times(inputs: tuple[Channel, ...], times: ArrayLike | None) -> TimeAxis:
+    """Choose the times of the outputs, on the clock of the inputs if they have one."""
     if times is None and not inputs:
         raise InvalidSettings("/times", "the model has no input; give the times of the outputs")
-    at = inputs[0].times if times is None else read_times(times, "the times").seconds
-    if at.ndim != 1 or at.size < 2:
-        raise InvalidRecord(f"times have shape {at.shape}. Need two times or more")
-    return at
+    start = inputs[0].started_at if inputs else None
+    if times is None:
+        axis = TimeAxis(inputs[0].times, start)
+    else:
+        at, first = read_times(times, "the times")
+        if first is not None and start is not None:
+            at = at + measure_distance(first, start)
+        axis = TimeAxis(at, start if inputs else first)
+    if axis.seconds.ndim != 1 or axis.seconds.size < 2:
+        raise InvalidRecord(f"times have shape {axis.seconds.shape}. Need two times or more")
+    return axis
 
 
 def complete_values(model: Model, values: Mapping[str, float]) -> dict[str, float]:

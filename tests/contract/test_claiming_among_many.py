@@ -7,14 +7,14 @@ import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
 from service.api.event_feed import EventFeed
-from service.core.states import JobState
+from service.core.states import OPEN_STATES, JobState
 from service.jobs.schemas import JobIn
 from service.queue.admission import Admission
 from service.queue.leases import JobProgress, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
 from service.repositories.jobs import JobRepository
 from service.storage.columns import utc_now
-from service.storage.tables import Job, Project
+from service.storage.tables import Job, Parcel, Project
 from tests.stored import claimed
 
 PROJECTS = [f"p{number}" for number in range(4)]
@@ -51,14 +51,24 @@ def add_crowd(database):
             "n_runs": 1,
             "state": state,
             "priority": 0,
-            "lease_owner": "d1" if state is JobState.RUNNING else None,
-            "lease_until": until if state is JobState.RUNNING else None,
         }
         for number, state in enumerate(states)
+    ]
+    parcels = [
+        {
+            "job_id": row["id"],
+            "first": 0,
+            "stop": 1,
+            "lease_owner": "d1" if row["state"] is JobState.RUNNING else None,
+            "lease_until": until if row["state"] is JobState.RUNNING else None,
+        }
+        for row in rows
+        if row["state"] in OPEN_STATES
     ]
     with database.write_session() as session:
         session.execute(insert(Project), [{"id": one, "name": one} for one in PROJECTS])
         session.execute(insert(Job), rows)
+        session.execute(insert(Parcel), parcels)
     with database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         connection.exec_driver_sql(
             "ANALYZE" if database.is_sqlite else "VACUUM ANALYZE"
@@ -160,7 +170,7 @@ def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specifi
     def work() -> None:
         with database.write_session() as session:
             queue = LeaseQueue(session)
-            queue.lock_job(got.lease)
+            queue.lock_lease(got.lease)
             queue.write_progress(got.lease, JobProgress(1))
             queue.append_event(got.lease, "log", {"message": "told"})
             queue.reap_expired(LeaseOwners(ended=frozenset({got.lease.owner})))

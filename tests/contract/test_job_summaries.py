@@ -173,9 +173,9 @@ def test_a_dispatcher_stores_what_the_first_reader_would_compute(
 ) -> None:
     place = stored_place
     job, lease, _ = ended(place)
-    claim = Claim(lease, place.job(job))
+    claim = Claim(lease, place.job(job), range(place.job(job).n_runs))
     maker = job_end.build_end_maker(
-        place.database, claim, JobRuns(place.database, claim, place.store)
+        place.database, claim.lease, JobRuns(place.database, claim, place.store).parts
     )
     assert maker is not None
     *_, floors = maker()

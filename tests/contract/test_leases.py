@@ -12,7 +12,7 @@ from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import HeldLeases
 from service.queue.dispatchers import DispatcherRepository
-from service.storage.tables import Job
+from service.storage.tables import Parcel
 from tests.dispatching import Place
 from tests.stored import Clock, claim, job_of, state_of, submit
 from tests.unit.workers.test_scheduler import ScriptedExecutor, fails
@@ -264,7 +264,7 @@ def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
     lease = leases.claim_job().lease
     slow.waits.clear()
     with database.write_session() as other:
-        other.execute(update(Job).where(Job.id == job).values(name="held"))
+        other.execute(update(Parcel).where(Parcel.job_id == job).values(lost_leases=0))
         with pytest.raises(OperationalError):
             leases.renew_leases()
     assert slow.waits == [1.0]

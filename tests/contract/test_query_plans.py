@@ -51,7 +51,7 @@ from tests.stored import claimed, new_dataset
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
 GROWING = {"jobs", "runs", "events", "datasets", "checkpoints", "run_history", "migrations_log"}
 GROWING |= {"idempotency_keys", "lineage_edges", "job_summaries", "models"}
-BOUNDED_INDEXES = ("ix_jobs_open", "ix_jobs_owned")
+BOUNDED_INDEXES = ("ix_jobs_open", "ix_parcels_owned")
 """Indexes of open jobs: to read them whole is to read what is open."""
 NUMBERS = {
     True: "WITH RECURSIVE s(n) AS (SELECT 0 UNION ALL SELECT n + 1 FROM s WHERE n < {last})",
@@ -243,7 +243,7 @@ def poll_and_claim(at: Filled) -> None:
         read_queue_status(session, "d1")
     with at[0].write_session() as session:
         queue = LeaseQueue(session)
-        assert queue.recover_claim("d1", [at[1].job.id]) is None
+        assert queue.recover_claim("d1", [at[1].lease]) is None
         claim = queue.claim_job("d1", admission=admission)
         assert claim is not None
         queue.renew_leases([claim.lease, at[1].lease])
@@ -349,10 +349,10 @@ USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
     stream_events: ("ix_events_job_id_id",),
     summarise: (),
     collect_garbage: ("ix_runs_signals_sha256",),
-    poll_and_claim: ("ix_jobs_open", "ix_jobs_owned"),
+    poll_and_claim: ("ix_jobs_open",),
     write_runs: ("ix_runs_project_id_spec_hash",),
     end_large_job: ("ix_runs_job_id_best_rms", "ix_runs_job_id_state_number"),
-    lose_workers_cancel_and_resume: ("ix_jobs_owned", "ix_runs_job_id_state_number"),
+    lose_workers_cancel_and_resume: ("ix_runs_job_id_state_number",),
     reap: ("ix_jobs_open",),
 }
 """What is done often or under the write lock, and the indexes that it must use."""

@@ -13,7 +13,17 @@ from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
-from tests.stored import Clock, claim, claimed, job_of, record_success, runs_of, state_of, submit
+from tests.stored import (
+    Clock,
+    claim,
+    claimed,
+    job_of,
+    parcel_of,
+    record_success,
+    runs_of,
+    state_of,
+    submit,
+)
 
 LEASE = timedelta(seconds=10)
 IMPATIENT_SECONDS = 0.5
@@ -59,9 +69,10 @@ def test_a_claimed_job_runs_under_its_first_attempt(database, clock):
     got = claim(database, "d1", clock)
     assert got.lease == Lease(job_id, 1, "d1")
     job = job_of(database, job_id)
-    assert (job.state, job.attempt, job.lease_owner) == (JobState.RUNNING, 1, "d1")
+    parcel = parcel_of(database, job_id)
+    assert (job.state, job.attempt, parcel.lease_owner) == (JobState.RUNNING, 1, "d1")
     assert job.started_at == clock.now
-    assert job.lease_until == clock.now + LEASE
+    assert parcel.lease_until == clock.now + LEASE
 
 
 def test_no_two_claimers_ever_get_the_same_job(database):
@@ -101,7 +112,7 @@ def test_a_reaper_leaves_a_job_alone_while_its_owner_writes(postgres_database, c
     lease = claim(postgres_database, "d1", clock).lease
     clock.advance(11)
     with postgres_database.write_session() as writer:
-        LeaseQueue(writer).lock_job(lease)
+        LeaseQueue(writer).lock_lease(lease)
         with postgres_database.write_session(IMPATIENT_SECONDS) as session:
             assert LeaseQueue(session, clock).reap_expired().requeued == ()
         LeaseQueue(writer).append_event(lease, "log", {"line": "in time"})
@@ -122,12 +133,15 @@ def test_a_reaper_does_not_wait_for_another_that_reaps_the_same_job(postgres_dat
 
 def test_a_claim_without_an_answer_is_found_among_those_of_its_owner_only(database):
     rival, known, lost = (submit(database) for _ in range(3))
+    leases = {}
     for owner, job in (("rival", rival), ("d1", known), ("d1", lost)):
-        assert claim(database, owner).job.id == job
+        got = claim(database, owner)
+        assert got.job.id == job
+        leases[job] = got.lease
     with database.write_session() as session:
         queue = LeaseQueue(session)
-        assert queue.recover_claim("d1", [known]).lease == Lease(lost, 1, "d1")
-        assert queue.recover_claim("d1", [known, lost]) is None
+        assert queue.recover_claim("d1", [leases[known]]).lease == Lease(lost, 1, "d1")
+        assert queue.recover_claim("d1", [leases[known], leases[lost]]) is None
         assert queue.recover_claim("d2", []) is None
 
 
@@ -165,7 +179,7 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     clock.advance(7)
     with database.write_session() as session:
         held = LeaseQueue(session, clock).renew_leases(mine)
-    assert {one.lease for one in held} == mine
+    assert held == mine
     clock.advance(4)
     assert set(reap(database, clock).requeued) == others
 
@@ -195,17 +209,8 @@ def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(
     is_held.wait(20)
     got = claim(database, "d1", clock)
     holder.join()
-    assert got.job.lease_until == Clock().now + LEASE
+    assert parcel_of(database, got.job.id).lease_until == Clock().now + LEASE
     assert set(asked) == {True}
-
-
-def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
-    got, _ = claimed(database)
-    with database.write_session() as session:
-        JobRepository(session).cancel(got.job.id)
-    with database.write_session() as session:
-        (held,) = LeaseQueue(session).renew_leases([got.lease])
-    assert held.cancel_requested
 
 
 def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
@@ -213,15 +218,15 @@ def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
     lost, _ = lose(database, clock)
     claim(database, "silent", clock)  # under a new attempt
     with database.write_session() as session:
-        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
+        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == frozenset()
 
 
 def test_a_heartbeat_does_not_renew_the_lease_of_a_job_that_waits_again(database, clock):
     job = submit(database)
     lost, _ = lose(database, clock)
     with database.write_session() as session:
-        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
-    assert job_of(database, job).lease_until is None
+        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == frozenset()
+    assert parcel_of(database, job).lease_until is None
 
 
 def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
@@ -229,7 +234,7 @@ def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
     claim(database, "d1", clock)
     clock.advance(7)
     with database.write_session() as session:
-        assert LeaseQueue(session, clock).renew_leases([]) == ()
+        assert LeaseQueue(session, clock).renew_leases([]) == frozenset()
     clock.advance(4)
     assert reap(database, clock).requeued == (job_id,)
 
@@ -321,7 +326,8 @@ def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
     with database.write_session() as session:
         LeaseQueue(session).release_job(got.lease)
     job = job_of(database, got.job.id)
-    assert (job.state, job.lost_leases, job.lease_owner) == (JobState.QUEUED, 0, None)
+    parcel = parcel_of(database, got.job.id)
+    assert (job.state, job.lost_leases, parcel.lease_owner) == (JobState.QUEUED, 0, None)
     assert claim(database).lease.attempt == 2
 
 
@@ -334,7 +340,7 @@ def test_a_job_released_after_a_wish_to_cancel_is_cancelled(database):
 
 
 LATE_WRITES = {
-    "hold": lambda session, lease, _: LeaseQueue(session).lock_job(lease),
+    "hold": lambda session, lease, _: LeaseQueue(session).lock_lease(lease),
     "report": lambda session, lease, _: LeaseQueue(session).write_progress(lease, JobProgress(5)),
     "tell": lambda session, lease, _: LeaseQueue(session).append_event(
         lease, "log", {"line": "late"}

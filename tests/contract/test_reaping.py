@@ -23,7 +23,7 @@ from service.storage import columns
 from service.storage.columns import utc_now
 from sysid.core.machine import read_machine_id
 from tests.dispatching import until
-from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
+from tests.stored import Clock, claim, claimed, job_of, parcel_of, runs_of, state_of, submit
 
 LEASE = timedelta(seconds=10)
 
@@ -110,9 +110,7 @@ def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back
     for _ in range(5):
         clock.advance(3)
         with database.write_session() as session:
-            assert [
-                one.lease for one in LeaseQueue(session, clock).renew_leases([held], LEASE)
-            ] == [held]
+            assert LeaseQueue(session, clock).renew_leases([held], LEASE) == {held}
         assert reap_jobs(database, clock).requeued == ()
 
 
@@ -268,10 +266,10 @@ def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
     with database.write_session() as session:
         LeaseQueue(session, clock).claim_job("slow", timedelta(seconds=60))
     assert reap_jobs(database, clock).requeued == ()
-    assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
+    assert parcel_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(-3600)
     reap_jobs(database, clock)
-    assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
+    assert parcel_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(59)
     assert reap_jobs(database, clock).requeued == ()
     clock.advance(2)

@@ -334,7 +334,7 @@ def test_a_job_that_stops_or_is_cancelled_goes_on_from_its_last_states(desk: Des
     assert desk.checkpoints() == {run: 200}
     desk.recorder = desk.claim_again()
     desk.tell_progress(run, searched(30, 300, 0.5), 2.0)
-    desk.recorder.cancel_job()
+    desk.recorder.cancel_parcel()
     assert desk.place.job(desk.job).state is JobState.CANCELLED
     assert desk.place.job(desk.job).evaluations == 300  # those of its checkpoint are among them
     with desk.place.database.write_session() as session:
@@ -541,7 +541,7 @@ def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: 
         desk.recorder.write_due()
     desk.tell_result(desk.runs[0], searched(5, 50, 0.5))
     desk.tell_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
-    for write in (desk.recorder.write_due, desk.recorder.cancel_job, desk.recorder.finish_job):
+    for write in (desk.recorder.write_due, desk.recorder.cancel_parcel, desk.recorder.finish_job):
         with pytest.raises(LeaseLost):
             write()
     assert desk.states() == [JobState.QUEUED] * 4

@@ -140,7 +140,7 @@ def test_statistics_are_those_of_the_rows_and_wait_for_nobody(database):
 def test_every_table_a_user_owns_names_its_project():
     # The others belong to a run or a job, which does, or to the service itself.
     within = {"projects", "run_history", "migrations_log", "checkpoints", "events", "dispatchers"}
-    within |= {"job_summaries", "web_sessions"}
+    within |= {"job_summaries", "parcels", "web_sessions"}
     for name, table in Base.metadata.tables.items():
         assert ("project_id" in table.columns) != (name in within), name
 

@@ -17,7 +17,7 @@ from sysid.trends.trend import compute_drift_limit
 from tests.database import record_statements
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
-from tests.stored import record_outcomes
+from tests.stored import parcel_of, record_outcomes
 
 LENGTHS = (1.0, 2.0, 4.0)
 
@@ -103,7 +103,7 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
 
 def end(place: Place, job: str) -> None:
     with place.database.write_session() as session:
-        lease = Lease(job, place.job(job).attempt, str(place.job(job).lease_owner))
+        lease = Lease(job, place.job(job).attempt, str(parcel_of(place.database, job).lease_owner))
         LeaseQueue(session).finish_job(lease, JobState.SUCCEEDED)
 
 

@@ -8,7 +8,7 @@ from sqlalchemy import event, select
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
-from service.dispatch import job_runs
+from service.dispatch import job_parts, job_runs
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.warm_starts import WarmStarts
 from service.jobs import submit
@@ -95,7 +95,7 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(job_runs, "Noise", broken_second_time())
+        patched.setattr(job_parts, "Noise", broken_second_time())
         runs, warm = carried_out(place, **chained(NOISE))
     assert [one.state for one in runs] == [JobState.SUCCEEDED, JobState.FAILED, JobState.SUCCEEDED]
     assert warm[2] == (values(runs[0]),)
@@ -290,6 +290,6 @@ def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, mon
         raise InvalidSettings("/algorithm", "as told")
 
     monkeypatch.setattr(WarmStarts, "_read_last_success", refused)
-    monkeypatch.setattr(job_runs, "to_algorithm", broken)
+    monkeypatch.setattr(job_parts, "to_algorithm", broken)
     runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
     assert {one.state for one in runs} == {JobState.FAILED}

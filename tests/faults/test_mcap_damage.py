@@ -20,11 +20,11 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.mcap import read_mcap_with_notes
 from service.formats.mcap_messages import build_schema
 from service.formats.mcap_writer import MCAP_MAGIC
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 from tests.profiles import scale_examples
@@ -42,8 +42,8 @@ FILES = [OURS, *FOREIGN.values()]
 ONE_MIB = 1024**2
 
 
-def refused(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> InvalidUpload:
-    with pytest.raises(InvalidUpload) as caught:
+def refused(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> UnreadableFile:
+    with pytest.raises(UnreadableFile) as caught:
         read_mcap_with_notes(content, limits)
     assert "\n" not in str(caught.value)
     return caught.value
@@ -156,7 +156,7 @@ def test_a_zstd_frame_that_asks_for_a_huge_window_is_refused() -> None:
 
 READ_IN_LITTLE_MEMORY = """
 import resource, sys
-from service.formats.errors import InvalidUpload
+from sysid.core.errors import UnreadableFile
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import read_mcap_with_notes
 
@@ -168,7 +168,7 @@ resource.setrlimit(resource.RLIMIT_AS, (used + 32 * 1024**2, used + 32 * 1024**2
 for path in bombs:
     try:
         read_mcap_with_notes(path, DEFAULT_LIMITS)
-    except InvalidUpload as error:
+    except UnreadableFile as error:
         print(error.detail)
 """
 
@@ -363,7 +363,7 @@ def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataO
         damaged[place] ^= 1 << data.draw(st.integers(0, 7))
     try:
         read, _ = read_mcap_with_notes(bytes(damaged), DEFAULT_LIMITS)
-    except InvalidUpload:
+    except UnreadableFile:
         return
     for before, after in zip(whole.channels, read.channels, strict=True):
         np.testing.assert_array_equal(before.values, after.values)
@@ -373,7 +373,7 @@ def is_read_whole_or_refused(content: bytes) -> bool:
     """Whether a file gives channels with a value for every time, or a reason; nothing else may."""
     try:
         recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
-    except InvalidUpload as error:
+    except UnreadableFile as error:
         return bool(str(error))
     return bool(recording.channels) and all(
         one.times.shape == one.values.shape for one in recording.channels

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.recordings import read_with_notes
+from sysid.core.errors import UnreadableFile
 from tests.recorded_files import write_mat, write_parquet, write_sheet
 
 MEMORY = "MiB of memory"
@@ -22,7 +22,7 @@ def refuse(folder: Path, content: bytes, **limits: Any) -> str:
     path = folder / "upload"
     path.write_bytes(content)
     assert len(content) < MIB
-    with pytest.raises(InvalidUpload) as caught:
+    with pytest.raises(UnreadableFile) as caught:
         read_with_notes(path, limits=replace(DEFAULT_LIMITS, **limits))
     assert "\n" not in caught.value.detail
     return caught.value.detail

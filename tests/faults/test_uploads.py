@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import typer
 
-from service.cli.identify import FileOptions, read_recording
+from service.cli.identify import FileOptions, read_input_file
 from service.formats import limits as format_limits
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
 from service.formats.sandbox import read_untrusted
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
@@ -26,8 +26,8 @@ def saved(folder: Path, content: bytes) -> Path:
     return path
 
 
-def refused(path: Path, **options: object) -> InvalidUpload:
-    with pytest.raises(InvalidUpload) as caught:
+def refused(path: Path, **options: object) -> UnreadableFile:
+    with pytest.raises(UnreadableFile) as caught:
         read_untrusted(path, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
@@ -109,7 +109,7 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
     path = tmp_path / "recording.mcap"
     path.write_bytes(recorded(Recording((Channel("u", times, np.sin(times)),))))
     own = FileOptions(None, ())
-    np.testing.assert_array_equal(read_recording(path, own).channel("u").values, np.sin(times))
+    np.testing.assert_array_equal(read_input_file(path, own).channel("u").values, np.sin(times))
     for change, words in (
         ({"memory_bytes": 64 * MIB}, "64 MiB of memory"),
         ({"seconds": 0.01}, "takes more than 0.01 s"),
@@ -117,7 +117,7 @@ def test_identify_reads_mcap_under_the_limits_of_the_service(
         smaller = replace(DEFAULT_LIMITS, **change)  # type: ignore[arg-type]
         monkeypatch.setattr(format_limits, "DEFAULT_LIMITS", smaller)
         with pytest.raises(typer.Exit):
-            read_recording(path, own)
+            read_input_file(path, own)
         assert words in capsys.readouterr().err
 
 

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from service.formats.csv_recordings import read_csv
-from service.formats.errors import InvalidUpload
+from sysid.core.errors import UnreadableFile
 from tests.profiles import scale_examples
 
 VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=30)
@@ -46,6 +46,6 @@ def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
 def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]
 ) -> None:
-    with suppress(InvalidUpload):
+    with suppress(UnreadableFile):
         recording, _ = read_csv(content, sample_time=sample_time, segments=segments)
         assert recording.samples > 0

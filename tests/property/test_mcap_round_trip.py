@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
 from service.formats import mcap_writer
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from service.formats.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
@@ -48,7 +48,7 @@ def recordings(draw: st.DrawFn) -> Recording:
 def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chunk: int) -> None:
     with mock.patch.object(mcap_writer, "CHUNK_SAMPLES", chunk):
         content = recorded(recording)
-    back = read_recording(content)
+    back = read_mcap(content)
     assert back.names == recording.names
     for before, after in zip(recording.channels, back.channels, strict=True):
         assert (after.unit, after.hold) == (before.unit, before.hold)

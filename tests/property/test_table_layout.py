@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from service.formats.cells import classify_cell
 from service.formats.csv_recordings import read_csv
-from service.formats.table_layout import SEPARATORS
+from service.formats.table_layout import PEEK_ROWS, SEPARATORS
 from tests.profiles import scale_examples
 
 NAMES = ("u", "y", "P1", "Druck", "flow rate", "x2", "T", "Ventil_1")
@@ -21,6 +21,7 @@ PREAMBLES = (
     ["[Header]", "Operator=X", "***End***"],
     ["Model,DS1054Z", "Rate,1000", "Depth;7", "Mode\tauto"],
     [f"Setting {i}: value {i}" for i in range(40)],
+    [f"Setting {i} is value {i}" for i in range(PEEK_ROWS + 50)],
 )
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False, width=32)
 
@@ -36,6 +37,7 @@ class Text:
     commas: bool
     heading: str
     preamble: int
+    quiet: int
     comment: bool
     end: str
 
@@ -52,8 +54,9 @@ class Text:
                 self.heading
             ]
             heads = [[form.format(*pair) for pair in zip(names, units, strict=True)]]
-        rows = [
-            [repr(k / 8), *(repr(float(value)) for value in row)]
+        rows = [[str(k), *("0" for _ in self.names)] for k in range(self.quiet)]
+        rows += [
+            [repr(self.quiet + k / 8), *(repr(float(value)) for value in row)]
             for k, row in enumerate(self.values)
         ]
         if self.commas:
@@ -81,6 +84,7 @@ def texts(draw: st.DrawFn) -> Text:
         separator != "," and draw(st.booleans()),
         draw(st.sampled_from(["none", "brackets", "parentheses", "row"])),
         draw(st.integers(0, len(PREAMBLES) - 1)),
+        draw(st.sampled_from([0, 0, 3, PEEK_ROWS + 10])),
         draw(st.booleans()),
         draw(st.sampled_from(["\n", "\r\n"])),
     )
@@ -95,9 +99,10 @@ def test_numbers_names_and_units_come_back_from_any_layout(text: Text) -> None:
     assert list(recording.names) == wanted, content
     units = ["1"] * len(text.names) if text.heading == "none" else list(text.units)
     assert [channel.unit for channel in recording.channels] == units, content
+    zeros, later = np.zeros(text.quiet), text.quiet + np.arange(len(text.values)) / 8
     for channel, values in zip(recording.channels, text.values.T, strict=True):
-        np.testing.assert_array_equal(channel.values, values)
-        np.testing.assert_array_equal(channel.times, np.arange(len(values)) / 8)
+        np.testing.assert_array_equal(channel.values, np.concatenate([zeros, values]))
+        np.testing.assert_array_equal(channel.times, np.concatenate([np.arange(zeros.size), later]))
 
 
 @given(st.floats(), st.sampled_from(".,"), st.sampled_from(["{}", " {} ", "+{}", "{:e}", "{:E}"]))

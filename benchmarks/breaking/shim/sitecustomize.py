@@ -2,7 +2,8 @@
 
 ``BREAK_CLOCK`` names a file with seconds that are added to the times of rows. ``BREAK_SEEDS`` lists
 the seeds of runs that kill their worker. ``BREAK_MEMORY`` lists the seeds of runs that take all
-available memory. While the file ``BREAK_RAY`` exists, Ray does not start.
+available memory. While the file ``BREAK_RAY`` exists, Ray does not start. ``BREAK_PARCELS`` is the
+number of runs of a parcel, so that also a small sweep has several.
 """
 
 import functools
@@ -66,7 +67,14 @@ def _break_start(module):
     module._start_ray = broken
 
 
+def _break_sizes(module):
+    size = int(os.environ["BREAK_PARCELS"])
+    module.FIRST_RUNS = module.MAX_RUNS = size
+    module.RUNS_PER_CORE = 0
+
+
 _BREAKERS = {
+    ("service.dispatch.held_jobs", "BREAK_PARCELS"): _break_sizes,
     ("service.storage.columns", "BREAK_CLOCK"): _break_clock,
     ("workers.tasks", "BREAK_SEEDS"): _break_runs,
     ("workers.tasks", "BREAK_MEMORY"): _break_memory,

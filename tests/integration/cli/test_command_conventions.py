@@ -150,8 +150,11 @@ def test_a_dataset_is_downloaded_and_no_file_is_overwritten(ask: Ask, tmp_path: 
 
 def test_a_download_that_fails_leaves_the_file_as_it_was(ask: Ask, tmp_path: Path) -> None:
     (tmp_path / "place").write_text("a file")
-    line = check_refusal(ask("dataset", "download", "steps", "-o", "place/steps.mcap"))
-    assert "place/steps.mcap cannot be written: Not a directory" in line
+    line = check_refusal(ask("dataset", "download", "steps", "-o", "place/steps.mcap"), 2)
+    assert "--output place/steps.mcap: there is no folder place" in line
+    (tmp_path / "steps.mcap").write_text("old")
+    assert "dataset" in check_refusal(ask("dataset", "download", "none", "-o", "steps.mcap", "-f"))
+    assert (tmp_path / "steps.mcap").read_text() == "old"
 
 
 def test_a_report_is_not_overwritten_without_asking(

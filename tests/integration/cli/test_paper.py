@@ -51,7 +51,7 @@ def test_without_its_data_the_tube_is_that_of_the_plant(url: str, tmp_path: Path
     ("words", "told", "code"),
     [
         (["--only", "table9"], "--only: the study has no part 'table9'; need some of series", 1),
-        (["--output", "nowhere/paper.html"], "--output: there is no folder nowhere", 2),
+        (["--output", "no/a.html"], "--output no/a.html: there is no folder no", 2),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_any_work(

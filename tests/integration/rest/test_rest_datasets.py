@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from tests.rest import CSV, recording, refused, store_csv
 
 SIMULATION: dict[str, Any] = {
@@ -76,7 +76,7 @@ def test_content_goes_up_again_as_mcap_with_the_same_samples(
     kind = {"content-type": "application/x-mcap"}
     copy = server.post("/v1/datasets?name=copy", content=content, headers=kind).json()
     first, second = (
-        read_recording(server.get(f"/v1/datasets/{one}/content").content)
+        read_mcap(server.get(f"/v1/datasets/{one}/content").content)
         for one in (dataset, copy["id"])
     )
     for name in ("u", "y"):
@@ -91,8 +91,7 @@ def test_content_as_csv_goes_up_again_with_the_same_samples(server: TestClient) 
     copy = server.post("/v1/datasets?segments=run", content=again, headers=CSV).json()
     assert copy["segments"] == stored["segments"]
     first, second = (
-        read_recording(server.get(f"/v1/datasets/{one['id']}/content").content)
-        for one in (stored, copy)
+        read_mcap(server.get(f"/v1/datasets/{one['id']}/content").content) for one in (stored, copy)
     )
     np.testing.assert_array_equal(first.channel("y").values, second.channel("y").values)
     assert second.channel("u").unit == "V"
@@ -151,7 +150,7 @@ def test_a_simulation_with_noise_differs_by_the_noise_alone_and_is_made_once(
     assert again.status_code == 200
     assert noisy.json()["id"] == again.json()["id"]
     a, b = (
-        read_recording(server.get(f"/v1/datasets/{one}/content").content)
+        read_mcap(server.get(f"/v1/datasets/{one}/content").content)
         for one in (clean["id"], noisy.json()["id"])
     )
     np.testing.assert_array_equal(a.channel("q").values, b.channel("q").values)
@@ -170,7 +169,7 @@ def test_an_input_is_the_same_as_a_formula_and_as_a_frequency(server: TestClient
         body = {**SIMULATION, "inputs": {"q": kind}}
         made = server.post("/v1/datasets:simulate", json=body).json()
         content = server.get(f"/v1/datasets/{made['id']}/content").content
-        values.append(read_recording(content).channel("y").values)
+        values.append(read_mcap(content).channel("y").values)
     np.testing.assert_allclose(values[0], values[1], atol=1e-9)
     np.testing.assert_allclose(values[0], values[2], atol=1e-9)
 
@@ -230,7 +229,7 @@ def test_an_input_from_a_part_is_what_was_recorded_before_it(
     }
     made = server.post("/v1/datasets:simulate", json=body)
     assert made.status_code == 201, made.text
-    stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+    stored = read_mcap(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
     u, y = stored.channel("u").values, stored.channel("y").values
     assert not u[:70].any()
     assert np.all(u[71:] == 1.0)
@@ -277,7 +276,7 @@ def test_an_input_that_jumps_is_stored_as_held(
     assert made.status_code == 201, made.text
     assert [c["hold"] for c in made.json()["channels"] if c["name"] == "u"] == [hold]
     if signal["kind"] == "step":  # no ramp leads to it
-        stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+        stored = read_mcap(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
         values = stored.channel("y").values
         assert not values[:11].any()
         assert values[11] < 0.05  # a ramp from the sample before gives 0.2
@@ -311,7 +310,7 @@ def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
     }
     made = server.post("/v1/datasets:simulate", json=body)
     assert made.status_code == 201, made.text
-    stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+    stored = read_mcap(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
     u, y = stored.channel("u"), stored.channel("y")
     assert (u.hold, u.unit, u.values[9], u.values[10]) == ("zero", "Pa", 0.0, 1000.0)
     assert not y.values[:11].any()  # no ramp leads to the jump

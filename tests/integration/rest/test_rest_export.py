@@ -172,7 +172,7 @@ def test_the_command_writes_a_file_or_to_stdout(
     assert done.exit_code == 0, done.output
     assert file.read_text(encoding="utf-8") == told
     failed = run(commands, ["export", served.run, "--output", str(tmp_path / "no" / "file")])
-    assert failed.exit_code == 1
+    assert failed.exit_code == 2
     assert run(commands, ["export", served.run, "--format", "pascal"]).exit_code == 2
 
 

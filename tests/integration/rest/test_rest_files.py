@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from tests.recorded_files import (
     INPUT,
     OUTPUT,
@@ -41,7 +41,7 @@ def check_stored(server: TestClient, answer: Any, kind: str) -> dict[str, Any]:
     assert answer.status_code in (200, 201), answer.text
     stored: dict[str, Any] = answer.json()
     assert stored["details"]["source"]["format"] == kind
-    content = read_recording(server.get(f"/v1/datasets/{stored['id']}/content").content)
+    content = read_mcap(server.get(f"/v1/datasets/{stored['id']}/content").content)
     for name, values in (("u", INPUT), ("y", OUTPUT)):
         np.testing.assert_array_equal(content.channel(name).times, TIMES)
         np.testing.assert_array_equal(content.channel(name).values, values)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from service.cli import datasets
 from service.client.client import Client
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from sysid.data.records import Recording
 from tests.integration.rest.test_client import Through
 from tests.rest import refused
@@ -27,7 +27,7 @@ def made(server: TestClient, body: dict[str, Any]) -> dict[str, Any]:
 
 
 def content(server: TestClient, dataset: dict[str, Any]) -> Recording:
-    return read_recording(server.get(f"/v1/datasets/{dataset['id']}/content").content)
+    return read_mcap(server.get(f"/v1/datasets/{dataset['id']}/content").content)
 
 
 def test_the_actuator_is_made_once_and_tells_its_true_parameters(server: TestClient) -> None:

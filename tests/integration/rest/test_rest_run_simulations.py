@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from service.api.app import create_app
 from service.cli import runs
 from service.client.client import Client
-from service.formats.mcap import read_recording
+from service.formats.mcap import read_mcap
 from tests.catalogue_cases import ACTUATOR
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
@@ -236,7 +236,7 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
     lineage = served.server.get(f"/v1/datasets/{dataset['id']}/lineage").json()["edges"]
     assert {"parent": served.arm, "child": dataset["id"], "relation": "simulated"} in lineage
     content = served.server.get(f"/v1/datasets/{dataset['id']}/content").content
-    angle = read_recording(content).channel("theta").values
+    angle = read_mcap(content).channel("theta").values
     assert angle.size == 601
     whole = simulated(served, served.arm, LOOP)["outputs"][0]["values"]
     np.testing.assert_array_equal(angle, whole)

@@ -11,11 +11,14 @@ import pytest
 from sqlalchemy import inspect, text
 
 import migrations
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Event, Job, Project, Run, StoredSummary
-from tests.stored import claimed, record_success
+from tests.stored import claim, claimed, parcels_of, record_success, submit
 
 HEAD = migrate.find_head_revision()
 VERSIONS = Path(migrations.__file__).parent / "versions"
@@ -71,6 +74,38 @@ def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back
     migrate.upgrade_database(empty_database)
     assert [rows(empty_database, kind) for kind in kinds] == before
     assert rows(empty_database, StoredSummary) == []  # the next reader computes it again
+
+
+def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):
+    """The earlier version creates runs in their order, so nothing may be behind a gap."""
+    database = empty_database
+    migrate.upgrade_database(database)
+    job = submit(database, n_runs=6)
+    for owner, numbers in (("d1", [0]), ("d2", [3, 4])):
+        with database.write_session() as session:
+            lease = LeaseQueue(session).claim_job(owner, choose_size=lambda _: 3).lease
+            writer = RunWriter(session, lease)
+            created = writer.create_runs(NewRun(number=number) for number in numbers)
+            record = RunOutcome(run_id=created[0].id, state=JobState.SUCCEEDED)
+            writer.record_outcomes([record])
+    whole = submit(database, n_runs=1)
+    leased = claim(database, "d3")
+    migrate.downgrade_database(database, "0002")
+    with database.engine.connect() as connection:
+        query = "SELECT id, state, lease_owner, n_done FROM jobs ORDER BY id"
+        assert list(map(tuple, connection.execute(text(query)))) == [
+            (job, "queued", None, 1),
+            (whole, "running", "d3", 0),
+        ]
+        numbers = text("SELECT number FROM runs ORDER BY number")
+        assert list(connection.scalars(numbers)) == [0]
+    migrate.upgrade_database(database)
+    assert migrate.list_differences(database) == []
+    (waiting,), (held,) = parcels_of(database, job), parcels_of(database, whole)
+    assert (waiting.first, waiting.stop, waiting.lease_owner) == (0, 6, None)
+    assert (held.attempt, held.lease_owner) == (leased.lease.attempt, "d3")
+    again = claim(database, "d4")
+    assert (again.job.id, again.runs, again.is_new) == (job, range(6), False)
 
 
 def rows(database, kind):

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import sys
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ from sysid.core.errors import (
     MissingLibrary,
     UnknownParameter,
     UnreadableResult,
+    UnwritableFile,
 )
 from sysid.identification.figures import FIGURES, draw_figures, list_experiments
 from sysid.identification.result import InputHold
@@ -255,7 +257,7 @@ def test_another_file_is_told(tmp_path: Path, content: str | None, told: str) ->
 
 
 def test_a_place_that_cannot_be_written_is_told(found: Identification, tmp_path: Path) -> None:
-    with pytest.raises(UnreadableResult, match="cannot be written: No such file"):
+    with pytest.raises(UnwritableFile, match="cannot be written: No such file"):
         found.save(tmp_path / "absent" / "found.json")
 
 
@@ -448,6 +450,9 @@ ARGUMENTS = [
     ({"records": Channel("u", T, T)}, "Join channels in a record: Record"),
     ({"records": []}, "there is no record"),
     ({"settings": "fast"}, "/settings: found 'fast'; need GeneticAlgorithm"),
+    ({"settings": pd.Series(T)}, r"/settings: found an object of type Series of shape \(240,\)"),
+    ({"settings": np.zeros(2)}, r"ndarray of shape \(2,\).*join them: Record\(inputs, outputs\)"),
+    ({"weights": list(range(99))}, "/weights: found an object of type list; need a mapping"),
     ({"loss": "soft-l1"}, "/loss: found 'soft-l1'; need Loss"),
     ({"noise": 0.1}, "/noise: found 0.1; need Noise"),
     ({"seed": "a"}, "/seed: found 'a'; need a whole number"),
@@ -494,3 +499,73 @@ def test_a_wrong_argument_is_told_in_one_line(
 def test_a_wrong_argument_of_a_simulation_is_told(inputs, values, more, told: str) -> None:
     with pytest.raises((InvalidRecord, InvalidSettings), match=told):
         simulate("fopdt", inputs, values, **more)
+
+
+def test_a_result_simulates_the_table_that_it_was_identified_from(
+    found: Identification, frame: pd.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "found.json"
+    found.save(path)
+    for result in (found, Identification.load(path)):
+        simulated = simulate("fopdt", frame, result).channel("y")
+        assert simulated.values.size == N
+        one = simulate("fopdt", frame[["Heizung [%]"]].rename(columns={"Heizung [%]": "u"}), result)
+        np.testing.assert_array_equal(one.channel("y").values, simulated.values)
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "told"),
+    [
+        (("posterior",), {}, "/names: no posterior was sampled; call identify"),
+        (("respons",), {}, "/names: there is no figure 'respons'; did you mean 'response'"),
+        ((["response", 3],), {}, "/names: there is no figure 3"),
+        ((), {"theme": "drak"}, "/theme: found 'drak'; need one of light, dark"),
+        ((), {"experiment": "1"}, "/experiment: found '1'; need a whole number"),
+        ((), {"experiment": True}, "/experiment: found True; need a whole number"),
+    ],
+)
+def test_a_wrong_argument_of_plot_is_told(
+    found: Identification, names: tuple[Any, ...], options: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(InvalidSettings, match=re.escape(told)):
+        found.plot(*names, **options)
+
+
+def test_figures_may_be_a_list(found: Identification) -> None:
+    assert len(found.plot(["response", "waterfall"]).data) == len(
+        found.plot("response", "waterfall").data
+    )
+    with pytest.raises(InvalidSettings, match="no data for the figure 'response'"):
+        replace(found, data=None).plot("response")
+
+
+def test_a_result_is_a_mapping_of_names_to_estimates(found: Identification) -> None:
+    names = [estimate.name for estimate in found.estimates]
+    assert len(found) == len(names)
+    assert list(found) == list(found.keys()) == names
+    assert list(found.values()) == list(found.estimates)
+    assert dict(found) == dict(found.items()) == {name: found[name] for name in names}
+    assert found.get("L") is found["L"]
+    assert found.get("M") is None
+    assert found.get("M", found["L"]) is found["L"]
+    with pytest.raises(UnknownParameter, match=r"there is no parameter 0; the names are K, T, L"):
+        found[0]  # type: ignore[index]
+    with pytest.raises(UnknownParameter, match="there is no parameter 'l'; known are K, L"):
+        found["l"]
+
+
+def test_a_failure_to_write_leaves_the_old_file_whole(
+    found: Identification, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "found.json"
+    found.save(path)
+    before = path.read_bytes()
+
+    def fill_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fill_disk)
+    with pytest.raises(UnwritableFile, match=r"found\.json: it cannot be written: No space left"):
+        found.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

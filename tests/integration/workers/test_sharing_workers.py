@@ -65,8 +65,8 @@ class Counted(HeldLeases):
         super().__init__(database, seconds)
         self._both = both
 
-    def claim_job(self, admission: Admission | None = None) -> Claim | None:
-        found = super().claim_job(admission)
+    def claim_job(self, admission: Admission | None = None, **chosen: Any) -> Claim | None:
+        found = super().claim_job(admission, **chosen)
         self.claimed += found is not None
         if found is not None and self.claimed == 1:
             self._both.wait(LIMIT_SECONDS)

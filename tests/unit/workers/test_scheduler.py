@@ -359,7 +359,7 @@ def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
     work, executor, _ = spread(monkeypatch)
     first, second = work.in_flight
     work.requeue_lost_pack(second, "killed")
-    assert work.has_waiting_runs
+    assert bool(work.n_waiting)
     island = executor.packs[first][0]
     assert isinstance(island, EvolveIsland)
     done = (
@@ -367,7 +367,7 @@ def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
         ItemResult("a0", None, 0.0),
     )
     work.absorb_pack(first, PackResult(done))
-    assert (work.in_flight, work.has_waiting_runs) == ({}, True)
+    assert (work.in_flight, bool(work.n_waiting)) == ({}, True)
 
 
 def test_a_run_that_goes_on_is_not_sent_a_second_time_when_an_older_pack_is_lost(
@@ -378,7 +378,7 @@ def test_a_run_that_goes_on_is_not_sent_a_second_time_when_an_older_pack_is_lost
     work.requeue_lost_pack(first, "killed")
     work.send_next_pack(0)
     work.requeue_lost_pack(second, "killed")
-    assert (len(work.in_flight), work.has_waiting_runs) == (1, False)
+    assert (len(work.in_flight), bool(work.n_waiting)) == (1, False)
     assert notebook.kills == {"a0": [1]}
     [whole] = work.in_flight
     work.absorb_pack(whole, PackResult((ItemResult("a0", RunFailure("as told"), 0.1),)))
@@ -395,10 +395,10 @@ def test_what_an_older_pack_says_of_a_run_that_goes_on_is_not_heard(
         second,
         PackResult((ItemResult("a0", RunFailure("too late"), 0.1), ItemResult("a0", None, 0.0))),
     )
-    assert (notebook.failures, work.has_waiting_runs) == ({}, True)
+    assert (notebook.failures, bool(work.n_waiting)) == ({}, True)
     work.send_next_pack(2)
     third, fourth = work.in_flight
     work.fail_pack(third, "internal error")
     work.fail_pack(fourth, "internal error")
     assert [one.reason for one in notebook.failures["a0"]] == ["internal error"]
-    assert (work.in_flight, work.has_waiting_runs) == ({}, False)
+    assert (work.in_flight, bool(work.n_waiting)) == ({}, False)

@@ -95,6 +95,28 @@ def test_what_asks_a_server_for_data_has_json() -> None:
     assert without == {"demo", "paper", "serve", "dispatcher", "report", "dataset download"}
 
 
+def test_what_writes_a_file_can_be_forced() -> None:
+    writers = {name for name, option in OPTIONS if "--output" in option.opts}
+    forced = {name for name, option in OPTIONS if "--force" in option.opts}
+    assert writers == forced
+    assert len(writers) > 5
+
+
+@pytest.mark.parametrize("words", [["identify", "a.csv", "--model", "fopdt"], ["export", "run_1"]])
+def test_no_file_is_overwritten_before_any_work(words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    path.write_text("mine")
+    line = check_refusal(run_lagid(*words, "--output", path))
+    assert line.endswith(
+        "exists, and nothing was written. Add --force, or name another by --output"
+    )
+    assert path.read_text() == "mine"
+    line = check_refusal(run_lagid(*words, "--output", tmp_path), 2)
+    assert "this is a folder; name a file" in line
+    line = check_refusal(run_lagid(*words, "--output", tmp_path / "no" / "a.json"), 2)
+    assert "there is no folder" in line
+
+
 def test_a_file_after_json_is_refused_with_the_option_that_writes_it() -> None:
     for words in ("a.csv --json b.json", "--json b.json a.csv"):
         line = check_refusal(run_lagid("identify", *words.split(), "--model", "fopdt"), 2)

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import typer
 
-from service.cli.common import FieldOrigins, name_read_options, report_faults
-from service.cli.identify import FileOptions, read_recording
+from service.cli.common import report_faults, upload_origins
+from service.cli.identify import FileOptions, read_input_file
 from service.client.calls import build_upload, raise_for_problem
-from tests.recorded_files import TIMES, join_rows
+from tests.recorded_files import TIMES, join_rows, write_parquet
 
 
 def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> str:
     with pytest.raises(typer.Exit):
-        read_recording(path, FileOptions(None, segments))
+        read_input_file(path, FileOptions(None, segments))
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert "Traceback" not in line
@@ -25,7 +25,7 @@ def refuse(path: Path, capsys: pytest.CaptureFixture[str], *segments: str) -> st
 def test_guesses_are_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rig.txt"
     path.write_text("Device: rig\n\n" + join_rows("Zeit;u;y", ";"))
-    recording = read_recording(path, FileOptions(None, ()))
+    recording = read_input_file(path, FileOptions(None, ()))
     np.testing.assert_array_equal(recording.channel("u").times, TIMES)
     notes = capsys.readouterr().err.splitlines()
     assert "note: the header is in row 3; the lines before it were skipped" in notes
@@ -49,14 +49,29 @@ def test_a_refusal_names_the_file_and_the_options(
 
 
 def test_refusals_of_the_server_name_options_too(capsys: pytest.CaptureFixture[str]) -> None:
-    detail = "row 2: sample_time is given too; 3 segments, name them with segments"
-    document = {"errors": [{"pointer": "/rows/2", "detail": detail}], "title": "x"}
-    origins = FieldOrigins(rest="rig.csv", rewrite=name_read_options)
-    with pytest.raises(typer.Exit), report_faults(origins):
-        raise_for_problem(httpx.Response(422, json=document))
+    detail = "row 2, column 'segments': in segments; name it in segments."
+    fault = {"pointer": "/rows/2", "detail": detail, "option": "segments"}
+    with pytest.raises(typer.Exit), report_faults(upload_origins(Path("rig.csv"))):
+        raise_for_problem(httpx.Response(422, json={"errors": [fault], "title": "x"}))
     assert capsys.readouterr().err == (
-        "lagid: rig.csv: row 2: --sample-time is given too; 3 segments, name them with --segments\n"
+        "lagid: rig.csv: row 2, column 'segments': in segments; name it in --segments.\n"
     )
+
+
+def test_columns_called_like_options_keep_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.csv"
+    path.write_text("t,sample_time,y\n0,1,2\n1,5x,3\n2,1,3\n")
+    line = refuse(path, capsys)
+    assert "column 'sample_time': found '5x'" in line
+    assert line.endswith("name it in --segments\n")
+    path.write_text("sample_time,y\n0,1\n1,2\n")
+    line = refuse(path, capsys)
+    assert "found sample_time, y. Name one" in line
+    assert line.endswith("with --sample-time.\n")
+    path.write_bytes(write_parquet(sample_time=[0.0, 1.0], y=[1.0, 2.0]))  # read by a child
+    assert refuse(path, capsys) == line.replace("row 1: ", "")
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.xlsx", "a.csv.gz", "a", "a.unknown"])

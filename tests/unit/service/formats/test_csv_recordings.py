@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from service.formats.csv_recordings import generate_csv, read_csv
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
 
 
-def refused(content: str | bytes, **options: object) -> InvalidUpload:
+def refused(content: str | bytes, **options: object) -> UnreadableFile:
     data = content if isinstance(content, bytes) else content.encode()
-    with pytest.raises(InvalidUpload) as caught:
+    with pytest.raises(UnreadableFile) as caught:
         read_csv(data, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return caught.value
@@ -157,7 +157,7 @@ def test_a_text_in_a_column_of_numbers_is_told_with_row_and_column() -> None:
     error = refused("t,u,y\n0,1,2\n1,2,oops\n")
     assert (error.row, error.column) == (3, "y")
     assert "'oops'" in error.detail
-    assert error.errors[0].pointer == "/rows/3/y"
+    assert error.pointer == "/rows/3/y"
 
 
 def test_blank_rows_count_where_a_fault_is_told() -> None:
@@ -195,7 +195,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("t,\n0,1\n", "has no name"),
         ("t [V],u\n0,1\n", "times are in [V]; need seconds, or another unit of time"),
         ("t [Hz],u\n0,1\n", "need seconds"),
-        ("t;u\n0.5;1,5\n", "other numbers of the file have commas"),
+        ("t;u\n0.5;1,5\n", "other numbers of the file have points"),
         ("t;u\n1,5;2,5\n2,5;abc.d\n", "name it in segments"),
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
@@ -227,7 +227,7 @@ def test_a_row_without_end_is_refused_before_it_fills_the_memory() -> None:
 
 
 def test_time_told_twice_or_wrongly_is_refused() -> None:
-    assert "remove one of them" in refused("t,u\n0,1\n", sample_time=0.1).detail
+    assert "Remove it, or leave out sample_time" in refused("t,u\n0,1\n", sample_time=0.1).detail
     assert "positive" in refused("u,y\n0,1\n", sample_time=0.0).detail
 
 

@@ -21,7 +21,7 @@ from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import (
     FittedOutput,
     read_fitted_outputs,
-    read_recording,
+    read_mcap,
     write_fitted_outputs,
     write_recording,
 )
@@ -168,7 +168,7 @@ def test_the_offsets_of_the_summary_enclose_records_of_one_kind_each() -> None:
 def test_times_before_zero_come_back() -> None:
     before = Channel("u", np.array([-0.5, -0.25, 0.0, 2.0]), np.arange(4.0))
     np.testing.assert_array_equal(
-        read_recording(recorded(Recording((before,)))).channel("u").times, before.times
+        read_mcap(recorded(Recording((before,)))).channel("u").times, before.times
     )
 
 
@@ -221,7 +221,7 @@ def test_a_part_of_the_time_can_be_read_through_the_index() -> None:
 
 
 def test_names_units_holds_and_segments_come_back() -> None:
-    back = read_recording(recorded(two_bases()))
+    back = read_mcap(recorded(two_bases()))
     assert back.names == ("u [x]", "other/base", "t")
     assert [one.unit for one in back.channels] == ["V", "m", "1"]
     assert [one.hold for one in back.channels] == ["zero", "auto", "band-limited"]
@@ -235,7 +235,7 @@ def test_a_history_stands_in_topics_of_its_own() -> None:
     topics = [channel.topic for _, channel, _ in reader.iter_messages()]
     assert topics.count("/history") == 3
     assert len(topics) == 46
-    back = read_recording(recorded(with_history)).channel("u [x]").history
+    back = read_mcap(recorded(with_history)).channel("u [x]").history
     assert back is not None
     np.testing.assert_array_equal(back.times, TIMES[:3] - 1)
 
@@ -265,7 +265,7 @@ def test_times_beyond_the_files_clock_are_refused() -> None:
 def test_paths_are_written(tmp_path) -> None:
     target = tmp_path / "a.mcap"
     write_recording(two_bases(), target)
-    assert read_recording(target).names == two_bases().names
+    assert read_mcap(target).names == two_bases().names
 
 
 def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
@@ -294,7 +294,7 @@ def test_the_widest_recording_is_written_within_the_limits_of_the_reader() -> No
     zeros = np.zeros(times.size)
     names = [f"channel{number}" for number in range(DEFAULT_LIMITS.channels)]
     content = recorded(Recording(tuple(Channel(name, times, zeros) for name in names)))
-    read = read_recording(BytesIO(content), DEFAULT_LIMITS)
+    read = read_mcap(BytesIO(content), DEFAULT_LIMITS)
     assert [channel.name for channel in read.channels] == names
     np.testing.assert_array_equal(read.channels[-1].times, times)
 

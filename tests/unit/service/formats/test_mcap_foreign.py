@@ -10,10 +10,10 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.writer import CompressionType
 
-from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import read_mcap_with_notes
 from service.formats.mcap_messages import build_schema
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 
@@ -202,7 +202,7 @@ def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
     ],
 )
 def test_what_holds_no_signal_is_refused_with_the_reason(content: bytes, words: str) -> None:
-    with pytest.raises(InvalidUpload) as caught:
+    with pytest.raises(UnreadableFile) as caught:
         read(content)
     assert words in caught.value.detail
     assert "\n" not in caught.value.detail

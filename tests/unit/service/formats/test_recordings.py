@@ -1,6 +1,8 @@
 """Files as loggers, spreadsheets and other programs write them: all give the same experiment."""
 
 import doctest
+import io
+import pickle
 import re
 import struct
 import warnings
@@ -11,14 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.formats import recordings, table_columns
+import lagid
+from service.formats import csv_recordings, recordings, table_columns
 from service.formats.csv_recordings import read_csv
-from service.formats.errors import InvalidUpload
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.limits import ReadOptions
-from service.formats.recordings import ReadingNote, read_recording, read_with_notes
+from service.formats.recordings import read_recording, read_with_notes
 from service.formats.sandbox_child import read_file
+from service.formats.table_layout import PEEK_ROWS
+from service.formats.text_files import open_text
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
+from sysid.data.table_rules import ReadingNote
 from tests.recorded_files import (
     INPUT,
     OUTPUT,
@@ -133,7 +139,7 @@ def test_encodings_are_recognised(encoding: str) -> None:
 
 def test_a_compressed_text_is_read() -> None:
     check_experiment(read_csv(compress(ROWS))[0])
-    with pytest.raises(InvalidUpload, match="damaged or cut off"):
+    with pytest.raises(UnreadableFile, match="damaged or cut off"):
         read_csv(compress(ROWS)[:-20])
 
 
@@ -239,14 +245,14 @@ def test_of_two_orders_of_day_and_month_the_one_is_taken_in_which_times_increase
 
 def test_stamps_that_are_too_coarse_or_mixed_are_refused_with_the_way_out() -> None:
     coarse = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S")).encode()
-    with pytest.raises(InvalidUpload, match="too coarse, give the sampling period with sample_t"):
+    with pytest.raises(UnreadableFile, match="too coarse, give the sampling period with sample_t"):
         read_csv(coarse)
     recording, notes = read_csv(coarse, sample_time=0.1)
     np.testing.assert_allclose(recording.channel("u").times, TIMES, atol=1e-12)
     assert recording.started_at == START
     assert "samples are 0.1 s apart; column 'Zeit' gives the start" in notes
     mixed = b"time,u\n2026-11-20 08:00:00,1\n20.11.2026 08:01,2\n"
-    with pytest.raises(InvalidUpload, match=r"row 3, column 'time': found '20\.11\.2026 08:01'"):
+    with pytest.raises(UnreadableFile, match=r"row 3, column 'time': found '20\.11\.2026 08:01'"):
         read_csv(mixed)
 
 
@@ -255,7 +261,7 @@ def test_words_of_missing_values_are_missing(word: str) -> None:
     text = ROWS.replace(f",{OUTPUT[7]:.6f}\n", f",{word}\n")
     recording, notes = read_csv(text.encode())
     assert np.flatnonzero(np.isnan(recording.channel("y").values)).tolist() == [7]
-    assert any("1 of 40 values are missing" in note and "row 9" in note for note in notes)
+    assert any(f"1 of {N} values are missing" in note and "row 9" in note for note in notes)
 
 
 def test_true_and_false_are_numbers_and_said() -> None:
@@ -291,7 +297,7 @@ REFUSED = {
 def test_what_cannot_be_read_is_refused_with_what_to_do(
     tmp_path: Path, text: str, words: str
 ) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(words)) as caught:
+    with pytest.raises(UnreadableFile, match=re.escape(words)) as caught:
         read_bytes(tmp_path, text.encode())
     assert "\n" not in caught.value.detail
 
@@ -311,7 +317,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_do(
 def test_a_kind_that_is_recognised_is_named_in_its_refusal(
     tmp_path: Path, head: bytes, words: str
 ) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(words)):
+    with pytest.raises(UnreadableFile, match=re.escape(words)):
         read_bytes(tmp_path, head)
 
 
@@ -323,17 +329,17 @@ def test_a_text_that_begins_like_another_kind_is_a_text() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 42 to 43 are below the data ('Mean')"),
-        (ROWS + "\n\nEnd of file\n", "row 44 is below the data ('End of file')"),
+        (ROWS + "Mean,0.875,0.1\nStd,0.2,0.3\n", "rows 242 to 243 are below the data ('Mean')"),
+        (ROWS + "\n\nEnd of file\n", "row 244 is below the data ('End of file')"),
         (
             join_rows("time;u;y", ";", time=stamp("%Y-%m-%d %H:%M:%S.%f")) + "Mittel;0.5;0.3\n",
-            "row 42 is below the data ('Mittel')",
+            "row 242 is below the data ('Mittel')",
         ),
         (
             "u,y,t\n"
             + "".join(f"{u},{y},{t}\n" for u, y, t in zip(INPUT, OUTPUT, TIMES, strict=True))
             + "End\n",
-            "row 42 is below the data ('End')",
+            "row 242 is below the data ('End')",
         ),
     ],
 )
@@ -350,20 +356,20 @@ def test_words_below_the_data_are_found_wherever_blocks_end(
         monkeypatch.setattr(table_columns, "BLOCK_ROWS", rows)
         recording, notes = read_with_notes((ROWS + "Mean,1,2\n" * 3).encode())
         check_experiment(recording)
-        assert notes == ("rows 42 to 44 are below the data ('Mean') and left out",)
+        assert notes == ("rows 242 to 244 are below the data ('Mean') and left out",)
 
 
 @pytest.mark.parametrize(
     "end", ["4.0,1,abc\n", "4V,1,2\n", ",0.8,0.1\n", "end\n" * 21, "Mean,1,2\n4.0,1,2\n"]
 )
 def test_a_fault_in_the_last_rows_is_no_footer(end: str) -> None:
-    with pytest.raises(InvalidUpload, match=r"^row 42"):
+    with pytest.raises(UnreadableFile, match=r"^row 242"):
         read_with_notes((ROWS + end).encode())
 
 
 def test_labels_that_divide_every_row_are_refused() -> None:
     text = join_rows("Zeit,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
-    with pytest.raises(InvalidUpload, match="into 40 segments, of which 40 have one sample"):
+    with pytest.raises(UnreadableFile, match=f"into {N} segments, of which {N} have one sample"):
         read_csv(text.encode(), segments=("Zeit",), sample_time=0.1)
 
 
@@ -406,7 +412,7 @@ def test_structures_of_matlab_are_opened_if_there_is_one(tmp_path: Path) -> None
     nested = write_mat({"data": {"run": {"t": TIMES, "u": INPUT, "y": OUTPUT}}})
     check_experiment(read_bytes(tmp_path, nested)[0])
     one = {"u": INPUT, "y": OUTPUT, "Ts": 0.1}
-    with pytest.raises(InvalidUpload, match="the file holds ze, zv; need arrays"):
+    with pytest.raises(UnreadableFile, match="the file holds ze, zv; need arrays"):
         read_bytes(tmp_path, write_mat({"ze": one, "zv": one}))
 
 
@@ -416,20 +422,20 @@ def test_matlab_4_is_recognised_without_a_suffix(tmp_path: Path) -> None:
 
 
 def test_objects_and_arrays_without_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidUpload, match="an array holds Python objects"):
+    with pytest.raises(UnreadableFile, match="an array holds Python objects"):
         read_bytes(tmp_path, write_npz(t=TIMES, u=np.array([{}] * N, dtype=object)))
     np.save(tmp_path / "a.npy", np.stack([TIMES, INPUT]))
-    with pytest.raises(InvalidUpload, match="one array without names"):
+    with pytest.raises(UnreadableFile, match="one array without names"):
         read_bytes(tmp_path, (tmp_path / "a.npy").read_bytes())
-    with pytest.raises(InvalidUpload, match="the MATLAB file cannot be read"):
+    with pytest.raises(UnreadableFile, match="the MATLAB file cannot be read"):
         read_bytes(tmp_path, b"MATLAB 5.0 MAT-file" + bytes(200))
 
 
 def test_an_array_that_is_infinite_or_without_a_time_is_refused(tmp_path: Path) -> None:
     broken = np.where(TIMES == 0.5, np.inf, OUTPUT)
-    with pytest.raises(InvalidUpload, match="row 6, column 'y': the value is infinite"):
+    with pytest.raises(UnreadableFile, match="row 6, column 'y': the value is infinite"):
         read_bytes(tmp_path, write_npz(t=TIMES, y=broken))
-    with pytest.raises(InvalidUpload, match="row 6, column 't': the time is missing"):
+    with pytest.raises(UnreadableFile, match="row 6, column 't': the time is missing"):
         read_bytes(tmp_path, write_npz(t=np.where(TIMES == 0.5, np.nan, TIMES), y=OUTPUT))
 
 
@@ -447,7 +453,7 @@ def test_parquet_keeps_units_stamps_and_zones(tmp_path: Path) -> None:
     zoned = [moment.replace(tzinfo=UTC) for moment in stamps]
     recording, _ = read_bytes(tmp_path, write_parquet(when=zoned, u=INPUT, y=OUTPUT))
     assert recording.started_at == START.replace(tzinfo=UTC)
-    with pytest.raises(InvalidUpload, match="the Parquet file cannot be read"):
+    with pytest.raises(UnreadableFile, match="the Parquet file cannot be read"):
         read_bytes(tmp_path, plain[: len(plain) // 2])
 
 
@@ -462,9 +468,9 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
     assert recording.channel("y").unit == "Pa"
     assert "column 1 (no name) counts rows and was left out" in notes
     faulty = [["t", "u"], [0.0, 1.0], [1.0, "x"]]
-    with pytest.raises(InvalidUpload, match="row 3, column 'u': found 'x'"):
+    with pytest.raises(UnreadableFile, match="row 3, column 'u': found 'x'"):
         read_bytes(tmp_path, write_sheet(faulty))
-    with pytest.raises(InvalidUpload, match="cannot be opened"):
+    with pytest.raises(UnreadableFile, match="cannot be opened"):
         read_bytes(tmp_path, write_experiment_sheet()[:700])
 
 
@@ -473,7 +479,7 @@ def test_an_open_document_and_an_old_excel_file_are_sheets_too(tmp_path: Path, w
     rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
     content = write([["t", "u", "y"], *rows])
     check_experiment(read_bytes(tmp_path, content)[0])
-    with pytest.raises(InvalidUpload, match="cannot be opened"):
+    with pytest.raises(UnreadableFile, match="cannot be opened"):
         read_bytes(tmp_path, content[: len(content) // 2])
 
 
@@ -497,12 +503,58 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
         ({"source": 3}, "found 3; need the path of a file"),
         ({"sample_time": "0.1 s"}, "sample_time is '0.1 s'; need a positive number"),
         ({"sample_time": -1}, "sample_time is -1; need a positive number"),
-        ({"segments": "run"}, "segments is 'run'; need a list of columns: ['run']"),
+        ({"segments": "run"}, "there is no label column 'run'"),
     ],
 )
 def test_a_wrong_argument_of_the_reader_is_told(arguments: dict[str, Any], told: str) -> None:
-    with pytest.raises(InvalidUpload, match=re.escape(told)):
+    with pytest.raises(UnreadableFile, match=re.escape(told)):
         read_recording(**{"source": ROWS.encode(), **arguments})
+
+
+def test_one_label_column_may_be_a_text() -> None:
+    rows = b"run,t,u\na,0,1\na,1,2\nb,0,3\nb,1,4\n"
+    recording, _ = read_with_notes(rows, segments="run")
+    assert [segment.labels["run"] for segment in recording.segments] == ["a", "b"]
+
+
+def test_an_open_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "rig.csv"
+    path.write_text(ROWS)
+    with path.open() as text, path.open("rb") as binary:
+        for source in (text, binary, io.BytesIO(ROWS.encode()), io.StringIO(ROWS)):
+            check_experiment(read_recording(source))
+    check_experiment(read_recording(io.BytesIO(write_experiment_sheet())))
+
+
+def test_a_plain_text_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def count(*arguments: Any) -> Any:
+        opened.append(arguments)
+        return open_text(*arguments)
+
+    monkeypatch.setattr(csv_recordings, "open_text", count)
+    check_experiment(read_recording(ROWS.encode()))
+    assert len(opened) == 1
+    stamps = join_rows("t,u,y", time=stamp("%Y-%m-%d %H:%M:%S.%f"))
+    check_experiment(read_with_notes(stamps.encode())[0])  # by a child, after one look
+    assert len(opened) == 2
+
+
+def test_a_refusal_is_an_error_of_the_library_with_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "rig.csv"
+    path.write_text("t,u\n0,1\n1,5 V\n")
+    with pytest.raises(lagid.SysidError) as caught:
+        lagid.read_recording(path)
+    error = caught.value
+    assert isinstance(error, lagid.UnreadableFile)
+    assert (error.name, error.row, error.column) == (str(path), 3, "u")
+    assert str(error) == f"{path}: {error.detail}"
+    assert error.detail.startswith("row 3, column 'u': found '5 V'")
+    assert error.pointer == "/rows/3/u"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    with pytest.raises(lagid.UnreadableFile, match=r"^row 3"):
+        lagid.read_recording(path.read_bytes())
 
 
 def test_every_kind_comes_through_the_child_with_its_clock(tmp_path: Path) -> None:
@@ -551,3 +603,87 @@ def test_the_page_lists_every_suffix_that_forms_offer() -> None:
     texts = (".txt", ".tsv", ".dat", ".asc")  # any name of a text
     missing = [s for s in SUFFIXES if s not in texts and names.get(s, f"`{s}`") not in page]
     assert missing == []
+
+
+def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_period() -> None:
+    rows = ["T,u", "20,0", "21,1", "22,1"]
+    assert read_rows(rows)[1] == ("column 'T' was read as the time in s",)
+    recording, notes = read_rows(rows, sample_time=0.5)
+    assert recording.names == ("T", "u")
+    assert recording.channel("T").times.tolist() == [0.0, 0.5, 1.0]
+    assert notes == ()
+    with pytest.raises(UnreadableFile, match=r"there is no time column; found T, u\."):
+        read_rows(["T [°C],u", *rows[1:]])
+    assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
+    arrays = write_npz(T=20 + TIMES, u=INPUT, Ts=0.5)
+    recording, _ = read_with_notes(arrays)
+    assert recording.names == ("T", "u")
+    assert recording.sampling.period == 0.5
+
+
+def test_a_zone_belongs_to_its_column() -> None:
+    local = [START + timedelta(seconds=k) for k in range(9)]
+    utc = [moment.replace(tzinfo=UTC) for moment in local]
+    for time, logged in ((local, utc), (utc, local)):
+        recording, notes = read_with_notes(write_parquet(time=time, logged=logged, u=[1.0] * 9))
+        assert recording.started_at == time[0]
+        zone = "UTC" if time is utc else "local"
+        assert any(f"column 'time' read as {zone} time stamps" in note for note in notes)
+
+
+@pytest.mark.parametrize("name", ["t [ms]", "time_ms", "t [min]", "elapsed"])
+def test_a_time_span_is_in_seconds_whatever_its_heading_says(name: str) -> None:
+    spans = [timedelta(seconds=k) for k in range(9)]
+    recording, _ = read_with_notes(write_parquet(**{name: spans, "u": [1.0] * 9}))
+    assert recording.channel("u").times.tolist() == list(range(9))
+
+
+LATE = PEEK_ROWS + 50  # a row after those that the layout is guessed from
+
+
+def read_rows(rows: list[str], **reading: object) -> tuple[Recording, tuple[str, ...]]:
+    return read_with_notes("\n".join(rows).encode(), **reading)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|", " "])
+@pytest.mark.parametrize("block", [3, 50_000])
+def test_decimal_commas_may_come_late(
+    separator: str, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_columns, "BLOCK_ROWS", block)
+    rows = ["t;u;y", *(f"{k};0;20" for k in range(LATE)), f"{LATE};1;20,5"]
+    recording, notes = read_rows([row.replace(";", separator) for row in rows])
+    assert recording.channel("y").values[-1] == 20.5
+    assert notes[-1] == "decimal commas were read as decimal points"
+
+
+def test_a_late_decimal_comma_is_a_fault_among_points() -> None:
+    rows = ["t;y", "0;1.5", *(f"{k};20" for k in range(1, LATE)), f"{LATE};20,5"]
+    with pytest.raises(UnreadableFile, match=f"row {LATE + 2}.*other numbers of the file"):
+        read_rows(rows)
+
+
+@pytest.mark.parametrize("gap", [50, LATE])
+@pytest.mark.parametrize("name", ["No", "index", "Nr."])
+def test_an_index_with_a_gap_is_a_signal_with_a_note(name: str, gap: int) -> None:
+    rows = [f"{name},t,u", *(f"{k + (k >= gap)},{k},0" for k in range(LATE + 9))]
+    recording, notes = read_rows(rows)
+    assert recording.names == (name, "u")
+    assert recording.channel(name).values[-1] == LATE + 9
+    assert notes == (f"column {name!r} does not count the rows, so it is a signal",)
+
+
+def test_an_index_that_restarts_with_segments_is_a_signal_with_a_note() -> None:
+    rows = ["index,run,t,u", *(f"{k % 300},{k // 300},{k % 300},0" for k in range(600))]
+    recording, notes = read_rows(rows, segments=["run"])
+    assert recording.names == ("index", "u")
+    assert "column 'index' does not count the rows, so it is a signal" in notes
+
+
+def test_a_long_preamble_is_skipped() -> None:
+    rows = [*(f"meta line {k}" for k in range(LATE)), "t,u", *(f"{k},0" for k in range(50))]
+    recording, notes = read_rows(rows)
+    assert recording.samples == 50
+    assert notes == (f"the header is in row {LATE + 1}; the lines before it were skipped",)
+    sheet = write_sheet([["meta", k] for k in range(LATE)] + [["t", "u"], [0, 1], [1, 2]])
+    assert read_with_notes(sheet)[0].samples == 2

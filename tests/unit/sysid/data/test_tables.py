@@ -1,6 +1,9 @@
 """Arrays and tables of other libraries become channels; what cannot be read is told in a line."""
 
 import math
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, timedelta
 
 import numpy as np
@@ -144,6 +147,7 @@ def test_a_history_may_be_lists() -> None:
         "array of channels",
     ],
 )
+@pytest.mark.filterwarnings("ignore:times were converted from ms")
 def test_a_table_is_a_recording(table: object) -> None:
     recording = Recording(table)
     assert recording.names == ("P1", "P2")
@@ -196,6 +200,49 @@ def test_series_of_dates_keep_their_distance(as_side: str) -> None:
     assert np.array_equal(record.outputs[0].times, TIMES[2:])
     again = Record(record.inputs, record.outputs)
     assert np.array_equal(again.outputs[0].times, TIMES[2:])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda channel: replace(channel, hold="zero"),
+        lambda channel: channel.slice_time(0.0, 1.5),
+        lambda channel: channel.slice_with_history(0.25, 1.5),
+        lambda channel: replace(channel, history=History([-1.0], [0.0])).history_and_samples,
+        lambda channel: pickle.loads(pickle.dumps(channel)),
+        lambda channel: Recording((channel,)).channel(channel.name),
+        lambda channel: Recording((channel,)).replace_holds({channel.name: "zero"}).channels[0],
+    ],
+)
+def test_a_changed_channel_keeps_its_date(change: Callable[[Channel], Channel]) -> None:
+    u = Channel("u", pd.Series(VALUES, index=pd.DatetimeIndex(DATES)))
+    late = u.started_at + timedelta(seconds=1)
+    record = Record(change(u), change(replace(u, name="y", started_at=late)))
+    moved = record.outputs[0].times - record.inputs[0].times
+    assert np.allclose(moved, 1.0, rtol=0, atol=1e-12)
+    assert record.outputs[0].started_at == record.inputs[0].started_at == START
+
+
+def test_files_with_dates_keep_their_distance() -> None:
+    first, second = (
+        Recording({"t": TIMES, name: VALUES}, started_at=START + timedelta(seconds=late))
+        for name, late in (("u", 0), ("y", 2))
+    )
+    record = Record(first.channel("u"), second.channel("y"))
+    assert np.array_equal(record.outputs[0].times, TIMES + 2)
+
+
+def test_a_channel_of_dates_is_not_joined_with_one_of_seconds() -> None:
+    u, y = Channel("u", DATES, VALUES), Channel("y", TIMES, VALUES)
+    with pytest.raises(InvalidRecord, match="'u' has dates, and channel 'y' has seconds"):
+        Record(u, y)
+    assert Record(u, replace(y, started_at=START)).outputs[0].times[0] == 0.0
+    assert Recording((u, y), started_at=START).started_at == START
+
+
+def test_a_recording_counts_from_the_date_that_it_is_given() -> None:
+    recording = Recording((Channel("u", DATES, VALUES),), started_at=START - timedelta(seconds=3))
+    assert np.array_equal(recording.channels[0].times, TIMES + 3)
 
 
 def test_dates_with_and_without_zone_are_not_mixed() -> None:

@@ -1,5 +1,8 @@
 """Simulation for a user: values in, a recording out."""
 
+from dataclasses import replace
+from datetime import datetime
+
 import numpy as np
 import pytest
 
@@ -27,6 +30,35 @@ def test_values_may_lie_outside_the_bounds_and_times_be_irregular() -> None:
     found = simulate(lag_element(), [STEP], values, times=times).channels[0].values
     expected = 9.0 * (1 - np.exp(-np.maximum(times - 1.7, 0.0) / 3.0))
     np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+def test_outputs_are_on_the_clock_of_the_inputs() -> None:
+    began = datetime.fromisoformat("2026-03-14 08:00")
+    values, step = {"c": 2.0, "L": 0.2, "b": 0.3}, replace(STEP, started_at=began)
+    late = np.datetime64(began) + np.timedelta64(500, "ms") * np.arange(5)
+    for times, first in ((None, 0.0), (late + np.timedelta64(1, "s"), 1.0), (late, 0.0)):
+        found = simulate(lag_element(), step, values, times=times)
+        assert found.started_at == began
+        assert found.channels[0].times[0] == first
+
+
+def test_inputs_are_named_as_in_identify() -> None:
+    values = {"c": 2.0, "L": 0.2, "b": 0.3}
+    expected = simulate(lag_element(), STEP, values).channels[0].values
+    table = {"t": TIMES, "heater [%]": STEP.values, "oven": 0 * TIMES}
+    for name in ("heater", "heater [%]"):
+        found = simulate(lag_element(), table, values, channels={"u": name, "y": "none"})
+        np.testing.assert_array_equal(found.channels[0].values, expected)
+    both = table | {"u": -STEP.values}
+    found = simulate(lag_element(), both, values, channels={"u": "heater"})
+    np.testing.assert_array_equal(found.channels[0].values, expected)
+    for channels, told in (
+        ({"u": "heatr"}, "/channels/u: there is no channel 'heatr'; did you mean 'heater'"),
+        ({"v": "heater"}, "/channels/v: the model has no signal 'v'"),
+        ("heater", "/channels: found the text 'heater'; need a mapping"),
+    ):
+        with pytest.raises(InvalidSettings, match=told):
+            simulate(lag_element(), table, values, channels=channels)
 
 
 def test_initial_values_can_be_given() -> None:

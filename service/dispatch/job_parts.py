@@ -1,0 +1,192 @@
+"""What the parcels of one job share in a dispatcher: specifications, records, warm starts."""
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import islice
+from typing import Any, NamedTuple
+
+from service.core.errors import ServiceError
+from service.core.json_pointer import build_run_body
+from service.datasets.recordings import read_records
+from service.datasets.signal_channels import SignalChannels, map_channels
+from service.dispatch.encoding import ResultEncoder
+from service.dispatch.warm_starts import WarmStarts
+from service.jobs.axes import AxisGroup
+from service.jobs.stored_cells import build_stored_cells, read_axis_groups
+from service.jobs.to_core import fit_settings_of, to_algorithm
+from service.models.models import load_stored_model
+from service.queue.run_writes import NewRun
+from service.repositories.datasets import DatasetRepository
+from service.storage.errors import StorageError
+from service.storage.objects import ObjectStore
+from service.storage.retry import retry_transient
+from service.storage.sessions import Database
+from service.storage.tables import Dataset, Job
+from sysid.core.errors import SysidError
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.noise import Noise
+from sysid.models.model import Model
+from workers.errors import RecordsUnavailable
+from workers.protocol import ProblemSpec, Records, RunSpec, WarmStartValues
+
+CACHED_SAMPLES = 1_000_000
+"""Samples that a job caches, 16 bytes each, in addition to the latest records."""
+
+
+class DataKey(NamedTuple):
+    """Datasets, and the channels of the model's signals."""
+
+    datasets: tuple[str, ...]
+    channels: SignalChannels
+
+
+class _SharedParts(NamedTuple):
+    """What is equal in the runs of a sweep that differ only in `_OWN_PATHS`.
+
+    `problem` has no noise. `body` is the body of any of these runs.
+    """
+
+    body: Mapping[str, Any]
+    problem: ProblemSpec
+    algorithm: GeneticAlgorithm
+
+
+_OWN_PATHS = ("/seed", "/noise/seed", "/noise/sigma")
+"""Fields that nearly every run has for itself. All else is built once for many runs."""
+_MAX_SHARED_PARTS = 256
+
+
+class JobParts:
+    """Specifications and records of the runs of a claimed job, in all its parcels.
+
+    Parameters
+    ----------
+    keeps_signals : bool
+        Whether sweeps store fitted signals, unless the job says otherwise.
+    """
+
+    def __init__(
+        self, database: Database, job: Job, store: ObjectStore, *, keeps_signals: bool = False
+    ) -> None:
+        self.job = job
+        self.warm = WarmStarts(database, job)
+        self.encoder = ResultEncoder(
+            "sqlite" if database.is_sqlite else "postgresql",
+            keeps_signals=_choose_keeping(job, default=keeps_signals),
+            reports_estimates=self.warm.may_wait,
+        )
+        self._database, self._store = database, store
+        self._data: dict[str, DataKey] = {}
+        self._cached_records: OrderedDict[str, Records] = OrderedDict()
+        self._groups: list[AxisGroup] | None = None
+        self._shared: OrderedDict[str, _SharedParts] = OrderedDict()
+
+    def build_cells(self, numbers: range) -> list[NewRun]:
+        """Build the rows of runs of the sweep that do not exist yet."""
+        if self._groups is None:
+            self._groups = read_axis_groups(self.job.spec)
+        cells = build_stored_cells(self.job.spec, self._groups, numbers.start)
+        return list(islice(cells, len(numbers)))
+
+    def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
+        """Build the specification of one cell's run, with its warm start.
+
+        Raises
+        ------
+        SysidError, ServiceError, StorageError
+            If its settings are invalid, or its model is missing.
+        """
+        return self._specify_run(cell, self._share_parts(cell), warm)
+
+    def read_reference(self, cell: Mapping[str, Any]) -> str | None:
+        """Return the warm start that a cell names: none, a run, or the previous one."""
+        reference: str | None = self._share_parts(cell).body["warm_start"]
+        return reference
+
+    def _specify_run(
+        self, cell: Mapping[str, Any], shared: _SharedParts, warm: WarmStartValues
+    ) -> RunSpec:
+        body = shared.body
+        sigma = cell.get("/noise/sigma", body["noise"]["sigma"])
+        noise = Noise(float(sigma), int(cell.get("/noise/seed", body["noise"]["seed"])))
+        return RunSpec(
+            shared.problem.replace_noise(noise),
+            shared.algorithm,
+            int(cell.get("/seed", body["seed"])),
+            warm,
+            posterior=body.get("posterior", False),  # older jobs do not have it
+        )
+
+    def _share_parts(self, cell: Mapping[str, Any]) -> _SharedParts:
+        """Return the parts of a cell's run that it shares with others, built at the first one."""
+        key = repr([(path, value) for path, value in cell.items() if path not in _OWN_PATHS])
+        if key not in self._shared:
+            self._shared[key] = self._build_shared_parts(build_run_body(self.job.spec, cell))
+            if len(self._shared) > _MAX_SHARED_PARTS:
+                self._shared.popitem(last=False)
+        return self._shared[key]
+
+    def _build_shared_parts(self, body: Mapping[str, Any]) -> _SharedParts:
+        model = load_stored_model(body["model"])
+        validation = body["validation"] or {}
+        validation_datasets = validation.get("datasets")
+        problem = ProblemSpec(
+            model=dict(model.document),
+            records=self._register_data(body["datasets"], body, model),
+            validation=None
+            if validation_datasets is None
+            else self._register_data(validation_datasets, body, model),
+            validation_fraction=validation.get("fraction"),
+            settings=fit_settings_of(body),
+        )
+        return _SharedParts(body, problem, to_algorithm(body["algorithm"]))
+
+    def load_records(self, key: str) -> Records:
+        """Load the records of that key from the object store, or from the cache.
+
+        Raises
+        ------
+        RecordsUnavailable
+            If a dataset or a channel is missing or invalid.
+        """
+        if key not in self._cached_records:
+            self._cached_records[key] = self._read_records(key)
+            while len(self._cached_records) > 1 and self._count_cached_samples() > CACHED_SAMPLES:
+                self._cached_records.popitem(last=False)
+        self._cached_records.move_to_end(key)
+        return self._cached_records[key]
+
+    def _count_cached_samples(self) -> int:
+        channels = (
+            channel
+            for records in self._cached_records.values()
+            for record in records
+            for channel in (*record.inputs, *record.outputs)
+        )
+        return sum(channel.total_samples for channel in channels)
+
+    def _read_records(self, key: str) -> Records:
+        datasets, channels = self._data[key]
+        try:
+            rows = retry_transient(partial(self._read_datasets, datasets))
+            return read_records(self._store, rows, channels)
+        except (SysidError, ServiceError, StorageError) as error:
+            raise RecordsUnavailable(str(error)) from error
+
+    def _read_datasets(self, datasets: tuple[str, ...]) -> Sequence[Dataset]:
+        with self._database.read_session() as session:
+            return DatasetRepository(session, self.job.project_id).get_all(datasets)
+
+    def _register_data(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:
+        channels = map_channels(model, body["channels"], body["hold"])
+        data = DataKey(tuple(datasets), channels)
+        key = repr(data)
+        self._data[key] = data
+        return key
+
+
+def _choose_keeping(job: Job, *, default: bool) -> bool:
+    """Choose whether signals are stored: as the job says, else those of a single run."""
+    wanted = job.spec.get("keep_signals")  # older jobs do not have it
+    return job.n_runs == 1 or default if wanted is None else bool(wanted)

@@ -1,0 +1,106 @@
+"""A table of pandas and the file of the same table are one recording: the same rules read both."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from service.formats.recordings import read_recording
+from sysid.data.records import Recording
+from sysid.data.table_rules import ReadingNote
+
+TIMES = np.arange(40) / 10.0
+INPUT = np.where(TIMES < 1, 0.0, 1.0)
+OUTPUT = np.round(np.sin(TIMES), 6)
+CLOCK = 1773475200.5
+
+
+def read(source: Callable[[], Recording]) -> tuple[Recording, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        recording = source()
+    notes = [one for one in caught if one.category is ReadingNote]
+    assert {one.filename for one in notes} <= {__file__}  # the place where the user reads
+    return recording, [str(one.message) for one in notes]
+
+
+def assert_same(table: pd.DataFrame) -> Recording:
+    """Read a table and its file; they are the same bit for bit, and so are their notes."""
+    content = table.to_csv(index=False).encode()
+    (file, of_file), (frame, of_frame) = (
+        read(source) for source in (lambda: read_recording(content), lambda: Recording(table))
+    )
+    assert frame.names == file.names
+    assert frame.started_at == file.started_at
+    for channel, other in zip(frame.channels, file.channels, strict=True):
+        assert channel.unit == other.unit
+        assert np.array_equal(channel.times, other.times)
+        assert np.array_equal(channel.values, other.values, equal_nan=True)
+    assert of_frame == of_file
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("time", "scale"),
+    [
+        *((name, 1.0) for name in ("t", "Time (s)", "t/s", "timestamp", "Zeit", "elapsed")),
+        *((name, 1.0) for name in ("t [sec]", "Elapsed Time", "x value", "T")),
+        *((name, 1e3) for name in ("time_ms", "t [ms]", "Time (msec)")),
+        *((name, 1 / 3600) for name in ("t [hours]", "t/h", "time in h")),
+    ],
+)
+def test_the_time_has_the_same_name_and_unit(time: str, scale: float) -> None:
+    table = pd.DataFrame({time: TIMES * scale, "u (V)": INPUT, "y [°C]": OUTPUT})
+    recording = assert_same(table)
+    assert recording.names == ("u", "y")
+    np.testing.assert_allclose(recording.channels[0].times, TIMES, rtol=0, atol=1e-9)
+
+
+def test_a_rising_temperature_is_not_the_time() -> None:
+    table = pd.DataFrame({"T": 20 + TIMES, "time": TIMES, "u": INPUT})
+    assert assert_same(table).names == ("T", "u")
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e6])
+def test_a_clock_since_1970_is_counted_from_its_first_sample(size: float) -> None:
+    times = np.round(CLOCK * size + TIMES * size, 6)
+    recording = assert_same(pd.DataFrame({"t": times, "u": INPUT}))
+    assert recording.started_at is not None
+    assert recording.started_at.timestamp() == CLOCK
+    np.testing.assert_allclose(recording.channels[0].times, TIMES, rtol=0, atol=1e-6)
+
+
+def test_serial_dates_of_a_spreadsheet_are_dates() -> None:
+    recording = assert_same(pd.DataFrame({"t": 46095.25 + TIMES / 86_400, "u": INPUT}))
+    assert str(recording.started_at) == "2026-03-14 06:00:00"
+
+
+def test_an_index_that_counts_rows_is_left_out() -> None:
+    table = pd.DataFrame({"No": np.arange(40), "t": TIMES, "u": INPUT})
+    with pytest.warns(ReadingNote, match="No.* counts rows and was left out"):
+        assert Recording(table).names == ("u",)
+    gap = pd.DataFrame({"No": np.arange(40) * 2, "t": TIMES, "u": INPUT})
+    assert assert_same(gap).names == ("No", "u")
+
+
+def test_dates_are_rounded_once() -> None:
+    dates = pd.date_range("2026-03-14", periods=10, freq="100ms")
+    table = pd.DataFrame({"time": dates, "u": INPUT[:10]})
+    file = read(lambda: read_recording(table.to_csv(index=False).encode()))[0]
+    spans = table[["u"]].set_index(dates - dates[0])
+    for other in (table, table.set_index("time"), spans):
+        assert np.array_equal(Recording(other).channels[0].times, file.channels[0].times)
+    assert file.channels[0].times[3] == 0.3
+
+
+def test_a_channel_is_named_by_its_column_or_without_the_unit() -> None:
+    from sysid.identification.arguments import read_records
+    from sysid.models.catalogue.load import resolve_model
+
+    table = pd.DataFrame({"t": TIMES, "u (V)": INPUT, "y": OUTPUT})
+    model = resolve_model("fopdt")
+    for name in ("u (V)", "u"):
+        (record,) = read_records(model, table, {"u": name, "y": "y"}).records
+        assert record.inputs[0].unit == "V"
