@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import access, datasets, jobs, models, runs, server, sweeps
+from service.cli import access, datasets, health, jobs, models, runs, server, sweeps
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -146,6 +146,7 @@ upkeep.add_group("key", access.key_app)
 upkeep.add_group("project", access.project_app)
 upkeep.add("audit", access.list_audit_log, "lagid audit", "lagid audit --project tubes --json")
 upkeep.add_group("db", server.database_app)
+upkeep.add("health", health.check_health, "lagid health web", "lagid health dispatcher")
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
 
