@@ -10,7 +10,7 @@ TEST_PROCESSES ?= 3
 export MYPY_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/lagid/mypy
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format openapi bench bench-full mutants night real-data clean
+.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format docs openapi bench bench-full mutants night real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -19,6 +19,7 @@ help:
 	@echo "make test        set up, run the whole test suite"
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
 	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
+	@echo "make docs        write the pages that the program makes: docs/settings.md"
 	@echo "make openapi     write docs/openapi.json and the client's types after a change of the interface"
 	@echo "make mutants     the gate's tests against faults made by hand, about an hour"
 	@echo "make night       all long tests with new seeds, mutants, robustness, torture: hours, one table"
@@ -84,6 +85,9 @@ check-laws: $(READY)
 format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(READY)
+	$(BIN)/python -m tests.settings_page
 
 BENCHES := kernels search peers latency silverbox noise_sweep memory mcap
 FULL    := $(BENCHES) robustness efficiency scaling

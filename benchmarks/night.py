@@ -51,6 +51,11 @@ def list_parts(seed: int) -> dict[str, Part]:
     settings = {"LAGID_TEST_PROFILE": "night", "LAGID_NIGHT_SEED": str(seed)}
     return {
         "tests": Part([*pytest], {**settings, "LAGID_REQUIRE_DATA": "1"}),
+        # The contract once more, with PostgreSQL and S3 also where the gate takes the light pair.
+        "server-storage": Part(
+            [*pytest, "tests/contract", "tests/integration/storage"],
+            {**settings, "LAGID_TEST_STORAGE": "server"},
+        ),
         "mutants": Part(["-m", "tests.mutants", "-j", "2", "--json", str(FOLDER / "mutants.json")]),
         "robustness": program("benchmarks.robustness", "--first-seed", str(1000 * seed)),
         "efficiency": program("benchmarks.efficiency"),

@@ -20,6 +20,7 @@ from tests.repository import ROOT
 pytest_plugins = [
     "tests.profiles",
     "tests.database",
+    "tests.stores",
     "tests.cluster",
     "tests.compiling",
     "tests.needs",

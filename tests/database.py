@@ -87,6 +87,14 @@ def _delete_rows(database: Database) -> None:
         connection.exec_driver_sql("; ".join(statements))
 
 
+def migrated_postgres() -> Database:
+    """A PostgreSQL database of its own with the tables of today; it ends with its server."""
+    with empty_postgres(keep=True) as database:
+        upgrade_database(database)
+        url = database.engine.url.render_as_string(hide_password=False)
+    return Database(url, poolclass=NullPool)  # nobody disposes of it, and it leaves nothing open
+
+
 @contextmanager
 def empty_sqlite(folder: Path):
     """A SQLite database without tables."""

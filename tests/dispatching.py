@@ -25,20 +25,32 @@ from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run
 from sysid.data.records import Recording
-from tests.database import migrated_sqlite
+from tests.database import migrated_postgres, migrated_sqlite
 from tests.runs import step_record
+from tests.stores import make_bucket
 from workers.protocol import Executor
 
 LIMIT_SECONDS = 240.0  # beside other work the search alone is compiled for two minutes
 
 
 class Place:
-    """A data folder with its database and store, and one dataset in it."""
+    """A data folder with its database and store, and one dataset in it.
+
+    The store is a folder beside SQLite, and a bucket beside PostgreSQL. So what runs on both
+    databases runs on both stores. With `LAGID_TEST_STORAGE=server` every place has the second pair.
+    """
 
     def __init__(self, folder: Path, database: Database | None = None) -> None:
         self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
         self.settings.prepare_data_folder()
-        self.database = database or migrated_sqlite(folder)
+        if database is None:
+            on_server = os.environ.get("LAGID_TEST_STORAGE") == "server"
+            database = migrated_postgres() if on_server else migrated_sqlite(folder)
+        self.database = database
+        if not database.is_sqlite:
+            url = database.engine.url.render_as_string(hide_password=False)
+            address = {"database_url": url, "store_url": make_bucket()}
+            self.settings = self.settings.model_copy(update=address)
         self.store: ObjectStore = open_store(self.settings.store_location)
         self.dataset = self._dataset()
 

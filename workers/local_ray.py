@@ -8,6 +8,7 @@ import logging
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager
 from pathlib import Path
@@ -26,6 +27,8 @@ from workers.ray_folders import (
 
 _log = logging.getLogger(__name__)
 
+START_SECONDS = 900.0
+"""Time limit for the start of Ray, and then of its workers. A slow machine needs minutes."""
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; Ray's default is 30 % of the memory."""
 INIT_ARGUMENTS = {"log_to_driver": False, "logging_level": logging.ERROR}
@@ -59,6 +62,8 @@ class LocalRay:
         Number of cores; None: all.
     meanwhile : callable, optional
         Called after Ray is imported and before it starts. The start is mostly waiting.
+    start_seconds : float
+        Time limit for the start.
 
     Attributes
     ----------
@@ -74,7 +79,10 @@ class LocalRay:
     """
 
     def __init__(
-        self, cpus: int | None = None, meanwhile: Callable[[], None] | None = None
+        self,
+        cpus: int | None = None,
+        meanwhile: Callable[[], None] | None = None,
+        start_seconds: float = START_SECONDS,
     ) -> None:
         self.folder = make_folder()
         os.environ.update(RAY_ENVIRONMENT)
@@ -87,7 +95,7 @@ class LocalRay:
         if meanwhile is not None:
             meanwhile()
         try:
-            _start_patiently(ray, cpus, self.folder)
+            _start_patiently(ray, cpus, self.folder, start_seconds)
         except INIT_ERRORS as error:
             self.remove_folder()
             raise ClusterUnavailable(explain_failure(None, error)) from error
@@ -123,18 +131,21 @@ def make_folder() -> Path:
     return folder
 
 
-def _start_patiently(ray: Any, cpus: int | None, folder: Path) -> None:
-    """Start Ray; once more after a timeout.
+def _start_patiently(ray: Any, cpus: int | None, folder: Path, seconds: float) -> None:
+    """Start Ray, and again after each timeout, until `seconds` are over.
 
     Ray gives up after 30 s, which may be too short on a busy machine, and has no setting for it.
-    The second time its programs and libraries are in memory.
+    The next time its programs and libraries are in memory.
     """
-    try:
-        _start_ray(ray, cpus, folder)
-    except TimeoutError as error:
-        _log.warning("Ray has not started in time, and is started again: %s", error)
-        kill_processes(find_folder_processes(os.getpid()))
-        _start_ray(ray, cpus, folder)
+    limit = time.monotonic() + seconds
+    while True:
+        try:
+            return _start_ray(ray, cpus, folder)
+        except TimeoutError as error:
+            if time.monotonic() > limit:
+                raise
+            _log.warning("Ray has not started in time, and is started again: %s", error)
+            kill_processes(find_folder_processes(os.getpid()))
 
 
 def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:

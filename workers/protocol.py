@@ -112,7 +112,7 @@ class RunSpec:
             self.problem.cache_key,
             _describe_algorithm(self.algorithm),
             self.seed,
-            [*map(dict, self.warm_starts)],
+            [sorted(values.items()) for values in self.warm_starts],  # JSONB sorts the names too
             self.posterior,
         )
         fingerprint = compute_fingerprint(
@@ -223,10 +223,14 @@ class ItemResult(NamedTuple):
 
 
 class PackResult(NamedTuple):
-    """What a worker returns of a pack: a result for each item, and its complete runs encoded."""
+    """What a worker returns of a pack: a result for each item, and its complete runs encoded.
+
+    `compile_seconds` is the time in which it compiled kernels.
+    """
 
     results: tuple[ItemResult, ...]
     encoded: EncodedRuns | None = None
+    compile_seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

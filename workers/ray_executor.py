@@ -25,6 +25,7 @@ from workers.local_ray import (
     INIT_ERRORS,
     ONE_THREAD_ENVIRONMENT,
     RAY_ENVIRONMENT,
+    START_SECONDS,
     LocalRay,
 )
 from workers.memory_limit import compute_worker_memory, process_pack_within
@@ -34,7 +35,6 @@ from workers.warmup import warm_up_worker
 
 _log = logging.getLogger(__name__)
 
-START_SECONDS = 180.0
 FETCH_SECONDS = 20.0
 SILENCE_SECONDS = 5.0
 """After this time without a finished task, a no-op task tests whether Ray is alive."""
@@ -55,11 +55,13 @@ class ClusterSettings:
 
     For a cluster that is joined, `cpus` is the largest number of cores used. `memory_bytes` is the
     memory limit of a worker for its runs. None: on a local Ray, its share of the machine's memory.
+    `start_seconds` is the time limit for the start of Ray, and then of its first worker.
     """
 
     address: str | None = None
     cpus: int | None = None
     memory_bytes: int | None = None
+    start_seconds: float = START_SECONDS
 
 
 class RayExecutor:
@@ -80,7 +82,7 @@ class RayExecutor:
         os.environ.update(RAY_ENVIRONMENT)
         self._local = None
         if settings.address is None:
-            self._local = local or LocalRay(settings.cpus)
+            self._local = local or LocalRay(settings.cpus, None, settings.start_seconds)
         else:
             check_address(settings.address)
         import ray  # it reads its environment now, unless the local one has imported it
@@ -94,7 +96,7 @@ class RayExecutor:
         self._probe: Any = None
         self._last_answer = self._last_process_check = time.monotonic()
         self._vital_pids = () if settings.address else _find_vital_processes()
-        self._most_slots = settings.cpus
+        self._most_slots, self._start_seconds = settings.cpus, settings.start_seconds
         self._shared_slots: int | None = None
         self.identity = None if settings.address is None else _name_cluster(ray)
         self.n_cores = self._count_cores()
@@ -120,13 +122,13 @@ class RayExecutor:
             warm_up_worker
         )
         tasks = [task.remote() for _ in range(self.slots)]
-        limit = time.monotonic() + START_SECONDS
-        ready, late = self._ray.wait(tasks, timeout=START_SECONDS)
+        limit = time.monotonic() + self._start_seconds
+        ready, late = self._ray.wait(tasks, timeout=self._start_seconds)
         if late and ready:
             left = min(LATE_WORKER_SECONDS, limit - time.monotonic())
             ready, late = self._ray.wait(tasks, num_returns=len(tasks), timeout=max(0.0, left))
         if not ready:
-            raise ClusterUnavailable(f"no worker of Ray came up within {START_SECONDS:.0f} s")
+            raise ClusterUnavailable(f"no worker of Ray came up within {self._start_seconds:.0f} s")
         try:
             fingerprints = self._ray.get(ready, timeout=FETCH_SECONDS)
         except self._ray.exceptions.RayError as error:

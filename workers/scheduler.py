@@ -35,6 +35,7 @@ class Scheduler(Generic[Key]):
     which job is next. A job may come in several parcels: each is added by itself, under a key of
     its own, and they share one account. `project_cores` is the largest number of packs of one
     project in flight.
+    `compile_seconds` is the time in which workers compiled kernels so far.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Scheduler(Generic[Key]):
         grace_seconds: float = GRACE_SECONDS,
         project_cores: int | None = None,
     ) -> None:
+        self.compile_seconds = 0.0
         self._executor = executor
         self._grace, self._project_cores = grace_seconds, project_cores
         self._shares: FairShare[Hashable] = FairShare()
@@ -188,6 +190,7 @@ class Scheduler(Generic[Key]):
             if owner is not None:
                 self._record_lost_task(owner, self._jobs[owner], handle, error)
             return
+        self.compile_seconds += pack.compile_seconds
         if owner is None:  # its job has ended
             _log.warning("a pack of no job came back")
             return

@@ -20,6 +20,7 @@ from sysid.identification.fit_problems import (
 )
 from sysid.identification.run import CALL_SECONDS, advance_island, begin_run, is_finished
 from sysid.identification.run import advance_run as advance_run
+from sysid.kernels.compilation import get_compile_seconds
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.island import Island, get_island_settings, split_population
@@ -57,8 +58,10 @@ def run_pack(
     encoder: Encoder, pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
 ) -> PackResult:
     """Process the pack, and encode its complete runs."""
+    before = get_compile_seconds()
     results = process_pack(pack, keys, *shared)
-    return encode_pack(encoder, pack, results, dict(zip(keys, shared, strict=True)))
+    encoded = encode_pack(encoder, pack, results, dict(zip(keys, shared, strict=True)))
+    return encoded._replace(compile_seconds=get_compile_seconds() - before)
 
 
 def encode_pack(

@@ -30,6 +30,7 @@ from service.api.html import PRIVATE_HEADERS, PROTECTIVE_HEADERS
 from service.api.middleware import BodyLimit, OriginCheck, ResponseHeaders
 from service.api.openapi import DocumentedApp, get_route_name
 from service.api.query_names import check_query_names
+from service.api.request_log import RequestLog
 from service.api.root_path import RootPath
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
@@ -75,7 +76,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         compresslevel=4,
         exclude_content_types=(*DEFAULT_EXCLUDED_CONTENT_TYPES, MCAP_TYPE),
     )
-    app.add_middleware(RootPath, default=chosen.root_path)  # the last one is outermost
+    app.add_middleware(RootPath, default=chosen.root_path)
+    app.add_middleware(RequestLog)  # the last one is outermost
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
         health.router,

@@ -4,15 +4,16 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Literal
 
 from fastapi import APIRouter
-from fastapi.responses import PlainTextResponse
+from fastapi.responses import PlainTextResponse, Response
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.api.dependencies import Parts, PartsDep, ReadSession
+from service.api.dependencies import Parts, PartsDep
+from service.api.queue_metrics import write_metrics
 from service.core.errors import FieldError, Unavailable
 from service.core.wire import Answer
-from service.queue.dispatchers import NO_DISPATCHER, DispatcherRepository
-from service.repositories.jobs import JobRepository
+from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.storage import migrate
 from service.storage.errors import StorageError
 
@@ -82,18 +83,9 @@ def check_ready(parts: PartsDep) -> ReadyOut:
 
 @router.head("/metrics", include_in_schema=False, response_class=PlainTextResponse)
 @router.get("/metrics", response_class=PlainTextResponse)
-def read_metrics(session: ReadSession) -> str:
-    """Read gauges in Prometheus' text format."""
-    alive_now = len(DispatcherRepository(session).list_alive())
-    lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
-    for state, n in JobRepository(session).count_states().items():
-        lines.append(f'lagid_jobs{{state="{state.value}"}} {n}')
-    lines += [
-        "# HELP lagid_dispatchers Dispatchers that are alive.",
-        "# TYPE lagid_dispatchers gauge",
-        f"lagid_dispatchers {alive_now}",
-    ]
-    return "\n".join(lines) + "\n"
+def read_metrics(parts: PartsDep) -> Response:
+    """Read this process's numbers and those of the queue, in Prometheus' text format."""
+    return Response(write_metrics(parts.database), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @router.get("/problems/{kind}", response_class=PlainTextResponse, include_in_schema=False)
@@ -122,5 +114,6 @@ def _check_store(parts: Parts) -> None:
 
 def _check_dispatcher(parts: Parts) -> None:
     with parts.database.read_session() as session:
-        if not DispatcherRepository(session).list_alive():
-            raise Unavailable(NO_DISPATCHER)
+        wait = describe_wait(DispatcherRepository(session).list_alive())
+    if wait is not None:
+        raise Unavailable(wait)

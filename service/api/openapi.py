@@ -59,6 +59,7 @@ class ProblemOut(Answer):
     status: int = Field(description="HTTP status of the answer")
     detail: str = Field(description="what was wrong, what was found, and what would be right")
     instance: str = Field(description="path of the request")
+    request_id: str = Field(description="id of the request, as in `X-Request-ID` and in the log")
     errors: tuple[FaultOut, ...] = Field(default=(), description="every fault of the request")
     dependents: tuple[ItemOut, ...] = Field(
         default=(), description="what was made from an item that was not deleted for it"

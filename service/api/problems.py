@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from service.api.html import PROTECTIVE_HEADERS, error_page, wants_html
+from service.api.request_log import REQUEST_ID_HEADER, get_request_id
 from service.core.errors import (
     Conflict,
     FieldError,
@@ -75,6 +76,7 @@ def problem_response(
         "status": status,
         "detail": _shorten(detail, MAX_TOTAL_CHARACTERS if errors else MAX_DETAIL_CHARACTERS),
         "instance": request.url.path,
+        "request_id": get_request_id(request),
         **(members or {}),
     }
     if errors:
@@ -229,7 +231,7 @@ def _handle_unexpected_error(request: Request, error: Exception) -> Response:
     log.error("%s %s failed: %r", request.method, request.url.path, error)
     detail = "unexpected error; see the server's log"
     # This answer does not pass the middleware.
-    headers = PROTECTIVE_HEADERS
+    headers = {**PROTECTIVE_HEADERS, REQUEST_ID_HEADER: get_request_id(request)}
     return problem_response(request, 500, "internal", "The service failed", detail, headers=headers)
 
 

@@ -10,7 +10,18 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import access, backup, datasets, jobs, models, retention, runs, server, sweeps
+from service.cli import (
+    access,
+    backup,
+    datasets,
+    health,
+    jobs,
+    models,
+    retention,
+    runs,
+    server,
+    sweeps,
+)
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -159,6 +170,7 @@ upkeep.add(
     "lagid restore lagid.zip --force",
 )
 upkeep.add_group("db", retention.app)
+upkeep.add("health", health.check_health, "lagid health web", "lagid health dispatcher")
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 
 

@@ -1,6 +1,7 @@
 """`lagid serve`, `lagid dispatcher`, `lagid db …` and `lagid doctor`."""
 
 import errno
+import logging
 import os
 import signal
 import socket
@@ -21,8 +22,6 @@ from service.core.errors import Misconfigured, Unavailable
 from service.core.extras import check_extra, list_missing
 
 if TYPE_CHECKING:
-    from fastapi import FastAPI
-
     from service.core.folder_lock import FolderLock
     from service.core.settings import Settings
     from service.dispatch.supervisor import Supervisor
@@ -64,8 +63,6 @@ def serve(
             child = supervise_dispatcher(settings)
         with child as supervisor:  # the dispatcher starts while the following runs
             _check_storage(settings)
-            from service.api.app import create_app
-
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
             url = f"http://{settings.host}:{bound}/"
@@ -75,7 +72,7 @@ def serve(
                 f"lagid serves {url} (data in {folder}); Ctrl-C ends it",
                 soft_wrap=True,
             )
-            _run_server(create_app(settings), listener, supervisor)
+            _run_server(settings, listener, supervisor)
 
 
 def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
@@ -157,8 +154,16 @@ def open_listener(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _run_server(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None") -> None:
+def _run_server(
+    settings: "Settings", listener: socket.socket, supervisor: "Supervisor | None"
+) -> None:
     import uvicorn
+
+    from service.api.app import create_app
+    from service.core.logs import configure_logging
+
+    configure_logging(settings.log_format, logging.WARNING, with_access=settings.writes_access_log)
+    app = create_app(settings)
 
     class Server(uvicorn.Server):
         """Server that stops open event streams and the dispatcher as soon as it must end."""
@@ -173,6 +178,7 @@ def _run_server(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor
 
     config = uvicorn.Config(
         app,
+        log_config=None,  # its loggers pass their lines on to ours
         log_level="warning",
         access_log=False,
         proxy_headers=False,  # the application believes them, of the proxies in its settings

@@ -10,9 +10,7 @@ from pydantic import BeforeValidator, Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.core.errors import Misconfigured
-
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-"""Format of the log lines of all processes."""
+from service.core.logs import LogFormat
 
 
 def make_sqlite_url(path: Path) -> str:
@@ -37,98 +35,102 @@ AuthMode = Literal["off", "keys", "proxy"]
 
 
 class Settings(BaseSettings):
-    """Storage, address and limits of the service.
+    """Storage, address, limits and habits of the service.
 
-    Attributes
-    ----------
-    data_dir : Path
-        Folder of everything that the embedded service stores.
-    database_url, store_url : str or None
-        None: SQLite and a folder of objects inside `data_dir`.
-    ray_address : str or None
-        None: a local Ray cluster, started by this process.
-    cpus : int or None
-        Workers of the local Ray; None: all cores.
-    worker_memory_mb : int or None
-        Memory of a worker for its runs, in MiB; None: its share of 80 % of the machine.
-    auth : str or None
-        ``off``: everybody who reaches the service may do everything. ``keys``: each request needs
-        an API key. ``proxy``: a key, or a user whom an authenticating proxy names. None: off on
-        loopback, keys elsewhere.
-    allow_open_host : bool
-        Serve other hosts without API keys.
-    proxy_header : str
-        Header in which an authenticating proxy names the user, for ``auth=proxy``.
-    proxy_addresses : tuple of str
-        Addresses or networks of proxies. Headers of other peers are not believed.
-    proxy_project : str
-        Project of the users whom the proxy names.
-    proxy_admins : tuple of str
-        Users of the proxy with the scope admin.
-    session_hours : float
-        How long a browser stays signed in.
-    allowed_hosts : tuple of str
-        More names by which requests may address the service, such as that of a reverse proxy.
-    root_path : str
-        Path under which a reverse proxy publishes the service, such as ``/lagid``; empty: none.
-    max_upload_bytes, max_body_bytes : int
-        Longest recording, and longest body of any other request. Larger ones are answered by 413.
-    max_uploads : int
-        Uploads that a web process receives and reads at once. A further one waits for 20 s, and is
-        then answered by 503.
-    max_streams : int
-        Event streams of one web process. A further one is answered by 503.
-    max_open_jobs, max_open_runs : int
-        Unfinished jobs and runs of one project. A submission beyond them is answered by 429.
-    project_cores : int or None
-        Cores of each dispatcher that the runs of one project may use; None: all.
-    keep_days : float or None
-        Ended jobs are deleted after this number of days, unless their project says otherwise. None:
-        they are kept.
-    keep_signals : bool
-        Whether sweeps store the fitted signals of their runs, unless a job says otherwise. Else
-        they are computed again when they are asked for.
-    lease_seconds : float
-        How long a job stays with a dispatcher that sends no heartbeat.
-    data : Path or None
-        Folder of measured records, for tests and benchmarks.
+    The texts below the fields are the page ``docs/settings.md`` (``make docs``).
     """
 
-    model_config = SettingsConfigDict(env_prefix="LAGID_", env_file="lagid.env", extra="ignore")
+    model_config = SettingsConfigDict(
+        env_prefix="LAGID_", env_file="lagid.env", extra="ignore", use_attribute_docstrings=True
+    )
 
     data_dir: Path = Path("lagid-data")
+    """Folder of database, objects and logs. May be relative."""
     database_url: str | None = None
+    """SQLAlchemy address of the database, such as `postgresql+psycopg://…`. Without it: SQLite in
+    the data folder."""
     store_url: str | None = None
-    ray_address: str | None = None
-    cpus: int | None = Field(default=None, ge=1)
-    worker_memory_mb: int | None = Field(default=None, ge=256)
+    """Where objects are: `s3://bucket/prefix` or `file:///folder`. Without it: `objects` in the
+    data folder."""
     host: str = "127.0.0.1"
+    """Address where the web process listens."""
     port: int = Field(default=8000, ge=0, le=65535)
+    """Port of the web process. 0 chooses a free one."""
     auth: AuthMode | None = None
+    """Who may use the service. `off`: everybody who reaches it. `keys`: whoever sends an API key.
+    `proxy`: a key, or a user whom an authenticating proxy names. Without it: `off` on loopback,
+    else `keys`."""
     allow_open_host: bool = False
+    """Serve other hosts without API keys. Only where nobody else reaches the port."""
     proxy_header: str = Field(default="X-Forwarded-User", pattern=r"^[A-Za-z0-9-]+$")
+    """Header in which an authenticating proxy names the user."""
     proxy_addresses: Names = ("127.0.0.1", "::1")
+    """Addresses or networks of proxies, separated by commas. Headers of others are not believed."""
     proxy_project: str = "proj_default"
+    """Project of the users whom the proxy names."""
     proxy_admins: Names = ()
+    """Users of the proxy with the scope admin, separated by commas."""
     session_hours: float = Field(default=12.0, gt=0, le=8760)
+    """How long a browser stays signed in."""
     allowed_hosts: Names = ()
+    """More host names that are answered, separated by commas, such as that of a reverse proxy."""
     root_path: Annotated[
         str, BeforeValidator(_strip_slash), Field(pattern=r"^(/[A-Za-z0-9._~-]+)*$")
     ] = ""
+    """Path below which a reverse proxy publishes the service, such as `/lagid`."""
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
+    """Largest recording. A larger one is answered by 413."""
     max_body_bytes: int = Field(default=4 * 1024**2, ge=1)
+    """Largest body of any other request; 413 beyond. About 40,000 labelled values of a sweep have
+    room. In any case 100,000 lists and objects with 200,000 fields are the most."""
     max_uploads: int = Field(default=4, ge=1)
+    """Uploads that one web process receives and reads at once, each with up to 4 GiB of memory for
+    120 s. Others wait, and are answered by 503 after 20 s. A sender that stops for 60 s is answered
+    by 408."""
     max_streams: int = Field(default=500, ge=1)
+    """Event streams of one web process; 503 beyond."""
     max_runs_per_job: int = Field(default=100_000, ge=1)
+    """Runs of one job."""
     max_open_jobs: int = Field(default=1000, ge=1)
+    """Unfinished jobs of a project; 429 beyond."""
     max_open_runs: int = Field(default=1_000_000, ge=1)
-    project_cores: int | None = Field(default=None, ge=1)
-    keep_days: float | None = Field(default=None, gt=0, le=36_500)
-    keep_signals: bool = False
-    lease_seconds: float = Field(default=10.0, gt=0)
-    max_attempts: int = Field(default=3, ge=1)
+    """Unfinished runs of a project; 429 beyond."""
     poll_seconds: float = Field(default=0.3, gt=0)
+    """How often the web process looks for news, once for all event streams."""
+    ray_address: str | None = None
+    """Head of the Ray cluster that the dispatcher joins, `host:port` or `auto`. Without it: a local
+    Ray."""
+    cpus: int | None = Field(default=None, ge=1)
+    """Workers of the local Ray, or cores that are used of a joined one at most. Without it: all
+    cores."""
+    worker_memory_mb: int | None = Field(default=None, ge=256)
+    """Memory that a worker may use for its runs, in MiB. Without it: its share of 80 % of the
+    machine."""
+    project_cores: int | None = Field(default=None, ge=1)
+    """Cores that one project may use of a dispatcher. Without it: all."""
+    keep_days: float | None = Field(default=None, gt=0, le=36_500)
+    """Ended jobs are deleted after this number of days, unless their project says otherwise
+    (`lagid db keep`). Without it: they are kept."""
+    keep_signals: bool = False
+    """Whether sweeps store fitted signals, unless a job says otherwise (`keep_signals`). Else they
+    are computed again when they are asked for."""
+    lease_seconds: float = Field(default=10.0, gt=0)
+    """After this time a silent dispatcher loses its jobs."""
+    max_attempts: int = Field(default=3, ge=1)
+    """Losses of the dispatcher without progress, after which a job fails."""
+    start_seconds: float = Field(default=900.0, ge=30)
+    """How long a dispatcher waits for Ray, and then for its workers, before it starts anew."""
+    log_format: LogFormat = "text"
+    """Form of the log lines: `text` for people, `json` for machines."""
+    access_log: bool | None = None
+    """Whether each request has a log line. Without it: with `json` only."""
+    metrics_host: str = "127.0.0.1"
+    """Address where a dispatcher answers Prometheus."""
+    metrics_port: int | None = Field(default=None, ge=1, le=65535)
+    """Port where a dispatcher answers Prometheus. Without it: nowhere. The web process has
+    `/metrics` in any case."""
     data: Path | None = None
+    """Folder of measured records, for tests and benchmarks."""
 
     @field_validator("database_url")
     @classmethod
@@ -162,6 +164,11 @@ class Settings(BaseSettings):
     def database_location(self) -> str:
         """SQLAlchemy address of the database."""
         return self.database_url or make_sqlite_url(self.data_dir / "lagid.db")
+
+    @property
+    def writes_access_log(self) -> bool:
+        """Whether each request has a log line."""
+        return self.log_format == "json" if self.access_log is None else self.access_log
 
     @property
     def worker_memory_bytes(self) -> int | None:

@@ -9,13 +9,17 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core import metrics
 from service.core.errors import Misconfigured
-from service.core.settings import LOG_FORMAT, Settings
+from service.core.logs import bind_ids
+from service.core.settings import Settings
 from service.dispatch.background import BackgroundJobs
 from service.dispatch.held_jobs import HeldJob, choose_first_size
 from service.dispatch.job_end import build_end_maker
@@ -24,23 +28,23 @@ from service.dispatch.job_runs import JobRuns
 from service.dispatch.leases import HeldLeases
 from service.dispatch.overlap import Overlap
 from service.dispatch.recorder import JobSpeed, RunRecorder
+from service.dispatch.start import DispatcherStart
 from service.dispatch.supervisor import RESTART_EXIT_CODE, SUPERVISED_VARIABLE
 from service.queue.admission import Admission
 from service.queue.dispatchers import CLUSTER_KEY
 from service.queue.leases import Claim, Lease
 from service.queue.notifications import open_notifier
-from service.storage import migrate
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.retry import retry_transient
 from service.storage.sessions import Database
+from sysid.kernels.compilation import get_compile_seconds
 from workers.core_sharing import SharedCluster, divide_cores
 from workers.errors import ClusterLost, WorkersError
 from workers.local_ray import LocalRay
 from workers.protocol import Executor
 from workers.ray_executor import ClusterSettings, RayExecutor
 from workers.scheduler import Scheduler
-from workers.warmup import warm_up_worker
 
 _log = logging.getLogger("lagid.dispatcher")
 
@@ -103,6 +107,7 @@ class Dispatcher:
         if self._cluster is not None:
             details[CLUSTER_KEY] = self._cluster.identity
         self._leases.start_heartbeat(details)
+        metrics.cores.set_function(lambda: self._executor.slots)
         _log.info("ready: %s with %d cores", self._leases.owner, self._executor.slots)
         self._listener.start()
         try:
@@ -129,11 +134,14 @@ class Dispatcher:
             self._end_runs(lease)
         for lease in self._list_ready_to_conclude():
             self._conclude_job(lease)
+        metrics.record_kernel_seconds("process", get_compile_seconds())
+        metrics.record_kernel_seconds("workers", self._scheduler.compile_seconds)
         for recorder in self._list_held_recorders():
             if not self._leases.is_held(recorder.lease):
                 continue  # the pending heartbeat, or the next one, decides
             try:
-                recorder.write_due()
+                with bind_lease(recorder.lease):
+                    recorder.write_due()
             except LeaseLost as error:
                 self._drop_lost_parcel(recorder, error)
 
@@ -239,11 +247,15 @@ class Dispatcher:
             project=job.project_id,
             account=job.id,
         )
+        metrics.held_jobs.set(len(self._jobs))
         runs = f"runs {claim.runs.start} to {claim.runs.stop - 1} of {job.n_runs}"
-        _log.info("%s: %s, attempt %d", job.id, runs, claim.lease.attempt)
+        with bind_lease(claim.lease):
+            _log.info("%s: %s, attempt %d", job.id, runs, claim.lease.attempt)
 
     def _drop_lost_parcel(self, recorder: RunRecorder, error: LeaseLost) -> None:
-        _log.warning("the parcel is dropped: %s", error)
+        metrics.lease_losses.labels("owner").inc()
+        with bind_lease(recorder.lease):
+            _log.warning("the parcel is dropped: %s", error)
         self._lost.add(recorder.lease)
         self._leases.forget_lease(recorder.lease)
         recorder.is_stopped = True
@@ -292,13 +304,16 @@ class Dispatcher:
             self._lost.discard(lease)
             return
         try:
-            retry_transient(
-                recorder.cancel_parcel
-                if recorder.is_stopped
-                else partial(recorder.finish_job, floors)
-            )
+            with bind_lease(lease):
+                retry_transient(
+                    recorder.cancel_parcel
+                    if recorder.is_stopped
+                    else partial(recorder.finish_job, floors)
+                )
+                _log.info("%s has ended", lease.job_id)
         except LeaseLost as error:
-            _log.warning("the end of the job was not written: %s", error)
+            with bind_lease(lease):
+                _log.warning("the end of the job was not written: %s", error)
 
     def _forget_parcel(self, lease: Lease) -> None:
         del self._recorders[lease]
@@ -306,6 +321,7 @@ class Dispatcher:
         del held.parcels[lease]
         if not held.parcels:
             del self._jobs[lease.job_id]
+        metrics.held_jobs.set(len(self._jobs))
         if lease not in self._lost:
             self._leases.forget_lease(lease)
 
@@ -322,16 +338,23 @@ class Dispatcher:
         _log.info("stopped")
 
 
-def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
+def run_dispatcher(
+    settings: Settings,
+    local: LocalRay | None = None,
+    prepare: Callable[[], DispatcherStart] | None = None,
+) -> int:
     """Run a dispatcher and return the exit code. Expected errors are logged in one line.
 
     Parameters
     ----------
     local : LocalRay, optional
         A Ray that is already running; it is closed here.
+    prepare : callable, optional
+        Returns a start that was made while Ray started, or raises its error.
     """
     try:
-        return serve_jobs(settings, local)
+        start = DispatcherStart(settings) if prepare is None else prepare()
+        return serve_jobs(settings, local, start)
     except (Misconfigured, StorageError, WorkersError) as error:
         _log.error("%s", error)
     except SQLAlchemyError as error:
@@ -342,7 +365,7 @@ def run_dispatcher(settings: Settings, local: LocalRay | None = None) -> int:
     return 1
 
 
-def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
+def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStart) -> int:
     """Run a dispatcher until it is stopped.
 
     Raises
@@ -350,24 +373,25 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
     Misconfigured, StorageError, WorkersError
         If the data folder, the database, the object store or Ray cannot be used.
     """
-    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT)
-    settings.prepare_data_folder()
-    database = Database(settings.database_location)
-    retry_transient(partial(migrate.upgrade_database, database))  # the database may be starting too
-    store = open_store(settings.store_location)
-    compiling = threading.Thread(target=warm_up_worker, name="warm", daemon=True)
-    compiling.start()  # in parallel with the start of Ray
-    where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory_bytes)
-    executor = RayExecutor(where, local)
+    start.announce()
+    # In parallel with joining Ray; an error is met again below.
+    threading.Thread(target=start.compile_search, name="compile", daemon=True).start()
+    where = ClusterSettings(
+        settings.ray_address, settings.cpus, settings.worker_memory_bytes, settings.start_seconds
+    )
+    executor = None
     try:
-        compiling.join()
+        store = open_store(settings.store_location)
+        executor = RayExecutor(where, local)
+        start.finish("ray")
+        start.compile_search()
         executor.warm_up_workers()
-        leases = HeldLeases(database, settings.lease_seconds)
+        start.finish("workers")
         dispatcher = Dispatcher(
-            database,
+            start.database,
             store,
             executor,
-            leases,
+            start.leases,
             project_cores=settings.project_cores,
             keeps_signals=settings.keep_signals,
             cluster=None if executor.identity is None else executor,
@@ -376,11 +400,18 @@ def serve_jobs(settings: Settings, local: LocalRay | None = None) -> int:
         dispatcher.run_until_stopped()
     except ClusterLost as error:
         _log.error("%s", error)
+        assert executor is not None
         _exit_now(executor)
     finally:
-        executor.close()
-        database.dispose()
+        if executor is not None:
+            executor.close()
+        start.close()
     return 0
+
+
+def bind_lease(lease: Lease) -> AbstractContextManager[None]:
+    """Let log lines name the job and the attempt."""
+    return bind_ids(job_id=lease.job_id, attempt=lease.attempt)
 
 
 def _stop_on_signals(stopping: threading.Event, executor: RayExecutor) -> None:

@@ -80,7 +80,7 @@ class HeldLeases:
         self._thread = threading.Thread(target=self._run_heartbeat, name="heartbeat", daemon=True)
 
     def start_heartbeat(self, details: dict[str, object]) -> None:
-        """Register the dispatcher and start the heartbeat."""
+        """Register the dispatcher and start the heartbeat; later calls change what it tells."""
         description: Document = {
             LEASE_SECONDS_KEY: self._length.total_seconds(),
             **describe_process(),
@@ -88,7 +88,8 @@ class HeldLeases:
         }
         self._cluster = description.get(CLUSTER_KEY)
         retry_transient(partial(self._announce_dispatcher, description))
-        self._thread.start()
+        if not self._thread.is_alive():
+            self._thread.start()
 
     def _announce_dispatcher(self, details: Document) -> None:
         with self._database.write_session() as session:
@@ -192,7 +193,8 @@ class HeldLeases:
     def stop_heartbeat(self) -> None:
         """Stop the heartbeat and unregister the dispatcher."""
         self._ending.set()
-        self._thread.join(5.0)
+        if self._thread.is_alive():
+            self._thread.join(5.0)
         with self._database.write_session() as session:
             DispatcherRepository(session).remove_dispatcher(self.owner)
 

@@ -11,6 +11,7 @@ from itertools import accumulate
 
 from sqlalchemy.orm import Session
 
+from service.core import metrics
 from service.core.states import JobState
 from service.dispatch.checkpoints import pack_state
 from service.dispatch.fitted_signals import store_signals
@@ -217,6 +218,7 @@ class RunRecorder:
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
         live = self._live.get(run)
+        metrics.evaluations.inc(max(0, state.evaluations - self._count_evaluations(run)))
         if live is None:
             begun_at = state.generation if run in self._checkpoint_evaluations else 0
             live = self._live[run] = _LiveRun(state, seconds, begun_at)
@@ -227,6 +229,9 @@ class RunRecorder:
     def record_results(self, packed: PackedResults) -> None:
         """Record the complete runs of a pack."""
         self._pending.packs.append(packed)
+        counted = sum(map(self._count_evaluations, packed.runs))
+        metrics.evaluations.inc(max(0, packed.evaluations - counted))
+        metrics.runs.labels("succeeded").inc(len(packed.runs))
         if self._live or self._checkpoint_evaluations:
             for run in packed.runs:
                 self._checkpoint_evaluations.pop(run, None)
@@ -242,11 +247,14 @@ class RunRecorder:
     def record_failure(self, run: str, failure: RunFailure) -> None:
         """Record that the run failed."""
         self._report_end(run, None)
+        metrics.runs.labels("failed").inc()
+        counted = self._count_evaluations(run)
         evaluations = self._checkpoint_evaluations.pop(run, 0)
         live = self._end_live_run(run)
         if live is not None:
             evaluations = live.state.evaluations
         evaluations = failure.evaluations or evaluations
+        metrics.evaluations.inc(max(0, evaluations - counted))
         self._evaluations += evaluations
         self._pending.outcomes.append(
             RunOutcome(
@@ -256,14 +264,21 @@ class RunRecorder:
         if failure.reason not in self._reasons and len(self._reasons) < MAX_REASONS:
             self._reasons.append(failure.reason)
             self._pending.messages.append(f"{run} failed: {failure.reason}")
+            _log.warning("%s failed: %s", run, failure.reason, extra={"run_id": run})
         self._has_new_progress = True
 
     def record_reuse(self, run: str, source: str) -> None:
         """Record that the run takes over the result of `source`."""
         self._pending.reused[run] = source
+        metrics.runs.labels("reused").inc()
         self._checkpoint_evaluations.pop(run, None)
         self._speed.n_begun += 1  # reused runs do not count for the speed
         self._has_new_progress = True
+
+    def _count_evaluations(self, run: str) -> int:
+        """Count the evaluations of an open run that its progress has told already."""
+        live = self._live.get(run)
+        return self._checkpoint_evaluations.get(run, 0) if live is None else live.state.evaluations
 
     def should_stop(self) -> bool:
         """Test whether the job was cancelled or its lease lost."""
@@ -503,7 +518,7 @@ class RunRecorder:
         if runs:
             others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
             text = f"the signals of {runs[0]}{others} are not stored: {reason}"
-            _log.error(text)
+            _log.error(text, extra={"run_id": runs[0]})
             pending.messages.append(text)
 
     def _write_pending(self, session: Session, pending: _PendingWrites) -> list[RunOutcome]:

@@ -34,7 +34,7 @@ from service.pages.views import (
     to_job_view,
     to_run_view,
 )
-from service.queue.dispatchers import NO_DISPATCHER, DispatcherRepository
+from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
@@ -173,9 +173,10 @@ def job_page(
 
 def _describe_obstacle(session: Session, job: Job) -> str:
     """Describe why a job cannot begin; empty if nothing is in its way but other jobs."""
-    if job.state is not JobState.QUEUED or DispatcherRepository(session).list_alive():
+    if job.state is not JobState.QUEUED:
         return ""
-    return f"This job waits: {NO_DISPATCHER}."
+    wait = describe_wait(DispatcherRepository(session).list_alive())
+    return "" if wait is None else f"This job waits: {wait}."
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:

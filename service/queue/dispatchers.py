@@ -1,7 +1,8 @@
 """Heartbeats of the dispatchers."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
+from typing import Literal
 
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
@@ -13,12 +14,14 @@ from service.storage.statements import upsert
 from service.storage.tables import DispatcherHeartbeat
 
 _FORGET_AFTER = timedelta(days=1)
-NO_DISPATCHER = (
+_NO_DISPATCHER = (
     "no dispatcher is alive; jobs are accepted, but wait until one starts. A first start compiles "
     "the search, which takes about a minute"
 )
 LEASE_SECONDS_KEY = "lease_seconds"
 """Key of the lease length in the details of a dispatcher."""
+STARTING_KEY = "starting"
+"""Key of what a dispatcher waits for before its first job; absent once it is ready."""
 
 
 CLUSTER_KEY = "cluster"
@@ -32,12 +35,12 @@ class DispatcherRepository:
         self._session, self._clock = session, clock or choose_database_clock(session)
 
     def add_dispatcher(self, owner: str, details: Document) -> None:
-        """Record that a dispatcher has started, and delete those without a heartbeat for a day."""
-        now = self._clock()
+        """Record what a dispatcher tells, and delete those without a heartbeat for a day."""
+        now, before = self._clock(), self._session.get(DispatcherHeartbeat, owner)
         row = {
             "owner": owner,
             "details": details,
-            "started_at": now,
+            "started_at": now if before is None else before.started_at,
             "seen_at": now,
             "wanted_cores": 0,
         }
@@ -86,3 +89,29 @@ def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta | None:
     """Return the length of the leases of a dispatcher; None if one of another version gave none."""
     seconds = dispatcher.details.get(LEASE_SECONDS_KEY)
     return None if seconds is None else timedelta(seconds=seconds)
+
+
+StartStep = Literal["ray", "search", "workers"]
+_STEPS: Mapping[str, str] = {
+    "ray": "Ray is starting",
+    "search": "the search is compiling",
+    "workers": "Ray's workers are starting",
+}
+
+
+def describe_start(dispatcher: DispatcherHeartbeat) -> str | None:
+    """Describe what a dispatcher waits for before its first job; None once it is ready."""
+    steps = dispatcher.details.get(STARTING_KEY)
+    if not steps:
+        return None
+    seconds = (dispatcher.seen_at - dispatcher.started_at).total_seconds()
+    waits = " and ".join(_STEPS.get(step, step) for step in steps)
+    return f"a dispatcher is starting ({seconds:.0f} s): {waits}"
+
+
+def describe_wait(alive: Sequence[DispatcherHeartbeat]) -> str | None:
+    """Describe why jobs wait for a dispatcher; None if one of these is ready."""
+    starts = [describe_start(one) for one in alive]
+    if None in starts:
+        return None
+    return f"{starts[0]}; jobs are accepted, but wait for it" if starts else _NO_DISPATCHER

@@ -10,6 +10,7 @@ import threading
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core import metrics
 from service.core.processes import is_awake, is_gone
 from service.queue.clocks import Clock
 from service.queue.dispatchers import DispatcherRepository, find_lease_length
@@ -53,13 +54,16 @@ def reap_jobs(
         dispatchers = DispatcherRepository(session, clock)
         for owner in owners.ended:
             dispatchers.remove_dispatcher(owner)
-    _log_reaped(reaped, owners)
+    _report_reaped(reaped, owners)
     return reaped
 
 
-def _log_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
+def _report_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
     if not reaped.owners:
         return
+    metrics.lease_losses.labels("reaper").inc(
+        len(reaped.requeued) + len(reaped.failed) + len(reaped.cancelled)
+    )
     reasons = ", ".join(
         f"{owner} {_explain_reaping(owner, owners)}" for owner in sorted(reaped.owners)
     )

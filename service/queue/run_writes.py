@@ -456,13 +456,20 @@ def _insert_in_postgres(
     """Insert by one statement, which takes each column as an array."""
     session.flush()
     driver: Any = session.connection().connection.driver_connection
-    columns = [
-        [getattr(cell, name) for cell in cells] if kind != "jsonb" else _list_json(cells, name)
-        for name, kind in _CELL_COLUMNS.items()
-    ]
+    columns = [_list_values(cells, name, kind) for name, kind in _CELL_COLUMNS.items()]
     constants = [job.project_id, job.id, utc_now(), *_RUN_DEFAULTS.values()]
     with driver.cursor() as cursor:
         cursor.execute(_INSERT_IN_POSTGRES, [*constants, list(ids), *columns])
+
+
+def _list_values(cells: Sequence[NewRun], name: str, kind: str) -> list[Any]:
+    """List a column as PostgreSQL takes it: an array has values of one type."""
+    if kind == "jsonb":
+        return _list_json(cells, name)
+    values = [getattr(cell, name) for cell in cells]
+    if kind != "double precision":
+        return values
+    return [None if value is None else float(value) for value in values]
 
 
 def _list_json(cells: Sequence[NewRun], name: str) -> list[str]:

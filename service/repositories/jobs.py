@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import delete, func, select, text, update
+from sqlalchemy import delete, select, text, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -150,12 +150,6 @@ class JobRepository:
         query = select(Job).where(Job.id.in_(list(self._session.scalars(ids))))
         rows = sorted(self._session.scalars(query), key=lambda job: job.id, reverse=True)
         return make_page(rows, limit, (job.id for job in rows))
-
-    def count_states(self) -> dict[JobState, int]:
-        """Count the jobs in each state."""
-        query = select(Job.state, func.count()).where(*self._filter_project()).group_by(Job.state)
-        counts = dict(self._session.execute(query).all())
-        return {state: counts.get(state, 0) for state in JobState}
 
     def cancel(self, job_id: str) -> Job:
         """Cancel a queued job at once, or ask the dispatcher of a running one to stop.

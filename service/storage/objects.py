@@ -23,7 +23,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
-from service.core import temporary_files
+from service.core import metrics, temporary_files
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 
 if TYPE_CHECKING:
@@ -277,14 +277,15 @@ def _translate_errors(action: str, sha256: str = "") -> Iterator[None]:
         yield
     except (NotFoundError, FileNotFoundError) as error:
         if not sha256:
-            raise ObjectStoreFailed(_describe_failure(action, error)) from error
+            raise _report_failure(action, error) from error
         raise ObjectMissing(sha256) from error
     except (BaseError, OSError) as error:
-        raise ObjectStoreFailed(_describe_failure(action, error)) from error
+        raise _report_failure(action, error) from error
 
 
-def _describe_failure(action: str, error: Exception) -> str:
-    return f"the object store cannot {action}: {_take_first_line(error)}"
+def _report_failure(action: str, error: Exception) -> ObjectStoreFailed:
+    metrics.store_errors.labels("objects").inc()
+    return ObjectStoreFailed(f"the object store cannot {action}: {_take_first_line(error)}")
 
 
 def _take_first_line(error: Exception) -> str:

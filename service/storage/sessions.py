@@ -11,13 +11,15 @@ from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.engine.interfaces import DBAPIConnection
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.engine.interfaces import DBAPIConnection, ExceptionContext
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from service.core import metrics
 from service.core.extras import check_extra
 from service.storage.columns import to_json
+from service.storage.retry import is_transient
 from service.storage.tables import DEFAULT_PROJECT
 
 BUSY_SECONDS = 30.0
@@ -71,6 +73,7 @@ class Database:
 
     def __init__(self, url: str, *, is_durable: bool = False, **options: Any) -> None:
         self.engine = _create_engine(url, is_durable=is_durable, **options)
+        event.listen(self.engine, "handle_error", _count_error)
         self._info: dict[str, Any] = {_DATABASE_KEY: self}
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
@@ -189,6 +192,13 @@ def _create_engine(url: str, *, is_durable: bool, **options: Any) -> Engine:
     )
     event.listen(engine, "begin", _begin_postgresql)
     return engine
+
+
+def _count_error(context: ExceptionContext) -> None:
+    """Count an error that is the database's own, not one of a statement."""
+    error = context.sqlalchemy_exception
+    if isinstance(error, DBAPIError) and is_transient(error):
+        metrics.store_errors.labels("database").inc()
 
 
 def _create_private_file(

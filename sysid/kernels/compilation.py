@@ -5,6 +5,8 @@ about 0.3 MB of each module in memory until its process ends, and services live 
 """
 
 import subprocess
+from threading import Lock
+from time import perf_counter
 
 from sysid.core.child_processes import OUT_OF_PROCESSOR_TIME, run_child
 from sysid.core.errors import Fault, InvalidModel
@@ -16,6 +18,8 @@ PROCESSOR_SECONDS = 60.0
 """A model of `sysid.models.equations.MAX_NODES` with few delays takes 40 s on a slow machine."""
 MEMORY_BYTES = 2 * 1024**3
 _WALL_SECONDS = 4 * PROCESSOR_SECONDS  # on a busy machine
+_spent = {"seconds": 0.0}  # by all threads
+_spent_lock = Lock()
 
 
 def compile_kernel(model: Model, variant: KernelVariant) -> bytes:
@@ -28,11 +32,15 @@ def compile_kernel(model: Model, variant: KernelVariant) -> bytes:
     OSError
         If no process can be started.
     """
+    begun = perf_counter()
     try:
         task = encode_task(CompileTask(model, variant, PROCESSOR_SECONDS, MEMORY_BYTES))
         child = run_child("sysid.kernels.compiler_child", task, seconds=_WALL_SECONDS)
     except subprocess.TimeoutExpired:
         raise _build_error(f"{_WALL_SECONDS:g} s") from None
+    finally:
+        with _spent_lock:
+            _spent["seconds"] += perf_counter() - begun
     if child.returncode == 0 and child.stdout:
         return child.stdout
     if child.returncode == OUT_OF_PROCESSOR_TIME:
@@ -43,6 +51,11 @@ def compile_kernel(model: Model, variant: KernelVariant) -> bytes:
     if is_ended_by_signal or "MemoryError" in errors or "\nSystemError" in errors:
         raise _build_error(f"{MEMORY_BYTES // 1024**2} MiB of memory")
     raise RuntimeError(f"the compiler ended with code {child.returncode}: {errors[-500:]}")
+
+
+def get_compile_seconds() -> float:
+    """Return the time in s that this process has waited for its compilers, for its operator."""
+    return _spent["seconds"]
 
 
 def _build_error(limit: str) -> InvalidModel:

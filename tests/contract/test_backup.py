@@ -151,9 +151,9 @@ def test_keys_and_the_audit_log_are_restored_and_sessions_of_browsers_are_not(
 
 
 def test_a_backup_goes_from_a_folder_into_a_bucket_and_back(
-    sqlite_database: Database, tmp_path: Path, bucket: tuple[str, dict[str, Any]]
+    sqlite_database: Database, tmp_path: Path, bucket: str
 ) -> None:
-    folder, remote = open_store(f"file://{tmp_path}/objects"), open_store(bucket[0], **bucket[1])
+    folder, remote = open_store(f"file://{tmp_path}/objects"), open_store(bucket)
     sha256 = folder.put_stream([b"x" * 100_000]).sha256
     add_dataset(sqlite_database, sha256=sha256)
     for number, (source, sink) in enumerate(

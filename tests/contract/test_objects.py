@@ -7,25 +7,16 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
-import boto3
 import obstore
 import pytest
 
 from service.storage import objects
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 from service.storage.objects import open_store
-from tests.contract.conftest import CREDENTIALS
+from tests.stores import open_s3_client
 
 FUTURE = datetime.now(UTC) + timedelta(days=1)
 ABSENT = "0" * 64
-
-
-@pytest.fixture(params=["folder", "bucket"])
-def store(request, tmp_path):
-    if request.param == "folder":
-        return open_store(f"file://{tmp_path}/objects")
-    url, options = request.getfixturevalue("bucket")
-    return open_store(url, **options)
 
 
 def sha256(data):
@@ -66,8 +57,7 @@ def test_storing_again_makes_an_old_object_young_and_changes_nothing_else(store,
 
 
 def test_a_young_object_of_a_bucket_is_not_sent_again(bucket, monkeypatch):
-    url, options = bucket
-    store = open_store(url, **options)
+    store = open_store(bucket)
     monkeypatch.setattr(objects, "_SINGLE_PUT", 1)
     store.put_stream([b"large"])
     monkeypatch.setattr(obstore, "put", None)
@@ -145,20 +135,18 @@ def test_a_writer_that_fails_half_way_leaves_nothing(store):
 
 def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):
     monkeypatch.setattr(objects, "_SINGLE_PUT", 1000)
-    url, options = bucket
-    store = open_store(url, **options)
+    store = open_store(bucket)
     data = os.urandom(6 << 20)
     for _ in range(2):
         assert store.get_bytes(store.put_stream([data]).sha256) == data
 
 
-def test_a_bucket_never_replaces_an_object(bucket, s3_endpoint):
-    url, options = bucket
-    store = open_store(url, **options)
+def test_a_bucket_never_replaces_an_object(bucket):
+    store = open_store(bucket)
     name = store.put_stream([b"first"]).sha256
-    client = boto3.client("s3", endpoint_url=s3_endpoint, region_name="us-east-1", **CREDENTIALS)
+    client = open_s3_client()
     key = f"lagid/sha256/{name[:2]}/{name}.mcap"
-    client.put_object(Bucket=url.split("/")[2], Key=key, Body=b"marked")
+    client.put_object(Bucket=bucket.split("/")[2], Key=key, Body=b"marked")
     client.close()
     store.put_stream([b"first"])
     assert store.get_bytes(name) == b"marked"
@@ -197,9 +185,9 @@ def test_a_folder_that_cannot_be_made_or_written_is_told_in_one_line(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-def test_a_bucket_that_is_not_there_is_told_in_one_line(bucket):
-    _, options = bucket
-    store = open_store("s3://no-such-bucket-here/x", **options)
+@pytest.mark.usefixtures("bucket")
+def test_a_bucket_that_is_not_there_is_told_in_one_line():
+    store = open_store("s3://no-such-bucket-here/x")
     with pytest.raises(ObjectStoreFailed, match="the object store cannot write") as caught:
         store.check_writable()
     assert "\n" not in str(caught.value)

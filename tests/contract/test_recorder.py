@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prometheus_client import REGISTRY
 
 from service.core.states import JobState
 from service.dispatch import fitted_signals, recorder
@@ -220,6 +221,32 @@ def test_each_evaluation_counts_once_whatever_becomes_of_its_run(desk: Desk) -> 
     runs = {run.id: run for run in desk.place.runs(desk.job)}
     assert [runs[run].evaluations for run in desk.runs] == [310, 100, 0, 40]
     assert desk.ended == [(fails, None), (refused, None)]
+
+
+def read_counters() -> dict[str, float]:
+    """The numbers of runs and evaluations that this process shows to Prometheus."""
+    read, name = REGISTRY.get_sample_value, "lagid_runs_total"
+    counted = {one: read(name, {"outcome": one}) for one in ("succeeded", "failed", "reused")}
+    counted["evaluations"] = read("lagid_evaluations_total")
+    assert None not in counted.values()
+    return {name: float(value or 0) for name, value in counted.items()}
+
+
+def test_the_metrics_count_each_run_and_each_evaluation_of_this_attempt_once(desk: Desk) -> None:
+    first, second, third, fourth = desk.runs
+    desk.tell_progress(first, searched(10, 100, 0.5), 1.0)
+    desk.recorder.write_all()
+    before = read_counters()
+    desk.recorder = desk.claim_again()  # of the first run, 100 evaluations belong to the past
+    desk.tell_progress(first, searched(20, 170, 0.5), 1.0)
+    desk.tell_progress(first, searched(30, 250, 0.4), 1.0)
+    desk.tell_result(first, searched(40, 300, 0.3))
+    desk.tell_result(second, searched(40, 1000, 0.3))
+    desk.tell_progress(third, searched(5, 7, 0.5), 1.0)
+    desk.recorder.record_failure(third, RunFailure("no way", evaluations=9))
+    desk.recorder.record_reuse(fourth, second)
+    counted = {name: value - before[name] for name, value in read_counters().items()}
+    assert counted == {"succeeded": 2, "failed": 1, "reused": 1, "evaluations": 200 + 1000 + 9}
 
 
 def test_a_run_that_begins_and_ends_between_two_writes_has_both_times(desk: Desk) -> None:

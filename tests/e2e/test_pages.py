@@ -8,6 +8,7 @@ from playwright.sync_api import Page, expect
 
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
+from service.queue.queue_state import read_queue_state
 from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress
@@ -165,7 +166,7 @@ def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page
     page.get_by_role("button", name="Resume").click()
     expect(page.locator("#job .chip")).to_have_text("queued")
     with own_site.parts.database.write_session() as session:
-        assert JobRepository(session).count_states()[JobState.QUEUED] == 1
+        assert read_queue_state(session).jobs[JobState.QUEUED] == 1
 
 
 def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(

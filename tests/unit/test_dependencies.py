@@ -68,14 +68,31 @@ def test_what_tests_import_is_declared() -> None:
     assert imported - declared - {*names.values()} == set()
 
 
-def test_what_is_declared_is_in_the_lock() -> None:
-    locked = set(
-        re.findall(r"^([\w.-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
-    )
+def read_lock(path: str) -> dict[str, str]:
+    """Names and versions of a lock file."""
+    text = (ROOT / path).read_text()
+    return dict(re.findall(r"^([\w.-]+)==([\w.!+-]+)", text, re.MULTILINE))
+
+
+def list_declared(*extra_names: str) -> set[str]:
+    """Distributions of the declared dependencies, and of some extras; all of them without one."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lists = (project["dependencies"], *project["optional-dependencies"].values())
-    names = {Requirement(line).name.lower() for lines in lists for line in lines}
-    assert names - locked == set()
+    extras = project["optional-dependencies"]
+    chosen = [extras[name] for name in extra_names or extras]
+    lines = (line for one in (project["dependencies"], *chosen) for line in one)
+    return {Requirement(line).name.lower() for line in lines}
+
+
+def test_what_is_declared_is_in_the_lock() -> None:
+    assert list_declared() - {*read_lock("requirements.lock")} == set()
+
+
+def test_the_image_has_the_locked_versions_of_a_server_and_no_test_tools() -> None:
+    whole, image = read_lock("requirements.lock"), read_lock("docker/requirements.lock")
+    assert {*image.items()} < {*whole.items()}
+    served = list_declared("server", "postgres")
+    assert served - {*image} == set()
+    assert (list_declared("test") - served) & {*image} == {"jsonschema", "packaging"}  # for Ray
 
 
 # Without the libraries of a server: as after a plain `pip install lagid`.

@@ -87,8 +87,9 @@ def test_nothing_names_a_registry_or_a_path_of_the_developers_machine() -> None:
     assert named == []
 
 
-def test_every_locked_dependency_carries_a_hash() -> None:
-    text = (ROOT / "requirements.lock").read_text().replace("\\\n", " ")
+@pytest.mark.parametrize("lock", ["requirements.lock", "docker/requirements.lock"])
+def test_every_locked_dependency_carries_a_hash(lock: str) -> None:
+    text = (ROOT / lock).read_text().replace("\\\n", " ")
     bare = [line for line in text.splitlines() if "==" in line and "--hash=sha256:" not in line]
     assert bare == []
 

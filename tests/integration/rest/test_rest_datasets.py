@@ -279,12 +279,6 @@ def test_a_part_without_history_is_another_dataset(server: TestClient, dataset: 
     assert fault["pointer"] == "/steps/0/trim/history"
 
 
-def test_metrics_count_jobs_by_state(server: TestClient) -> None:
-    text = server.get("/metrics").text
-    assert 'lagid_jobs{state="queued"}' in text
-    assert server.get("/healthz").json() == {"status": "ok"}
-
-
 @pytest.mark.parametrize(
     ("signal", "hold"),
     [

@@ -25,11 +25,6 @@ from tests.stored import claimed, new_dataset
 AT_ONCE = timedelta(seconds=-5)
 
 
-@pytest.fixture
-def store(tmp_path):
-    return open_store(f"file://{tmp_path}/objects")
-
-
 def garbage(database, store, older_than=AT_ONCE):
     with database.read_session() as session:
         return {one.sha256 for one in find_orphans(session, store, older_than)}
@@ -108,9 +103,14 @@ OLD = 2 * MINIMUM_AGE.total_seconds()
 
 
 @pytest.fixture
-def orphan(store, tmp_path):
+def folder_store(tmp_path):
+    return open_store(f"file://{tmp_path}/objects")
+
+
+@pytest.fixture
+def orphan(folder_store, tmp_path):
     """An object that waits in vain for its row, as after a crash between the two."""
-    sha256 = store.put_stream([b"live"]).sha256
+    sha256 = folder_store.put_stream([b"live"]).sha256
     (file,) = (tmp_path / "objects").rglob("*.mcap")
     os.utime(file, (file.stat().st_mtime - OLD,) * 2)
     return sha256
@@ -118,7 +118,7 @@ def orphan(store, tmp_path):
 
 @pytest.mark.parametrize("has_row", [True, False])
 def test_an_orphan_that_is_stored_again_while_garbage_is_collected_stays(
-    database, store, orphan, monkeypatch, has_row
+    database, folder_store, orphan, monkeypatch, has_row
 ):
     def find_and_let_others_write(*arguments):
         orphans = list(find_orphans(*arguments))
@@ -126,29 +126,29 @@ def test_an_orphan_that_is_stored_again_while_garbage_is_collected_stays(
             with database.write_session() as session:
                 DatasetRepository(session).add(new_dataset(sha256=orphan))
         else:  # its row comes later
-            store.put_stream([b"live"])
+            folder_store.put_stream([b"live"])
         assert [one.sha256 for one in orphans] == [orphan]
         return orphans
 
     monkeypatch.setattr(garbage_collection, "find_orphans", find_and_let_others_write)
-    assert delete_orphans(database, store) == (0, 0)
-    assert store.get_bytes(orphan) == b"live"
+    assert delete_orphans(database, folder_store) == (0, 0)
+    assert folder_store.get_bytes(orphan) == b"live"
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_an_object_that_is_stored_again_in_the_moment_it_is_deleted_stays(
-    store, orphan, monkeypatch, when
+    folder_store, orphan, monkeypatch, when
 ):
     rename = os.rename
 
     def rename_and_let_others_write(*paths):
         if when == "before":
-            store.put_stream([b"live"])
+            folder_store.put_stream([b"live"])
         rename(*paths)
         if when == "after":
-            store.put_stream([b"live"])
+            folder_store.put_stream([b"live"])
 
     monkeypatch.setattr(os, "rename", rename_and_let_others_write)
-    assert store.delete_older(orphan, utc_now() - MINIMUM_AGE) is (when == "after")
-    assert store.get_bytes(orphan) == b"live"
-    assert list((store._folder / "tmp").iterdir()) == []
+    assert folder_store.delete_older(orphan, utc_now() - MINIMUM_AGE) is (when == "after")
+    assert folder_store.get_bytes(orphan) == b"live"
+    assert list((folder_store._folder / "tmp").iterdir()) == []

@@ -1,7 +1,7 @@
 """What the driver sends to workers arrives whole."""
 
 import pickle
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
@@ -21,3 +21,10 @@ def test_every_field_is_pickled(sent: Any) -> None:
     kind, values = sent.__reduce__()
     assert values == tuple(getattr(sent, field.name) for field in fields(kind))
     assert pickle.loads(pickle.dumps(sent)) == sent
+
+
+def test_the_order_of_the_names_of_a_warm_start_makes_no_other_run() -> None:
+    """PostgreSQL returns stored estimates in an order of its own."""
+    starts = ({"K": 2.0, "L": 0.5}, {"L": 0.5, "K": 2.0}, {"K": 0.5, "L": 2.0})
+    keys = [replace(spec(7), warm_starts=(values,)).reuse_key for values in starts]
+    assert keys[0] == keys[1] != keys[2]

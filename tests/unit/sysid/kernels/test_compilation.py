@@ -38,6 +38,16 @@ def test_the_child_compiles_the_same_code_and_imports_nothing_of_the_working_fol
     assert compile_kernel(duffing(), VARIANT) == compile_assembly(emit_kernel(duffing(), VARIANT))
 
 
+def test_the_time_of_a_compilation_is_told_to_the_operator(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = compilation.get_compile_seconds()
+    monkeypatch.setattr(compilation, "_WALL_SECONDS", 0.01)
+    with pytest.raises(InvalidModel):
+        compile_kernel(duffing(), VARIANT)
+    assert compilation.get_compile_seconds() >= before + 0.01
+
+
 @pytest.mark.parametrize("name", catalogue())
 def test_the_task_of_the_child_has_all_that_a_kernel_depends_on(name: str) -> None:
     model = load_model(name)
