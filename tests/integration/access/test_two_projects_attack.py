@@ -148,6 +148,8 @@ def _list_bodies(method: str, path: str, victim: Side) -> list[dict[str, Any]]:
         "/v1/models": [{**copy_catalogue_document("fopdt"), "name": f"of-{len(victim.mark)}"}],
         "/v1/models:check": [{"name": victim.model}],
     }
+    if method == "DELETE":
+        return []  # what is deleted, others would not find
     if method == "PATCH":
         bodies = {path: [{"note": victim.mark, "tags": [victim.mark]}]}
     if path == "/v1/datasets":

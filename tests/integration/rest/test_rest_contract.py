@@ -67,7 +67,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         doomed = {
             examples.RUN: carried_out(parts, doomed_job)[0],
             examples.JOB: doomed_job,
-            examples.DATASET_ID: post("/v1/datasets:simulate", "simulate_dataset", samples=50),
+            examples.DATASET_ID: post(
+                "/v1/datasets:simulate", "simulate_dataset", name="doomed", samples=50
+            ),
         }
         yield World(server, document, names, doomed)
 
