@@ -56,13 +56,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         parts = parts_of(server)
         carried_out(parts, batch)
         runs = carried_out(parts, pair)
-        names = {
-            examples.DATASET_ID: dataset,
-            examples.RUN: runs[0],
-            examples.OTHER_RUN: runs[1],
-            examples.JOB: batch,
-            "waiting": post("/v1/jobs", "submit_job"),
-        }
         doomed_job = post("/v1/jobs", "submit_job", algorithm=SMALL, sweep=twice)
         doomed = {
             examples.RUN: carried_out(parts, doomed_job)[0],
@@ -70,6 +63,13 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             examples.DATASET_ID: post(
                 "/v1/datasets:simulate", "simulate_dataset", name="doomed", samples=50
             ),
+        }
+        names = {
+            examples.DATASET_ID: dataset,
+            examples.RUN: runs[0],
+            examples.OTHER_RUN: runs[1],
+            examples.JOB: batch,
+            "waiting": post("/v1/jobs", "submit_job"),
         }
         yield World(server, document, names, doomed)
 
