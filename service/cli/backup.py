@@ -29,7 +29,7 @@ def write_backup(
     from service.upkeep import backup
 
     require_database(settings)
-    protect_file(file, force)
+    protect_file(file, force, "FILE")
     with open_database(settings) as database:
         store = open_store(settings.store_location)
         try:

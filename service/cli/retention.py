@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
+from service.cli.access import ACTOR, DEFAULT_PROJECT_NAME, Project
 from service.cli.common import (
     AsJson,
-    fail,
     fail_usage,
     out,
     parse_number,
@@ -27,33 +27,31 @@ Days = Annotated[
     str | None,
     typer.Argument(help=f"Days, `{FOREVER}`, or `{DEFAULT}` (LAGID_KEEP_DAYS); none: show them."),
 ]
-ProjectName = Annotated[str | None, typer.Option(help="Id of the project.", show_default=False)]
-
-
 app = database_app
 
 
 @app.command("keep", epilog=show_examples("lagid db keep 365", "lagid db keep forever"))
 def keep_jobs(
     days: Days = None,
-    project: ProjectName = None,
+    project: Project = DEFAULT_PROJECT_NAME,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Show or set how long ended jobs of a project are kept, with what only they use."""
     settings = load_settings(data_dir=data_dir)
+    from service.repositories.projects import ProjectRepository
     from service.storage import migrate
-    from service.storage.tables import DEFAULT_PROJECT, Project
+    from service.storage.sessions import SessionOwner
 
     require_database(settings)
     with open_database(settings) as database:
         migrate.check_revision(database)
-        with database.write_session() as session:
-            row = session.get(Project, project or DEFAULT_PROJECT)
-            if row is None:
-                fail(f"there is no project {project}")
-            if days is not None:
-                row.keep_days = _parse_days(days)
+        with database.open_for(SessionOwner(actor=ACTOR)).write_session() as session:
+            projects = ProjectRepository(session)
+            if days is None:
+                row = projects.get(project)
+            else:
+                row = projects.change_retention(project, _parse_days(days))
             chosen = row.keep_days
             identity = row.id
     effective = settings.keep_days if chosen is None else chosen or None

@@ -27,6 +27,7 @@ AuditAction = Literal[
     "model.delete",
     "model.edit",
     "project.create",
+    "project.keep",
     "project.limit",
     "reference.accept",
     "reference.delete",

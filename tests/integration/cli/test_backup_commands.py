@@ -39,7 +39,7 @@ def test_mistakes_in_backup_and_restore_are_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     settings_of(folder)
     assert "no database" in check_refusal(run(tmp_path / "none", "backup", "b.zip"))
-    assert "cannot be written" in check_refusal(run(folder, "backup", "no/b.zip"))
+    assert "no folder" in check_refusal(run(folder, "backup", "no/b.zip"), 2)
     assert "no file" in check_refusal(run(folder, "restore", "b.zip"))
     (tmp_path / "b.zip").write_text("text")
     assert "no complete ZIP" in check_refusal(run(folder, "restore", "b.zip"))
@@ -62,4 +62,9 @@ def test_a_project_is_told_how_long_to_keep_jobs(tmp_path: Path) -> None:
     assert shown == {"project": "proj_default", "keep_days": None, "is_default": True}
     assert "need more than 0" in check_refusal(run(folder, "db", "keep", "0"), 2)
     assert "need a number" in check_refusal(run(folder, "db", "keep", "long"), 2)
-    assert "no project" in check_refusal(run(folder, "db", "keep", "--project", "proj_x"))
+    assert "project 'x'" in check_refusal(run(folder, "db", "keep", "--project", "x"))
+    run(folder, "project", "create", "tubes")
+    told = run(folder, "db", "keep", "9", "--project", "tubes").stdout
+    assert told.endswith(" keeps ended jobs for 9 days\n")
+    log = run(folder, "audit", "--project", "tubes", "--json").stdout
+    assert [entry["action"] for entry in json.loads(log)] == ["project.keep", "project.create"]
