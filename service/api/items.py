@@ -102,10 +102,10 @@ def read_dataset_form(
 def read_job_form(
     fields: Annotated[dict[str, str], Depends(read_dataset_form)],
     model: FormText = "",
-    dataset: FormText = "",
+    recording: FormText = "",
 ) -> dict[str, str]:
     """Read the filled fields of the form that filters jobs."""
-    more = {"model": model.strip(), "dataset": dataset.strip()}
+    more = {"model": model.strip(), "recording": recording.strip()}
     return {**fields, **{field: text for field, text in more.items() if text}}
 
 
@@ -124,10 +124,10 @@ def parse_form(session: Session, form: Mapping[str, str]) -> ListFilter:
     """
     terms: list[Term] = [("tag", form["tag"])] if "tag" in form else []
     terms += _list_labels([form["label"]] if "label" in form else None)
-    if "dataset" in form:
-        dataset = resolve_dataset(session, form["dataset"])
+    if "recording" in form:
+        dataset = resolve_dataset(session, form["recording"])
         if isinstance(dataset, str):
-            raise InvalidRequest.from_fault("?dataset", dataset)
+            raise InvalidRequest.from_fault("?recording", dataset)
         terms.append(("dataset", dataset.id))
     if "model" in form:
         terms.append(("model", form["model"]))

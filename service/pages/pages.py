@@ -79,7 +79,7 @@ DATASET_FILTER_FIELDS = (
 JOB_FILTER_FIELDS = (
     DATASET_FILTER_FIELDS[0],
     ("model", "Model", ""),
-    ("dataset", "Recording", "id or name"),
+    ("recording", "Recording", "id or name"),
     *DATASET_FILTER_FIELDS[1:],
 )
 """Fields of the filter of a list: name, label and hint."""
