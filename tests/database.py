@@ -81,6 +81,7 @@ def _delete_rows(database: Database) -> None:
         f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {others}",
         *(f"DELETE FROM {name}" for name in tables if name != Project.__tablename__),
         f"DELETE FROM {Project.__tablename__} WHERE id <> '{DEFAULT_PROJECT}'",
+        f"UPDATE {Project.__tablename__} SET keep_days = NULL",
     ]
     with database.engine.begin() as connection:
         connection.exec_driver_sql("; ".join(statements))

@@ -5,11 +5,12 @@ from typing import Any
 
 from service.api.dependencies import Parts
 from service.dispatch.cramer_rao import build_bounds_maker
+from service.dispatch.encoding import describe_program
 from service.dispatch.job_runs import JobRuns
 from service.dispatch.recorder import RunRecorder
 from service.jobs import submit
 from service.jobs.schemas import JobIn
-from service.queue.leases import LeaseQueue
+from service.queue.leases import LeaseQueue, ProgramOfJob
 from service.repositories.runs import RunRepository
 from workers.inline_executor import InlineExecutor
 from workers.scheduler import Scheduler
@@ -24,9 +25,10 @@ def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[s
 def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     """Carry out a job that waits; gives the ids of its runs."""
     with parts.database.write_session() as session:
-        claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
+        program, hour = ProgramOfJob(**describe_program()), timedelta(hours=1)
+        claim = LeaseQueue(session).claim_job("test", hour, program=program)
         while claim is not None and claim.job.id != job:  # others that wait are left claimed
-            claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
+            claim = LeaseQueue(session).claim_job("test", hour, program=program)
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
     floors = build_bounds_maker(parts.database, source.parts)

@@ -35,6 +35,7 @@ from service.api.root_path import RootPath
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
+from service.upkeep.housekeeper import Housekeeper
 
 DESCRIPTION = (
     "Identification of nonlinear time-lag systems. Upload a recording, name a model or write its "
@@ -82,6 +83,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         health.router,
         datasets.router,
         models.router,
+        models.edit_router,
         jobs.router,
         recipes.recipe_router,
         references.reference_router,
@@ -112,12 +114,15 @@ def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]
     async def run(app: FastAPI) -> AsyncIterator[None]:
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)
         reaper = Reaper(parts.database, parts.stopping)
+        housekeeper = Housekeeper(parts.database, parts.store, settings.keep_days, parts.stopping)
         reaper.start()
+        housekeeper.start()
         try:
             yield
         finally:
             parts.stopping.set()
             reaper.join()
+            housekeeper.join()
             parts.database.dispose()
 
     return run

@@ -107,14 +107,8 @@ def content_response(
     store: ContentSource,
     sha256: str,
     file_name: str,
-    part_of: ByteRange | None = None,
 ) -> Response:
     """Answer with an object, or with the requested range of it.
-
-    Parameters
-    ----------
-    part_of : ByteRange, optional
-        Where the file lies in the object. By default the file is the whole object.
 
     Raises
     ------
@@ -123,7 +117,7 @@ def content_response(
     StaleVersion
         If ``If-Match`` names another version.
     """
-    etag = f'"{sha256}"' if part_of is None else f'"{sha256}-{part_of.start}"'
+    etag = f'"{sha256}"'
     headers = {
         **CROSS_ORIGIN,
         "Accept-Ranges": "bytes",
@@ -137,9 +131,7 @@ def content_response(
         )
     if _matches_etag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    whole = ByteRange(0, store.get_size(sha256))  # in any case: raises if the object is missing
-    file = whole if part_of is None else part_of
-    size = file.stop - file.start
+    size = store.get_size(sha256)
     part = _parse_range(request, size, etag)
     status, wanted = (200, ByteRange(0, size)) if part is None else (206, part)
     if part is not None:
@@ -147,7 +139,7 @@ def content_response(
     headers["Content-Length"] = str(wanted.stop - wanted.start)
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MCAP_TYPE)
-    blocks = store.get_stream(sha256, file.start + wanted.start, wanted.stop - wanted.start)
+    blocks = store.get_stream(sha256, wanted.start, wanted.stop - wanted.start)
     return McapResponse(blocks, status, headers)
 
 

@@ -17,7 +17,15 @@ from service.api.content import (
     preflight_response,
     receive_upload,
 )
-from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
+from service.api.dependencies import (
+    Cursor,
+    Limit,
+    MaxPoints,
+    PartsDep,
+    ReadSession,
+    WriteSession,
+)
+from service.api.items import Cascade, DatasetFilterDep, IfMatch, delete, edit, set_etag
 from service.core.root_path import to_address
 from service.datasets import datasets, simulated
 from service.datasets.recordings import load_recording
@@ -30,6 +38,7 @@ from service.datasets.schemas import (
     SimulateIn,
 )
 from service.formats.csv_recordings import generate_csv
+from service.items.schemas import DeletedOut, EditIn
 from service.repositories.datasets import DatasetRepository, StoredDataset
 
 router = APIRouter(prefix="/v1", tags=["datasets"], route_class=JsonRoute)
@@ -111,15 +120,40 @@ def derive_dataset(
 
 
 @router.get("/datasets")
-def list_datasets(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> DatasetPage:
-    """List datasets, latest first."""
-    return datasets.list_datasets(session, cursor, limit)
+def list_datasets(
+    session: ReadSession, chosen: DatasetFilterDep, cursor: Cursor = None, limit: Limit = 50
+) -> DatasetPage:
+    """List datasets, latest first; all conditions must hold."""
+    return datasets.list_datasets(session, cursor, limit, chosen)
 
 
 @router.get("/datasets/{dataset_id}")
-def read_dataset(dataset_id: str, session: ReadSession) -> DatasetOut:
+def read_dataset(dataset_id: str, session: ReadSession, response: Response) -> DatasetOut:
     """Read one dataset: channels, sampling, segments, warnings."""
+    row = DatasetRepository(session).get(dataset_id)
+    set_etag(response, row)
+    return datasets.to_out(row)
+
+
+@router.patch("/datasets/{dataset_id}")
+def edit_dataset(
+    dataset_id: str,
+    body: EditIn,
+    session: WriteSession,
+    response: Response,
+    if_match: IfMatch = None,
+) -> DatasetOut:
+    """Change name, note or tags of a dataset; with `If-Match` only if they are as read."""
+    edit(session, "dataset", dataset_id, body, if_match, response)
     return datasets.to_out(DatasetRepository(session).get(dataset_id))
+
+
+@router.delete("/datasets/{dataset_id}")
+def delete_dataset(
+    dataset_id: str, session: WriteSession, cascade: Cascade = False, if_match: IfMatch = None
+) -> DeletedOut:
+    """Delete a dataset; 409 lists the datasets and jobs that were made from it."""
+    return delete(session, "dataset", dataset_id, cascade, if_match)
 
 
 @router.get("/datasets/{dataset_id}/signals")

@@ -19,9 +19,14 @@ PARAMETERS: Mapping[str, tuple[str, str]] = {
     "run_id": ("identifier of a run", RUN),
 }
 """Description and example of the parameters that many paths have."""
+_OWN_MODEL = "name of your own model, or `name@version`"
 NAMES: Mapping[str, tuple[str, str]] = {
     "read_model": ("name of a model, `name@version`, or its identifier", "fopdt"),
+    "edit_model": (_OWN_MODEL, "heater"),
+    "delete_model": (_OWN_MODEL, "heater"),
     "read_reference": ("name of a reference", DATASET),
+    "edit_reference": ("name of a reference", DATASET),
+    "delete_reference": ("name of a reference", DATASET),
     "accept_reference": ("name of the reference", DATASET),
     "draw_run_figure": ("name of the figure", "response"),
 }
@@ -69,6 +74,8 @@ _JOB = {
     "parameters": {"L": {"upper": 2}},
     "validation": {"fraction": 0.3},
 }
+_EDIT = {"note": "the valve was replaced before", "tags": ["spring", "valve 2"]}
+EDITED_KINDS = ("dataset", "model", "job", "run", "reference")
 
 BODIES: Mapping[str, Mapping[str, Any]] = {
     "add_dataset": {
@@ -125,6 +132,7 @@ BODIES: Mapping[str, Mapping[str, Any]] = {
             "sample_time": 0.05,
         }
     },
+    **{f"edit_{kind}": {"application/json": _EDIT} for kind in EDITED_KINDS},
     "validate_run": {"application/json": {"dataset": DATASET_ID}},
     "profile_run": {"application/json": {"parameters": ["L"], "points": 5}},
 }

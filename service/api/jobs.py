@@ -7,9 +7,11 @@ from fastapi import APIRouter, Header, Query, Response, status
 from service.api.bodies import JsonRoute
 from service.api.content import CsvResponse
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.api.items import Cascade, IfMatch, JobFilterDep, Tags, delete, edit, set_etag
 from service.core.root_path import to_address
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
+from service.items.schemas import DeletedOut, EditIn
 from service.jobs import submit
 from service.jobs.schemas import JobIn, JobOut, JobPage
 from service.repositories.jobs import JobRepository
@@ -56,17 +58,44 @@ def submit_job(
 
 @router.get("")
 def list_jobs(
-    session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: StatesFilter = None
+    session: ReadSession,
+    chosen: JobFilterDep,
+    cursor: Cursor = None,
+    limit: Limit = 50,
+    state: StatesFilter = None,
 ) -> JobPage:
-    """List jobs, latest first."""
-    return submit.list_jobs(session, cursor, limit, state or [])
+    """List jobs, latest first; all conditions must hold."""
+    return submit.list_jobs(session, cursor, limit, state or [], chosen)
 
 
 @router.get("/{job_id}")
-def read_job(job_id: str, session: ReadSession) -> JobOut:
+def read_job(job_id: str, session: ReadSession, response: Response) -> JobOut:
     """Read one job: state, progress, and the exact request."""
     job = JobRepository(session).get(job_id)
+    set_etag(response, job)
     return submit.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
+
+
+@router.patch("/{job_id}")
+def edit_job(
+    job_id: str,
+    body: EditIn,
+    session: WriteSession,
+    response: Response,
+    if_match: IfMatch = None,
+) -> JobOut:
+    """Change name, note or tags of a job; with `If-Match` only if they are as they were read."""
+    edit(session, "job", job_id, body, if_match, response)
+    job = JobRepository(session).get(job_id)
+    return submit.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
+
+
+@router.delete("/{job_id}")
+def delete_job(
+    job_id: str, session: WriteSession, cascade: Cascade = False, if_match: IfMatch = None
+) -> DeletedOut:
+    """Delete an ended job with its runs; 409 lists what was made from them."""
+    return delete(session, "job", job_id, cascade, if_match)
 
 
 @router.post("/{job_id}:cancel")
@@ -106,11 +135,12 @@ def list_runs(
     state: StatesFilter = None,
     cell: CellFilter = None,
     label: CellFilter = None,
+    tag: Tags = None,
     order: Order = "number",
     descending: Descending = False,
 ) -> RunPage:
     """List the runs of a job that exist already; filter by axis values, labels or state."""
-    choice = runs.RunQuery(state or [], cell or [], label or [], order, descending)
+    choice = runs.RunQuery(state or [], cell or [], label or [], tag or [], order, descending)
     return runs.list_runs(session, job_id, cursor, limit, choice)
 
 

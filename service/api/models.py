@@ -6,15 +6,19 @@ from urllib.parse import quote
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.api.bodies import check_counts, check_shape
-from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
+from service.api.bodies import JsonRoute, check_counts, check_shape
+from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.api.items import Cascade, FilterDep, IfMatch, delete, edit, set_etag
 from service.core.documents import MAX_DOCUMENT_BYTES, parse_json, parse_yaml
 from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
 from service.core.root_path import to_address
+from service.items.schemas import DeletedOut, EditIn
 from service.models import catalogue, models
 from service.models.schemas import CheckOut, ModelOut, ModelPage
+from service.repositories.models import ModelRepository
 
 router = APIRouter(prefix="/v1", tags=["models"])
+edit_router = APIRouter(prefix="/v1", tags=["models"], route_class=JsonRoute)
 
 YAML_TYPES = ("application/yaml", "application/x-yaml", "text/yaml", "text/x-yaml")
 DOCUMENT_BODY: dict[str, Any] = {
@@ -30,15 +34,41 @@ DOCUMENT_BODY: dict[str, Any] = {
 
 
 @router.get("/models")
-def list_models(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> ModelPage:
-    """List models: built-in ones, then your own."""
-    return models.list_models(session, cursor, limit)
+def list_models(
+    session: ReadSession, chosen: FilterDep, cursor: Cursor = None, limit: Limit = 50
+) -> ModelPage:
+    """List models: built-in ones, then your own; all conditions must hold."""
+    return models.list_models(session, cursor, limit, chosen)
 
 
 @router.get("/models/{name}")
-def read_model(name: str, session: ReadSession) -> ModelOut:
+def read_model(name: str, session: ReadSession, response: Response) -> ModelOut:
     """Read a model with its document; ``name@version`` is an earlier version of your own model."""
+    model = models.get_model(session, name)
+    if not model.builtin:
+        set_etag(response, ModelRepository(session).get(name))
+    return model
+
+
+@edit_router.patch("/models/{name}")
+def edit_model(
+    name: str,
+    body: EditIn,
+    session: WriteSession,
+    response: Response,
+    if_match: IfMatch = None,
+) -> ModelOut:
+    """Change note or tags of the latest version of your own model, or of ``name@version``."""
+    edit(session, "model", name, body, if_match, response)
     return models.get_model(session, name)
+
+
+@edit_router.delete("/models/{name}")
+def delete_model(
+    name: str, session: WriteSession, cascade: Cascade = False, if_match: IfMatch = None
+) -> DeletedOut:
+    """Delete all versions of your own model, or ``name@version``; 409 lists jobs with it."""
+    return delete(session, "model", name, cascade, if_match)
 
 
 @router.post("/models", status_code=201, openapi_extra=DOCUMENT_BODY)

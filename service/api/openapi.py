@@ -22,6 +22,7 @@ from service.api.problems import PROBLEM_TYPE
 from service.core import errors
 from service.core.errors import InvalidRequest, ServiceError
 from service.core.wire import Answer, FaultOut
+from service.items.schemas import ItemOut
 
 Operation = Mapping[str, Any]
 _Rule = Callable[[str, Operation], bool]
@@ -60,6 +61,9 @@ class ProblemOut(Answer):
     instance: str = Field(description="path of the request")
     request_id: str = Field(description="id of the request, as in `X-Request-ID` and in the log")
     errors: tuple[FaultOut, ...] = Field(default=(), description="every fault of the request")
+    dependents: tuple[ItemOut, ...] = Field(
+        default=(), description="what was made from an item that was not deleted for it"
+    )
 
 
 def _is_any(_method: str, _operation: Operation) -> bool:
@@ -80,6 +84,11 @@ def _has_file(_method: str, operation: Operation) -> bool:
 
 def _gives_file(_method: str, operation: Operation) -> bool:
     return any(MCAP_TYPE in response.get("content", {}) for response in _answers(operation))
+
+
+def _has_precondition(method: str, operation: Operation) -> bool:
+    named = {parameter["name"].lower() for parameter in operation.get("parameters", ())}
+    return "if-match" in named or _gives_file(method, operation)
 
 
 def _names_resource(method: str, operation: Operation) -> bool:
@@ -108,7 +117,7 @@ RULES: tuple[tuple[type[ServiceError], _Rule], ...] = (
     (errors.NotFound, _names_resource),
     (errors.StalledRequest, _has_file),
     (errors.Conflict, _names_resource),
-    (errors.StaleVersion, _gives_file),
+    (errors.StaleVersion, _has_precondition),
     (errors.TooLarge, _has_body),
     (errors.UnsupportedMediaType, _has_body),
     (errors.UnsatisfiableRange, _gives_file),

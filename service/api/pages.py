@@ -8,6 +8,7 @@ from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Res
 from service.api.dependencies import Cursor, PartsDep, ReadSession
 from service.api.figures import csv_response
 from service.api.html import HtmlPage
+from service.api.items import DatasetFormDep, JobFormDep, parse_form
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.states import JobState
@@ -32,9 +33,12 @@ def reference_page(request: Request) -> Response:
 
 
 @router.get("/", **HIDDEN)
-def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
+def jobs_page(
+    session: ReadSession, form: JobFormDep, state: StateFilter = None, cursor: Cursor = None
+) -> Response:
     """Show the list of jobs, and the form of a new identification."""
-    return HtmlPage(pages.jobs_page(session, state, cursor))
+    chosen = parse_form(session, form)
+    return HtmlPage(pages.jobs_page(session, state, cursor, chosen, form))
 
 
 @router.get("/new/noise-sweep", **HIDDEN)
@@ -85,9 +89,9 @@ def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
 
 
 @router.get("/datasets", **HIDDEN)
-def datasets_page(session: ReadSession, cursor: Cursor = None) -> Response:
+def datasets_page(session: ReadSession, form: DatasetFormDep, cursor: Cursor = None) -> Response:
     """List the stored recordings."""
-    return HtmlPage(pages.datasets_page(session, cursor))
+    return HtmlPage(pages.datasets_page(session, cursor, parse_form(session, form), form))
 
 
 @router.get("/datasets/{dataset_id}", **HIDDEN)

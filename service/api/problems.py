@@ -62,6 +62,7 @@ def problem_response(
     detail: str,
     errors: Sequence[FieldError] = (),
     headers: Mapping[str, str] | None = None,
+    members: Mapping[str, Any] | None = None,
 ) -> Response:
     """Answer with a problem document; its `type` is a path of this server, one per kind.
 
@@ -76,6 +77,7 @@ def problem_response(
         "detail": _shorten(detail, MAX_TOTAL_CHARACTERS if errors else MAX_DETAIL_CHARACTERS),
         "instance": request.url.path,
         "request_id": get_request_id(request),
+        **(members or {}),
     }
     if errors:
         entries = [error.to_dict() for error in errors[: MAX_FAULTS + 1]]
@@ -121,7 +123,14 @@ def install_handlers(app: FastAPI) -> None:
 def error_response(request: Request, error: ServiceError) -> Response:
     """Answer with the problem document of an error that the service raises on purpose."""
     return problem_response(
-        request, error.status, error.kind, error.title, error.detail, error.errors, error.headers
+        request,
+        error.status,
+        error.kind,
+        error.title,
+        error.detail,
+        error.errors,
+        error.headers,
+        error.members,
     )
 
 

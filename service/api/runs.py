@@ -7,19 +7,19 @@ from fastapi import APIRouter, Query, Request, Response
 from service.api.bodies import JsonRoute
 from service.api.content import (
     FILE_ANSWERS,
-    ByteRange,
     McapResponse,
     MemoryContent,
     content_response,
 )
-from service.api.dependencies import MaxPoints, PartsDep, ReadSession
+from service.api.dependencies import MaxPoints, PartsDep, ReadSession, WriteSession
+from service.api.items import Cascade, IfMatch, delete, edit, set_etag
 from service.control import simulate
 from service.control.schemas import RunSimulationIn, RunSimulationOut
-from service.core.errors import NotFound
 from service.core.wire import FigureOut
 from service.figures.profiles import plot_profiles as profile_figure
-from service.jobs.stored_run import load_run
-from service.runs import comparison, exports, fitted, free_run, profiles, residuals, runs
+from service.items.schemas import DeletedOut, EditIn
+from service.repositories.runs import RunRepository
+from service.runs import comparison, exports, fitted, free_run, profiles, residuals, run_file, runs
 from service.runs.schemas import (
     CompareIn,
     ComparisonOut,
@@ -42,9 +42,31 @@ router = APIRouter(prefix="/v1/runs", tags=["runs"], route_class=JsonRoute)
 
 
 @router.get("/{run_id}")
-def read_run(run_id: str, session: ReadSession) -> RunOut:
+def read_run(run_id: str, session: ReadSession, response: Response) -> RunOut:
     """Read one run: its state, and its result as soon as it exists."""
+    set_etag(response, RunRepository(session).get(run_id))
     return runs.get_run(session, run_id)
+
+
+@router.patch("/{run_id}")
+def edit_run(
+    run_id: str,
+    body: EditIn,
+    session: WriteSession,
+    response: Response,
+    if_match: IfMatch = None,
+) -> RunOut:
+    """Change note or tags of a run; with `If-Match` only if they are as they were read."""
+    edit(session, "run", run_id, body, if_match, response)
+    return runs.get_run(session, run_id)
+
+
+@router.delete("/{run_id}")
+def delete_run(
+    run_id: str, session: WriteSession, cascade: Cascade = False, if_match: IfMatch = None
+) -> DeletedOut:
+    """Delete a run of an ended job; 409 lists what was made from it."""
+    return delete(session, "run", run_id, cascade, if_match)
 
 
 @router.get("/{run_id}/history")
@@ -132,18 +154,12 @@ def profile_run(
 def read_run_signals(
     run_id: str, request: Request, session: ReadSession, parts: PartsDep
 ) -> Response:
-    """Download measured and simulated outputs and residuals as MCAP; ranges and ETags work."""
-    stored = load_run(session, run_id)
-    run, part = stored.run, None
-    if run.signals_sha256 is None:
-        fits = fitted.load_fitted_signals(session, parts.store, stored)
-        if fits is None:
-            raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
-        content = MemoryContent(fitted.write_signals_file(run_id, fits))
-        return content_response(request, content, content.sha256, f"{run_id}.mcap")
-    if run.signals_start is not None and run.signals_size is not None:
-        part = ByteRange(run.signals_start, run.signals_start + run.signals_size)
-    return content_response(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)
+    """Download the run as MCAP: inputs, measured and simulated outputs, residuals, and its origin.
+
+    Its topics are `/fit` and `/inputs`, those of every run. Ranges and ETags are honoured.
+    """
+    content = MemoryContent(run_file.load_run_file(session, parts.store, run_id))
+    return content_response(request, content, content.sha256, f"{run_id}.mcap")
 
 
 comparison_router = APIRouter(prefix="/v1", tags=["runs"], route_class=JsonRoute)

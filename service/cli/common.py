@@ -123,7 +123,7 @@ Limit = Annotated[
 ]
 Force = Annotated[
     bool,
-    typer.Option("--force", "-f", help="Overwrite the file.", rich_help_panel=OUTPUT_PANEL),
+    typer.Option("--force", "-f", help="Overwrite what is there.", rich_help_panel=OUTPUT_PANEL),
 ]
 
 __all__ = [

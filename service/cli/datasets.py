@@ -43,6 +43,15 @@ from service.cli.common import (
     show_examples,
     upload_origins,
 )
+from service.cli.items import (
+    LabelFilter,
+    NamePart,
+    Since,
+    TagFilter,
+    Until,
+    add_item_commands,
+    read_filters,
+)
 from service.client.calls import DEFAULT_URL
 from sysid.core.errors import suggest_name
 from sysid.core.text import append_unit
@@ -60,11 +69,20 @@ DatasetName = Annotated[str, typer.Argument(metavar="DATASET", help="Id or name 
 
 
 def list_datasets(
-    url: Url = DEFAULT_URL, key: Key = None, limit: Limit = None, as_json: AsJson = False
+    name: NamePart = None,
+    tag: TagFilter = None,
+    label: LabelFilter = None,
+    since: Since = None,
+    until: Until = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    limit: Limit = None,
+    as_json: AsJson = False,
 ) -> None:
     """List the recordings of the server, latest first."""
+    filters = read_filters(name=name, tag=tag, label=label, since=since, until=until)
     with connect_client(url, key) as client:
-        listing = fetch_listing(client.datasets, limit, as_json)
+        listing = fetch_listing(lambda most: client.datasets(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -77,7 +95,9 @@ def list_datasets(
             dataset["duration"],
             _format_channels(dataset),
         ),
-        empty="no datasets; add one: lagid dataset add recording.csv",
+        empty="no such datasets"
+        if filters
+        else "no datasets; add one: lagid dataset add recording.csv",
     )
 
 
@@ -116,7 +136,7 @@ def show_dataset(
 ) -> None:
     """Show one recording: its samples and its channels."""
     with connect_client(url, key) as client:
-        found = _find_dataset(client, dataset)
+        found = find_dataset(client, dataset)
     _print_dataset(found, as_json)
     if not as_json:
         rows = [
@@ -150,7 +170,7 @@ def download_dataset(
 ) -> None:
     """Download a recording."""
     with connect_client(url, key) as client:
-        found = _find_dataset(client, dataset)
+        found = find_dataset(client, dataset)
         if file == STANDARD_INPUT:
             _write_pieces(client.download(found["id"], format), sys.stdout.buffer)
             return
@@ -235,13 +255,13 @@ def derive_dataset(
     _print_dataset(stored, as_json)
 
 
-def _find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
+def find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
     """Find a dataset by its id or name; end the command if none or several have it."""
     if name.startswith(DATASET_ID):
         return client.dataset(name)
-    datasets = client.datasets()
-    found = [dataset for dataset in datasets if dataset["name"] == name]
+    found = [dataset for dataset in client.datasets(name=name) if dataset["name"] == name]
     if not found:
+        datasets = client.datasets()
         hint = suggest_name(name, {dataset["name"] for dataset in datasets})
         fail(f"there is no dataset {name!r}{hint}")
     if len(found) > 1:
@@ -289,3 +309,13 @@ def _format_channels(dataset: Mapping[str, Any]) -> str:
     return ", ".join(
         append_unit(channel["name"], channel["unit"]) for channel in dataset["channels"]
     )
+
+
+add_item_commands(
+    app,
+    "lagid dataset",
+    "dataset",
+    "recording",
+    has_name=True,
+    resolve=lambda client, name: str(find_dataset(client, name)["id"]),
+)

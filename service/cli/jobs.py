@@ -37,6 +37,17 @@ from service.cli.common import (
     report_faults,
     write_file,
 )
+from service.cli.datasets import find_dataset
+from service.cli.items import (
+    FILTER_PANEL,
+    LabelFilter,
+    NamePart,
+    Since,
+    TagFilter,
+    Until,
+    add_item_commands,
+    read_filters,
+)
 from service.cli.tables import (
     MAX_PRINTED,
     print_reuse_note,
@@ -55,6 +66,10 @@ if TYPE_CHECKING:
 
 
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
+
+
+app = typer.Typer(help="Edit and delete jobs.", no_args_is_help=True)
+add_item_commands(app, "lagid job", "job", "job_1", has_name=True)
 
 
 def submit_job(
@@ -101,6 +116,20 @@ def list_jobs(
     state: Annotated[
         list[JobState] | None, typer.Option(help="Only jobs in this state; may be repeated.")
     ] = None,
+    name: NamePart = None,
+    model: Annotated[
+        str | None, typer.Option(help="Only those of this model.", rich_help_panel=FILTER_PANEL)
+    ] = None,
+    dataset: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only those that use this dataset (id or name).", rich_help_panel=FILTER_PANEL
+        ),
+    ] = None,
+    tag: TagFilter = None,
+    label: LabelFilter = None,
+    since: Since = None,
+    until: Until = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     limit: Limit = None,
@@ -108,7 +137,17 @@ def list_jobs(
 ) -> None:
     """List the jobs of the server, latest first."""
     with connect_client(url, key) as client:
-        listing = fetch_listing(lambda most: client.jobs(most, state=state or None), limit, as_json)
+        filters = read_filters(
+            state=state,
+            name=name,
+            model=model,
+            dataset=[find_dataset(client, text)["id"] for text in dataset or ()],
+            tag=tag,
+            label=label,
+            since=since,
+            until=until,
+        )
+        listing = fetch_listing(lambda most: client.jobs(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -122,10 +161,14 @@ def list_jobs(
             *_single_run_rms(job),
             format_moment(job["created_at"]),
         ),
-        empty=f"no jobs are {' or '.join(state)}"
-        if state
-        else "no jobs; submit one: lagid submit job.yaml",
+        empty=_explain_no_jobs(state, filters),
     )
+
+
+def _explain_no_jobs(state: list[JobState] | None, filters: dict[str, Any]) -> str:
+    if state and len(filters) == 1:
+        return f"no jobs are {' or '.join(state)}"
+    return "no such jobs" if filters else "no jobs; submit one: lagid submit job.yaml"
 
 
 def list_runs(

@@ -10,7 +10,18 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import access, datasets, health, jobs, models, runs, server, sweeps
+from service.cli import (
+    access,
+    backup,
+    datasets,
+    health,
+    jobs,
+    models,
+    retention,
+    runs,
+    server,
+    sweeps,
+)
 from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
 from service.cli.identify import identify
@@ -106,7 +117,7 @@ first.add(
     "lagid paper --only table1,figure15 --output table1.html",
 )
 data = _HelpPanel("Data and models")
-data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --limit 5 --json")
+data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --name tube --json")
 data.add_group("dataset", datasets.app)
 data.add_group("models", models.app)
 work = _HelpPanel("Jobs")
@@ -117,9 +128,15 @@ work.add(
     "lagid submit - --json < job.yaml",
 )
 work.add("watch", jobs.watch_job, "lagid watch job_1", "lagid watch job_1 --quiet --json")
-work.add("jobs", jobs.list_jobs, "lagid jobs", "lagid jobs --state running --state queued")
+work.add(
+    "jobs",
+    jobs.list_jobs,
+    "lagid jobs --state running",
+    "lagid jobs --tag night --since 2026-01-31",
+)
 work.add("cancel", jobs.cancel_job, "lagid cancel job_1")
 work.add("resume", jobs.resume_job, "lagid resume job_1")
+work.add_group("job", jobs.app)
 work.add_group("sweep", sweeps.app)
 work.add(
     "reidentify",
@@ -145,7 +162,14 @@ upkeep.add("dispatcher", server.run_dispatcher, "lagid dispatcher --cpus 8")
 upkeep.add_group("key", access.key_app)
 upkeep.add_group("project", access.project_app)
 upkeep.add("audit", access.list_audit_log, "lagid audit", "lagid audit --project tubes --json")
-upkeep.add_group("db", server.database_app)
+upkeep.add("backup", backup.write_backup, "lagid backup lagid.zip")
+upkeep.add(
+    "restore",
+    backup.restore_backup,
+    "lagid restore lagid.zip --data-dir restored",
+    "lagid restore lagid.zip --force",
+)
+upkeep.add_group("db", retention.app)
 upkeep.add("health", health.check_health, "lagid health web", "lagid health dispatcher")
 upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
 

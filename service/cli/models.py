@@ -15,6 +15,7 @@ from service.cli.common import (
     complete_model_name,
     connect_client,
     err,
+    fail_usage,
     fetch_listing,
     file_origins,
     name_file,
@@ -25,6 +26,14 @@ from service.cli.common import (
     read_object,
     report_faults,
     show_examples,
+)
+from service.cli.items import (
+    NamePart,
+    Since,
+    TagFilter,
+    Until,
+    add_item_commands,
+    read_filters,
 )
 from service.client.calls import DEFAULT_URL
 from service.core.documents import parse_yaml
@@ -53,17 +62,25 @@ def list_models(
         str | None,
         typer.Option("--url", envvar="LAGID_URL", help="Include the models of this server."),
     ] = None,
+    name: NamePart = None,
+    tag: TagFilter = None,
+    since: Since = None,
+    until: Until = None,
     key: Key = None,
     limit: Limit = None,
     as_json: AsJson = False,
 ) -> None:
-    """List built-in models; with --url also those of a server."""
+    """List built-in models; with --url also those of a server, whose tags and times are known."""
+    filters = read_filters(name=name, tag=tag, since=since, until=until)
     if url is None:
-        built_in = _list_builtin_models()
+        if tag or since or until:
+            fail_usage("--tag, --since and --until need --url: built-in models have none")
+        part = (name or "").lower()
+        built_in = [model for model in _list_builtin_models() if part in model["name"]]
         listing = Listing(built_in[: limit or None], len(built_in[limit:]) if limit else 0)
     else:
         with connect_client(url, key) as client:
-            listing = fetch_listing(client.models, limit, as_json)
+            listing = fetch_listing(lambda most: client.models(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -166,3 +183,6 @@ def _list_builtin_models() -> list[dict[str, Any]]:
     from service.models.catalogue import list_catalogue
 
     return [model.model_dump(mode="json") for model in list_catalogue()]
+
+
+add_item_commands(app, "lagid models", "model", "mine", has_name=False)

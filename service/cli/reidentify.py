@@ -44,6 +44,14 @@ from service.cli.common import (
     upload_origins,
     write_file,
 )
+from service.cli.items import (
+    NamePart,
+    Since,
+    TagFilter,
+    Until,
+    add_item_commands,
+    read_filters,
+)
 from service.cli.tables import print_reuse_note, print_trend
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
@@ -257,11 +265,19 @@ ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the 
 
 @app.command("list", epilog=show_examples("lagid references list"))
 def list_references(
-    url: Url = DEFAULT_URL, key: Key = None, limit: Limit = None, as_json: AsJson = False
+    name: NamePart = None,
+    tag: TagFilter = None,
+    since: Since = None,
+    until: Until = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    limit: Limit = None,
+    as_json: AsJson = False,
 ) -> None:
     """List the current references."""
+    filters = read_filters(name=name, tag=tag, since=since, until=until)
     with connect_client(url, key) as client:
-        listing = fetch_listing(client.references, limit, as_json)
+        listing = fetch_listing(lambda most: client.references(most, **filters), limit, as_json)
     print_listing(
         listing,
         as_json,
@@ -274,7 +290,9 @@ def list_references(
             format_labels(reference["labels"]),
             _format_estimates(reference["estimates"]),
         ),
-        empty="no references; accept one: lagid references accept NAME RUN",
+        empty="no such references"
+        if filters
+        else "no references; accept one: lagid references accept NAME RUN",
     )
 
 
@@ -329,3 +347,6 @@ def _format_estimates(estimates: Mapping[str, Any]) -> str:
     return ", ".join(
         f"{name} = {format_estimate(estimate)}" for name, estimate in estimates.items()
     )
+
+
+add_item_commands(app, "lagid references", "reference", "tube", has_name=True)

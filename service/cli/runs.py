@@ -34,6 +34,7 @@ from service.cli.common import (
     show_examples,
     write_file,
 )
+from service.cli.items import add_item_commands
 from service.cli.jobs import list_runs as listing
 from service.client.calls import DEFAULT_URL
 from sysid.core.text import format_p_value
@@ -341,3 +342,6 @@ def export_model(
     write_file(output, text)
     if not as_json:
         out.print(str(output), markup=False)
+
+
+add_item_commands(app, "lagid runs", "run", "run_1", has_name=False)

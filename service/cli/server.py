@@ -52,7 +52,7 @@ def serve(
     _prepare_data_folder(settings)
     _check_access(settings)
     with (
-        _lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
+        lock_data_folder(settings, with_dispatcher=with_dispatcher) as lock,
         open_listener(settings.host, settings.port) as listener,
     ):
         from service.dispatch.supervisor import supervise_dispatcher
@@ -84,7 +84,7 @@ def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     raise typer.Exit(run_process(settings))
 
 
-def _lock_data_folder(
+def lock_data_folder(
     settings: "Settings", *, with_dispatcher: bool
 ) -> "AbstractContextManager[FolderLock | None]":
     """Lock the data folder for a dispatcher. Web processes without one may share a folder."""
@@ -288,10 +288,10 @@ def downgrade_database(
     settings = load_settings(data_dir=data_dir)
     from service.storage import migrate
 
-    _require_database(settings)
+    require_database(settings)
     settings.prepare_data_folder()
     with (
-        _lock_data_folder(settings, with_dispatcher=True),
+        lock_data_folder(settings, with_dispatcher=True),
         open_database(settings) as database,
     ):
         undone = migrate.list_undone_migrations(database, revision)
@@ -313,7 +313,14 @@ def _print_revision(revision: str | None, as_json: bool) -> None:
         out.print(f"the database is at revision {revision}", markup=False)
 
 
-def _require_database(settings: "Settings") -> None:
+def require_database(settings: "Settings") -> None:
+    """Refuse to go on if the data folder has no database.
+
+    Raises
+    ------
+    Misconfigured
+        With what to do.
+    """
     if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
         raise Misconfigured(
             f"there is no database in {settings.data_dir.absolute()}. Create one with "
@@ -328,7 +335,7 @@ def check_database(data_dir: DataDir = None, fix: Fix = False, as_json: AsJson =
     from service.storage import garbage, migrate
     from service.storage.objects import open_store
 
-    _require_database(settings)
+    require_database(settings)
     with open_database(settings) as database:
         migrate.check_revision(database)
         store = open_store(settings.store_location)

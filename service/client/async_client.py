@@ -146,13 +146,15 @@ class AsyncClient:
         body = {"name": name, "steps": steps}
         return await self._fetch(calls.DERIVE(dataset, json=body))
 
-    async def datasets(self, limit: int | None = None) -> "Rows[documents.DatasetDocument]":
-        """List datasets, newest first: all, or at most `limit`."""
-        return await self._fetch_list(calls.DATASETS(), limit)
+    async def datasets(
+        self, limit: int | None = None, **filters: Any
+    ) -> "Rows[documents.DatasetDocument]":
+        """List datasets, newest first: all, or at most `limit`; `name`, `tag` … are filters."""
+        return await self._fetch_list(calls.DATASETS(**filters), limit)
 
-    def iterate_datasets(self) -> AsyncIterator["documents.DatasetDocument"]:
-        """Iterate over datasets, latest first, a page at a time."""
-        return self._iterate(calls.DATASETS())
+    def iterate_datasets(self, **filters: Any) -> AsyncIterator["documents.DatasetDocument"]:
+        """Iterate over the datasets that pass the filters, latest first, a page at a time."""
+        return self._iterate(calls.DATASETS(**filters))
 
     async def dataset(self, name: str) -> "documents.DatasetDocument":
         """Fetch one dataset by its id."""
@@ -178,6 +180,18 @@ class AsyncClient:
         """Draw the signals of a dataset, as Plotly JSON; `options` are those of the interface."""
         return await self._fetch(calls.DATASET_FIGURE(dataset, **options))
 
+    async def edit_dataset(
+        self, dataset: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> "documents.DatasetDocument":
+        """Change name, note or tags of a dataset; `if_match` is the ETag that was read."""
+        return await self._fetch(calls.build_edit(calls.EDIT_DATASET, dataset, changes, if_match))
+
+    async def delete_dataset(
+        self, dataset: str, *, cascade: bool = False
+    ) -> "documents.DeletedDocument":
+        """Delete a dataset; `cascade` adds what was made from it."""
+        return await self._fetch(calls.build_deletion(calls.DELETE_DATASET, dataset, cascade))
+
     # ---- access
     async def access(self) -> "documents.AccessDocument":
         """Fetch who asks: project and scopes, with the project's limits and use."""
@@ -192,13 +206,15 @@ class AsyncClient:
         return self._iterate(calls.AUDIT())
 
     # ---- models
-    async def models(self, limit: int | None = None) -> "Rows[documents.ModelDocument]":
+    async def models(
+        self, limit: int | None = None, **filters: Any
+    ) -> "Rows[documents.ModelDocument]":
         """List the built-in models and those of users: all, or at most `limit`."""
-        return await self._fetch_list(calls.MODELS(), limit)
+        return await self._fetch_list(calls.MODELS(**filters), limit)
 
-    def iterate_models(self) -> AsyncIterator["documents.ModelDocument"]:
-        """Iterate over the built-in models and those of users, a page at a time."""
-        return self._iterate(calls.MODELS())
+    def iterate_models(self, **filters: Any) -> AsyncIterator["documents.ModelDocument"]:
+        """Iterate over the models that pass the filters, a page at a time."""
+        return self._iterate(calls.MODELS(**filters))
 
     async def model(self, name: str) -> "documents.ModelDocument":
         """Fetch one model with its document."""
@@ -211,6 +227,18 @@ class AsyncClient:
     async def check_model(self, document: Mapping[str, Any]) -> "documents.CheckDocument":
         """Check a model document; every error has its column."""
         return await self._fetch(calls.CHECK_MODEL(json=document))
+
+    async def edit_model(
+        self, model: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> "documents.ModelDocument":
+        """Change note or tags of a model; `if_match` is the ETag that was read."""
+        return await self._fetch(calls.build_edit(calls.EDIT_MODEL, model, changes, if_match))
+
+    async def delete_model(
+        self, model: str, *, cascade: bool = False
+    ) -> "documents.DeletedDocument":
+        """Delete a model, all versions or ``name@version``; `cascade` adds what used it."""
+        return await self._fetch(calls.build_deletion(calls.DELETE_MODEL, model, cascade))
 
     # ---- jobs
     async def submit(
@@ -232,20 +260,30 @@ class AsyncClient:
         return await self._fetch(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
 
     async def jobs(
-        self, limit: int | None = None, state: Sequence[str] | None = None
+        self, limit: int | None = None, state: Sequence[str] | None = None, **filters: Any
     ) -> "Rows[documents.JobDocument]":
-        """List jobs, newest first: all, at most `limit`, or those in some states."""
-        return await self._fetch_list(calls.JOBS(state=state), limit)
+        """List jobs, newest first: all, at most `limit`, or those that filters select."""
+        return await self._fetch_list(calls.JOBS(state=state, **filters), limit)
 
     def iterate_jobs(
-        self, state: Sequence[str] | None = None
+        self, state: Sequence[str] | None = None, **filters: Any
     ) -> AsyncIterator["documents.JobDocument"]:
-        """Iterate over jobs, latest first: all, or those in some states, a page at a time."""
-        return self._iterate(calls.JOBS(state=state))
+        """Iterate over the jobs that pass the filters, latest first, a page at a time."""
+        return self._iterate(calls.JOBS(state=state, **filters))
 
     async def job(self, name: str) -> "documents.JobDocument":
         """Fetch one job with its state and progress."""
         return await self._fetch(calls.JOB(name))
+
+    async def edit_job(
+        self, job: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> "documents.JobDocument":
+        """Change name, note or tags of a job; `if_match` is the ETag that was read."""
+        return await self._fetch(calls.build_edit(calls.EDIT_JOB, job, changes, if_match))
+
+    async def delete_job(self, job: str, *, cascade: bool = False) -> "documents.DeletedDocument":
+        """Delete a job that has ended; `cascade` adds what was made from it."""
+        return await self._fetch(calls.build_deletion(calls.DELETE_JOB, job, cascade))
 
     async def cancel(self, job: str) -> "documents.JobDocument":
         """Cancel a job; its results so far stay."""
@@ -355,6 +393,16 @@ class AsyncClient:
         """Fetch the result of one run."""
         return await self._fetch(calls.RUN(name))
 
+    async def edit_run(
+        self, run: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> "documents.RunDocument":
+        """Change note or tags of a run; `if_match` is the ETag that was read."""
+        return await self._fetch(calls.build_edit(calls.EDIT_RUN, run, changes, if_match))
+
+    async def delete_run(self, run: str, *, cascade: bool = False) -> "documents.DeletedDocument":
+        """Delete a run of a job that has ended; `cascade` adds what was made from it."""
+        return await self._fetch(calls.build_deletion(calls.DELETE_RUN, run, cascade))
+
     async def history(self, run: str) -> "documents.HistoryDocument":
         """Fetch the improvements of each island's champion."""
         return await self._fetch(calls.HISTORY(run))
@@ -414,13 +462,15 @@ class AsyncClient:
         return await self._fetch(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
-    async def references(self, limit: int | None = None) -> "Rows[documents.ReferenceDocument]":
+    async def references(
+        self, limit: int | None = None, **filters: Any
+    ) -> "Rows[documents.ReferenceDocument]":
         """List the references in use, by name: all, or at most `limit`."""
-        return await self._fetch_list(calls.REFERENCES(), limit)
+        return await self._fetch_list(calls.REFERENCES(**filters), limit)
 
-    def iterate_references(self) -> AsyncIterator["documents.ReferenceDocument"]:
-        """Iterate over the references in use, by name, a page at a time."""
-        return self._iterate(calls.REFERENCES())
+    def iterate_references(self, **filters: Any) -> AsyncIterator["documents.ReferenceDocument"]:
+        """Iterate over the references that pass the filters, by name, a page at a time."""
+        return self._iterate(calls.REFERENCES(**filters))
 
     async def reference(self, name: str) -> "documents.ReferenceDocument":
         """Fetch one reference with its history."""
@@ -432,6 +482,20 @@ class AsyncClient:
         """Make a run the reference of a name; the previous one stays in the history."""
         body = {"run": run, "by": by, "note": note}
         return await self._fetch(calls.ACCEPT_REFERENCE(name, json=body))
+
+    async def edit_reference(
+        self, reference: str, changes: Mapping[str, Any], *, if_match: str | None = None
+    ) -> "documents.ReferenceDocument":
+        """Change name, note or tags of a reference; `if_match` is the ETag that was read."""
+        return await self._fetch(
+            calls.build_edit(calls.EDIT_REFERENCE, reference, changes, if_match)
+        )
+
+    async def delete_reference(
+        self, reference: str, *, cascade: bool = False
+    ) -> "documents.DeletedDocument":
+        """Delete a reference with its history; `cascade` adds what was made from it."""
+        return await self._fetch(calls.build_deletion(calls.DELETE_REFERENCE, reference, cascade))
 
 
 async def _read_blocks(path: Path) -> AsyncIterator[bytes]:

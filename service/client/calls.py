@@ -251,6 +251,29 @@ AUDIT: "Endpoint[documents.AuditEntryDocument]" = Endpoint("GET", "audit")
 REFERENCES: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references")
 REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("GET", "references/{}")
 ACCEPT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PUT", "references/{}")
+EDIT_DATASET: "Endpoint[documents.DatasetDocument]" = Endpoint("PATCH", "datasets/{}")
+DELETE_DATASET: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "datasets/{}")
+EDIT_MODEL: "Endpoint[documents.ModelDocument]" = Endpoint("PATCH", "models/{}")
+DELETE_MODEL: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "models/{}")
+EDIT_JOB: "Endpoint[documents.JobDocument]" = Endpoint("PATCH", "jobs/{}")
+DELETE_JOB: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "jobs/{}")
+EDIT_RUN: "Endpoint[documents.RunDocument]" = Endpoint("PATCH", "runs/{}")
+DELETE_RUN: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "runs/{}")
+EDIT_REFERENCE: "Endpoint[documents.ReferenceDocument]" = Endpoint("PATCH", "references/{}")
+DELETE_REFERENCE: "Endpoint[documents.DeletedDocument]" = Endpoint("DELETE", "references/{}")
+
+
+def build_edit(
+    endpoint: Endpoint[Answer], name: str, changes: Mapping[str, Any], if_match: str | None
+) -> RestCall[Answer]:
+    """Build a call that changes name, note or tags, by `if_match` only of that version."""
+    headers = {} if if_match is None else {"If-Match": if_match}
+    return replace(endpoint(name, json=changes), headers=headers)
+
+
+def build_deletion(endpoint: Endpoint[Answer], name: str, cascade: bool) -> RestCall[Answer]:
+    """Build a call that deletes an item, by `cascade` with everything that was made from it."""
+    return endpoint(name, cascade=True) if cascade else endpoint(name)
 
 
 def build_submission(

@@ -396,6 +396,10 @@ class DatasetDocument(TypedDict):
     """what was guessed or is doubtful"""
     details: dict[str, Any]
     """how it was made"""
+    note: NotRequired[str | None]
+    """note of a user"""
+    tags: NotRequired[list[str]]
+    """tags of users"""
     created_at: str
     """time of the upload, UTC"""
 
@@ -407,6 +411,13 @@ class DatasetPageDocument(TypedDict):
     """items of this page, in the order of the list"""
     next: NotRequired[str | None]
     """cursor of the following page; null on the last one"""
+
+
+class DeletedDocument(TypedDict):
+    """Everything that was deleted, the requested item first."""
+
+    deleted: list[ItemDocument]
+    """all items, the requested one first"""
 
 
 class DriftDocument(TypedDict):
@@ -688,6 +699,17 @@ class IslandDocument(TypedDict):
     """values of the free parameters, in their units"""
 
 
+class ItemDocument(TypedDict):
+    """A stored item: its kind, its identifier (of a reference its name), and its name."""
+
+    kind: Literal["job", "run", "dataset", "model", "reference"]
+    """kind of the item"""
+    id: str
+    """identifier; of a reference its name"""
+    name: str
+    """name of the item"""
+
+
 class JobInDocument(TypedDict):
     """Job: model, data, and how to identify."""
 
@@ -760,6 +782,16 @@ class JobDocument(TypedDict):
     """why the job failed; null if it did not"""
     model: str
     """name of the model"""
+    note: NotRequired[str | None]
+    """note of a user"""
+    tags: NotRequired[list[str]]
+    """tags of users"""
+    version: NotRequired[str | None]
+    """version of the program that computed the job, or took it"""
+    fingerprint: NotRequired[str | None]
+    """digest of the kernels' program: equal ones give results equal bit for bit"""
+    spec_hash: NotRequired[str | None]
+    """digest of the request"""
     priority: int
     """jobs of higher priority come first"""
     progress: ProgressDocument
@@ -859,6 +891,8 @@ class LineageDocument(TypedDict):
     """identifier of the dataset"""
     edges: list[LineageEdgeDocument]
     """all steps to it and from it"""
+    deleted: NotRequired[list[TombstoneDocument]]
+    """items that were deleted since"""
 
 
 class LossInDocument(TypedDict):
@@ -978,6 +1012,10 @@ class ModelDocument(TypedDict):
     """unit of each output"""
     parameters: dict[str, ModelParameterDocument]
     """parameters by name"""
+    note: NotRequired[str | None]
+    """note of a user"""
+    tags: NotRequired[list[str]]
+    """tags of users"""
     document: NotRequired[ModelDocumentDocument | None]
     """document of the model; null in lists"""
 
@@ -1266,6 +1304,8 @@ class ReferenceDocument(TypedDict):
     """why it was accepted"""
     at: str
     """time of the acceptance, UTC"""
+    tags: NotRequired[list[str]]
+    """tags of users"""
     labels: NotRequired[dict[str, float | int | str | bool | None]]
     """labels of the run"""
     estimates: NotRequired[dict[str, ReferenceValueDocument]]
@@ -1383,6 +1423,18 @@ class RunDocument(TypedDict):
     """why the run failed; null if it did not"""
     reused_from: NotRequired[str | None]
     """the earlier run with the same specification"""
+    seed: NotRequired[int | None]
+    """seed of the search"""
+    spec_hash: NotRequired[str | None]
+    """digest of all that the result depends on"""
+    version: NotRequired[str | None]
+    """version of the program that computed the result"""
+    fingerprint: NotRequired[str | None]
+    """digest of the kernels' program: equal ones give results equal bit for bit"""
+    note: NotRequired[str | None]
+    """note of a user"""
+    tags: NotRequired[list[str]]
+    """tags of users"""
     created_at: str
     """time when the run was made, UTC"""
     started_at: NotRequired[str | None]
@@ -1675,6 +1727,17 @@ class SweepInDocument(TypedDict):
 
     axes: NotRequired[list[SweepAxisInDocument]]
     """axes, which are crossed"""
+
+
+class TombstoneDocument(TypedDict):
+    """What is left of a deleted item."""
+
+    id: str
+    """identifier of the item"""
+    name: str
+    """name that it had"""
+    deleted_at: str | None
+    """time of its deletion, UTC"""
 
 
 class TrendInDocument(TypedDict):

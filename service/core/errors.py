@@ -89,6 +89,11 @@ class ServiceError(Exception):
         """Headers that the response carries in addition to the document."""
         return {}
 
+    @property
+    def members(self) -> Mapping[str, Any]:
+        """Members that the problem document has in addition."""
+        return {}
+
 
 class ForeignOrigin(ServiceError):
     """A page of another origin sent a request that changes something."""

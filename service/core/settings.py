@@ -108,6 +108,9 @@ class Settings(BaseSettings):
     machine."""
     project_cores: int | None = Field(default=None, ge=1)
     """Cores that one project may use of a dispatcher. Without it: all."""
+    keep_days: float | None = Field(default=None, gt=0, le=36_500)
+    """Ended jobs are deleted after this number of days, unless their project says otherwise
+    (`lagid db keep`). Without it: they are kept."""
     keep_signals: bool = False
     """Whether sweeps store fitted signals, unless a job says otherwise (`keep_signals`). Else they
     are computed again when they are asked for."""

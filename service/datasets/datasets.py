@@ -25,6 +25,7 @@ from service.datasets.schemas import (
     LineageOut,
     SeriesOut,
     SignalsOut,
+    TombstoneOut,
 )
 from service.formats.file_kinds import SUFFIXES, detect_kind
 from service.formats.mcap import write_recording
@@ -34,8 +35,10 @@ from service.repositories.lineage import (
     LineageRepository,
     Relation,
     find_datasets_by_name,
+    find_tombstones,
     list_dataset_names,
 )
+from service.repositories.search import NO_FILTER, ListFilter
 from service.storage.errors import RowNotFound
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
@@ -51,7 +54,14 @@ def read_lineage(session: Session, dataset_id: str) -> LineageOut:
     row = DatasetRepository(session).get(dataset_id)
     repository = LineageRepository(session)
     edges = {*repository.list_ancestors(row.id), *repository.list_descendants(row.id)}
-    return LineageOut(id=row.id, edges=[LineageEdgeOut.from_source(edge) for edge in sorted(edges)])
+    identities = {name for edge in edges for name in (edge.child, edge.parent)}
+    return LineageOut(
+        id=row.id,
+        edges=[LineageEdgeOut.from_source(edge) for edge in sorted(edges)],
+        deleted=[
+            TombstoneOut.from_source(one) for one in find_tombstones(session, sorted(identities))
+        ],
+    )
 
 
 def resolve_dataset(session: Session, reference: str) -> Dataset | str:
@@ -172,7 +182,9 @@ def add_recording(
     relation: Relation = "derived",
 ) -> StoredDataset:
     """Store a recording: first its object, then the row that refers to it."""
-    metadata = {"source": key, "parents": " ".join(parents), "name": name}
+    # The source of an upload is its file; that of others follows from parents and request.
+    file = (details.get("source") or {}).get("sha256", "") if kind == "upload" else ""
+    metadata = {"source": file, "source_key": key, "parents": " ".join(parents), "name": name}
     content = _store_file(store, recording, metadata)
     new = describe_recording(
         recording, name=name, kind=kind, key=key, details=details, content=content
@@ -223,6 +235,7 @@ def to_out(row: Dataset) -> DatasetOut:
         segments=details.pop("segments"),
         started_at=details.pop("started_at", None),
         warnings=details.pop("warnings"),
+        tags=row.tags or [],
         details=details,
     )
 
@@ -245,9 +258,11 @@ def _measure_history(recording: Recording) -> float:
     )
 
 
-def list_datasets(session: Session, cursor: str | None, limit: int) -> DatasetPage:
-    """List datasets, latest first."""
-    page = DatasetRepository(session).list_page(cursor=cursor, limit=limit)
+def list_datasets(
+    session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
+) -> DatasetPage:
+    """List the datasets that meet a filter, latest first."""
+    page = DatasetRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
     return DatasetPage(items=[to_out(row) for row in page.items], next=page.next)
 
 

@@ -194,6 +194,8 @@ class DatasetOut(Answer):
     )
     warnings: list[str] = Field(description="what was guessed or is doubtful")
     details: Annotated[Any, DescribedBy(DatasetDetailsOut)] = Field(description="how it was made")
+    note: str | None = Field(default=None, description="note of a user")
+    tags: list[str] = Field(default=[], description="tags of users")
     created_at: datetime = Field(description="time of the upload, UTC")
 
 
@@ -232,11 +234,23 @@ class LineageEdgeOut(Answer):
     relation: str = Field(description="how it was made")
 
 
+class TombstoneOut(Answer):
+    """What is left of a deleted item."""
+
+    id: str = Field(description="identifier of the item")
+    name: str = Field(description="name that it had")
+    deleted_at: datetime | None = Field(description="time of its deletion, UTC")
+
+
 class LineageOut(Answer):
-    """Everything that a dataset was made from, and everything made from it."""
+    """Everything that a dataset was made from, and everything made from it.
+
+    `deleted` lists the items of the edges that were deleted since.
+    """
 
     id: str = Field(description="identifier of the dataset")
     edges: list[LineageEdgeOut] = Field(description="all steps to it and from it")
+    deleted: list[TombstoneOut] = Field(default=[], description="items that were deleted since")
 
 
 MAX_SERIES_SAMPLES = 1_000_000

@@ -7,7 +7,10 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from service.core.documents import to_finite
@@ -25,6 +28,8 @@ from service.queue.packed_results import (
 )
 from service.repositories.history import pack_history, pack_migrants
 from service.runs.result import to_result_document
+from sysid.identification.fingerprint import compute_fingerprint
+from workers import protocol
 from workers.protocol import CompleteRun, Records
 from workers.tasks import prepare_run_records
 
@@ -97,8 +102,15 @@ def write_signals(run: CompleteRun, records: Mapping[str, Records]) -> bytes:
         validated = identification.simulated_validation
         fits += list_fitted_outputs("validation", data.validation, validated)
     target = io.BytesIO()
-    write_fitted_outputs(run.run, fits, target)
+    write_fitted_outputs(fits, target)
     return target.getvalue()
+
+
+@cache
+def describe_program() -> dict[str, str]:
+    """Describe the program of this process, which computes: its version and its fingerprint."""
+    folder = Path(protocol.__file__).parent  # workers split records and add noise
+    return {"version": version("lagid"), "fingerprint": compute_fingerprint(folder)}
 
 
 def _locate_files(files: Sequence[bytes]) -> list[_SignalsPlace]:
@@ -116,7 +128,11 @@ def _locate_files(files: Sequence[bytes]) -> list[_SignalsPlace]:
 def _build_row(run: CompleteRun, place: _SignalsPlace) -> Row:
     """Build the row of a run that succeeded, in the order of `RESULT_ROWS`."""
     found, noise_free = run.concluded.identification, to_finite(run.concluded.rms_noise_free)
-    result = {**to_result_document(found, run.seconds), "rms_noise_free": noise_free}
+    result = {
+        **to_result_document(found, run.seconds),
+        "rms_noise_free": noise_free,
+        **describe_program(),
+    }
     return (
         run.run,
         run.spec.reuse_key,

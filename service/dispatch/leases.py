@@ -13,6 +13,7 @@ from functools import partial
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.core.processes import describe_process
+from service.dispatch.encoding import describe_program
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
 from service.queue.dispatchers import (
@@ -21,7 +22,7 @@ from service.queue.dispatchers import (
     DispatcherRepository,
     count_wanted_cores,
 )
-from service.queue.leases import Claim, Lease, LeaseQueue, SizeRule
+from service.queue.leases import Claim, Lease, LeaseQueue, ProgramOfJob, SizeRule
 from service.queue.notifications import QueueStatus, read_queue_status
 from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import Document
@@ -123,6 +124,7 @@ class HeldLeases:
                     held=self._list_held_jobs(),
                     only=only,
                     choose_size=choose_size,
+                    program=ProgramOfJob(**describe_program()),
                 )
         self._has_asked = False
         if claim is not None:

@@ -226,6 +226,7 @@ class WarmStarts:
         query = select(Run.number, Run.estimates).where(
             Run.job_id == self._job.id,
             Run.state == JobState.SUCCEEDED,
+            Run.deleted_at.is_(None),
             Run.number >= before.start,
             Run.number < before.stop,
             (Run.number - before.start) % before.step == 0,

@@ -9,6 +9,8 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import groupby
 from pathlib import Path
 from typing import BinaryIO, Literal, Protocol, cast
 
@@ -53,6 +55,9 @@ McapTarget = str | os.PathLike[str] | ByteSink
 
 
 FitRole = Literal["estimation", "validation"]
+
+RUN_RECORD = "lagid.run"
+"""Name of the metadata record of a run's file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,18 +122,52 @@ def write_recording(
     _write_file(target, (*topics, *history), manifest)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedInput:
+    """One input of one experiment, as `FittedOutput`."""
+
+    role: FitRole
+    number: int
+    channel: Channel
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment, such as ``estimation 2``."""
+        return f"{self.role} {self.number}"
+
+
+def list_fitted_inputs(role: FitRole, records: Sequence[Record]) -> list[FittedInput]:
+    """List the inputs of records."""
+    return [
+        FittedInput(role, number, channel)
+        for number, record in enumerate(records, 1)
+        for channel in record.inputs
+    ]
+
+
 def write_fitted_outputs(
-    run: str,
     fits: Sequence[FittedOutput],
     target: McapTarget,
     *,
-    metadata: Mapping[str, str] | None = None,
+    inputs: Sequence[FittedInput] = (),
+    run: Mapping[str, str] | None = None,
+    started_at: datetime | None = None,
 ) -> None:
     """Write the fitted signals of a run as an MCAP file.
 
-    Topic ``/fit/<run>`` has three fields per output: ``<output>`` (simulated),
-    ``<output>_measured`` and ``<output>_residual``. Further experiments, and outputs with other
-    times, have topics below it.
+    Topic ``/fit`` has three fields per output: ``<output>`` (simulated), ``<output>_measured`` and
+    ``<output>_residual``. Topic ``/inputs`` has a field per input. Further experiments, and signals
+    with other times, have topics below them. The topics are those of every run, so that the layout
+    of a viewer serves for the next one.
+
+    Parameters
+    ----------
+    inputs : sequence of FittedInput
+        Inputs of the same experiments.
+    run : mapping of str to str
+        Content of the metadata record ``lagid.run``: identifiers, model, parameters, origin.
+    started_at : datetime, optional
+        Time 0 s on the clock that recorded.
     """
     groups: list[list[FittedOutput]] = []
     for fit in fits:
@@ -143,10 +182,34 @@ def write_fitted_outputs(
         names = [
             f"{fit.name}{suffix}" for fit in group for suffix in ("", "_measured", "_residual")
         ]
-        path = f"/fit/{run}" if number == 0 else f"/fit/{run}/{number + 1}"
+        path = "/fit" if number == 0 else f"/fit/{number + 1}"
         topics.append(make_topic(path, channels, names))
-    recording = Recording(tuple(channel for topic in topics for channel in topic.channels))
-    _write_file(target, topics, build_manifest(recording, topics, metadata or {}))
+    topics += _build_input_topics(inputs)
+    recording = Recording(
+        tuple(channel for topic in topics for channel in topic.channels), started_at=started_at
+    )
+    _write_file(target, topics, build_manifest(recording, topics, {}), run)
+
+
+def _build_input_topics(inputs: Sequence[FittedInput]) -> list[Topic]:
+    """Build the topics of inputs, each of one experiment and of equal times."""
+    topics: list[Topic] = []
+    for name, group in groupby(inputs, key=lambda one: one.experiment):
+        channels = tuple(
+            Channel(
+                f"{name}/{one.channel.name}/input",
+                one.channel.times,
+                one.channel.values,
+                one.channel.unit,
+                one.channel.hold,
+            )
+            for one in group
+        )
+        for topic in group_into_topics(Recording(channels)):
+            path = "/inputs" if not topics else f"/inputs/{len(topics) + 1}"
+            fields = [channel.name.split("/", 2)[1] for channel in topic.channels]
+            topics.append(make_topic(path, topic.channels, fields))
+    return topics
 
 
 def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
@@ -162,13 +225,28 @@ def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
     )
 
 
-def _write_file(target: McapTarget, topics: Sequence[Topic], manifest: Mapping[str, str]) -> None:
+def read_run_metadata(
+    source: "McapSource", limits: UploadLimits = DEFAULT_LIMITS
+) -> dict[str, str]:
+    """Read the record ``lagid.run`` of a run's file; empty if there is none."""
+    with _open_binary(source) as (binary, size):
+        return dict(read_content(binary, size, limits).metadata.get(RUN_RECORD, {}))
+
+
+def _write_file(
+    target: McapTarget,
+    topics: Sequence[Topic],
+    manifest: Mapping[str, str],
+    run: Mapping[str, str] | None = None,
+) -> None:
     if isinstance(target, str | os.PathLike):
         with Path(target).open("wb") as stream:
-            _write_file(stream, topics, manifest)
+            _write_file(stream, topics, manifest, run)
         return
     file = McapWriter(target.write)
     file.add_metadata(DATASET_RECORD, manifest)
+    if run is not None:
+        file.add_metadata(RUN_RECORD, run)
     numbers = [file.add_topic(topic.path, topic.all_fields) for topic in topics]
     for number, topic in zip(numbers, topics, strict=True):
         file.add_samples(number, topic.log_times, topic.columns)

@@ -4,22 +4,17 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
 from service.core.states import JobState
-from service.jobs.schemas import (
-    REFERENCE_PREFIX,
-    RUN_PREFIX,
-    ReferenceIn,
-    ReferenceOut,
-    ReferencePage,
-)
+from service.items.reference_names import REFERENCE_PREFIX, check_reference_name, find_name_fault
+from service.jobs.schemas import ReferenceIn, ReferenceOut, ReferencePage
 from service.jobs.stored_run import load_run
 from service.models.models import have_same_equations
+from service.repositories.jobs import JobRepository
 from service.repositories.references import CurrentReference, ReferenceRepository
 from service.repositories.runs import RunRepository
+from service.repositories.search import NO_FILTER, ListFilter
 from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.tables import AcceptedReference, Run
 from sysid.core.errors import suggest_name
-
-MAX_NAME_CHARACTERS = 100
 
 
 def accept_reference(session: Session, name: str, body: ReferenceIn) -> ReferenceOut:
@@ -30,8 +25,10 @@ def accept_reference(session: Session, name: str, body: ReferenceIn) -> Referenc
     InvalidRequest
         If the name is invalid or stands for another model, or if there is no such successful run.
     """
-    _check_name(name)
+    check_reference_name(name, "{name}")
     run = _get_succeeded_run(session, body.run, "/run")
+    JobRepository(session).share_lock(run.job_id)
+    run = _get_succeeded_run(session, body.run, "/run")  # it is not deleted from now on
     _check_model(session, name, run)
     ReferenceRepository(session).accept_run(name, run.id, body.by, body.note)
     return get_reference(session, name)
@@ -50,11 +47,13 @@ def get_reference(session: Session, name: str) -> ReferenceOut:
     )
 
 
-def list_references(session: Session, cursor: str | None, limit: int) -> ReferencePage:
-    """List the references in use, by name; a cursor is the last name of the previous page."""
-    if cursor is not None and _find_name_fault(cursor) is not None:
+def list_references(
+    session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
+) -> ReferencePage:
+    """List the references in use that meet a filter, by name."""
+    if cursor is not None and find_name_fault(cursor) is not None:
         raise InvalidCursor(cursor)
-    page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit)
+    page = ReferenceRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
     return ReferencePage(
         items=[_to_reference_out(reference, []) for reference in page.items], next=page.next
     )
@@ -80,28 +79,6 @@ def resolve_reference(session: Session, reference: str, pointer: str = "/warm_st
             "under this name first",
         ) from None
     return _get_succeeded_run(session, latest.run_id, pointer)
-
-
-def _check_name(name: str) -> None:
-    """Refuse names that look like a run's id or like parts of a path."""
-    requirement = _find_name_fault(name)
-    if requirement is not None:
-        raise InvalidRequest.from_fault(
-            "{name}", f"the name in the path is {name!r:.120}; need {requirement}"
-        )
-
-
-def _find_name_fault(name: str) -> str | None:
-    """Return what a name of a reference must be, if this one is not; else None."""
-    if not 1 <= len(name) <= MAX_NAME_CHARACTERS or not name.isprintable() or name != name.strip():
-        return f"1 to {MAX_NAME_CHARACTERS} printable characters without outer blanks"
-    if name.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
-        return (
-            f"one that does not begin with {RUN_PREFIX!r} (as run ids do) or {REFERENCE_PREFIX!r}"
-        )
-    if "/" in name or not name.strip("."):
-        return "one without '/', and not of dots only"
-    return None
 
 
 def _check_model(session: Session, name: str, run: Run) -> None:
@@ -146,6 +123,7 @@ def _to_reference_out(current: CurrentReference, before: list[AcceptedReference]
             **latest,
             "name": current.accepted.name,
             "job": current.job_id,
+            "tags": current.accepted.tags or [],
             "labels": current.labels,
             "estimates": current.estimates or {},
             "history": earlier,

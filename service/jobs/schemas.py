@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from service.core.states import StateName
 from service.core.wire import Answer, Body, DescribedBy, Labels, NoiseIn, Page, Pointer, Seed
+from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from sysid.core.settings import (
     MAX_BITS,
     MAX_EVALUATIONS,
@@ -276,7 +277,7 @@ class SweepIn(Body):
     )
 
 
-PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX = "previous", "reference:", "run_"
+PREVIOUS = "previous"
 
 
 def _check_warm_start(value: str) -> str:
@@ -473,6 +474,16 @@ class JobOut(Answer):
     attempt: int = Field(description="number of starts, resumptions included")
     error: str | None = Field(default=None, description="why the job failed; null if it did not")
     model: str = Field(description="name of the model")
+    note: str | None = Field(default=None, description="note of a user")
+    tags: list[str] = Field(default=[], description="tags of users")
+    version: str | None = Field(
+        default=None, description="version of the program that computed the job, or took it"
+    )
+    fingerprint: str | None = Field(
+        default=None,
+        description="digest of the kernels' program: equal ones give results equal bit for bit",
+    )
+    spec_hash: str | None = Field(default=None, description="digest of the request")
     priority: int = Field(description="jobs of higher priority come first")
     progress: ProgressOut = Field(description="progress of its runs")
     rms_unit: str | None = Field(
@@ -520,6 +531,7 @@ class ReferenceOut(Answer):
     by: str | None = Field(default=None, description="who accepted it")
     note: str | None = Field(default=None, description="why it was accepted")
     at: datetime = Field(description="time of the acceptance, UTC")
+    tags: list[str] = Field(default=[], description="tags of users")
     labels: Labels = Field(default={}, description="labels of the run")
     estimates: dict[str, ReferenceValueOut] = Field(
         default={}, description="estimates by parameter, each in the parameter's unit"

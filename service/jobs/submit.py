@@ -2,9 +2,10 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
@@ -16,6 +17,12 @@ from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
+from service.jobs.job_links import (
+    find_model_name,
+    list_used_datasets,
+    list_used_runs,
+    store_job_links,
+)
 from service.jobs.schemas import JobIn, JobOut, JobPage, ProgressOut
 from service.jobs.stored_cells import (
     CELLS_AT_SUBMISSION,
@@ -26,10 +33,13 @@ from service.jobs.stored_cells import (
 from service.jobs.sweep_checks import find_job_faults
 from service.queue.admission import count_unfinished
 from service.queue.run_writes import NewRun, insert_runs
+from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository, NewJob, Submission
-from service.repositories.lineage import LineageRepository
 from service.repositories.projects import ProjectRepository, check_daily_evaluations
+from service.repositories.runs import RunRepository
+from service.repositories.search import NO_FILTER, ListFilter
 from service.storage.columns import utc_now
+from service.storage.errors import RowNotFound
 from service.storage.sessions import Database
 from service.storage.tables import Dataset, Job
 
@@ -93,6 +103,8 @@ def check_job(
         n_runs=n_runs,
         priority=body.priority,
         max_attempts=settings.max_attempts,
+        version=version("lagid"),
+        spec_hash=digest,
     )
     first = islice(build_stored_cells(spec, read_axis_groups(spec)), CELLS_AT_SUBMISSION)
     return CheckedJob(new, digest, tuple(first))
@@ -112,14 +124,29 @@ def store_job(
     """
     submission = JobRepository(session).submit(checked.job, key=key, request_hash=checked.digest)
     if submission.is_new:
-        spec = checked.job.spec
         check_limits(session, submission.job, settings)
+        _lock_used(session, checked.job.spec)
         insert_runs(session, submission.job, checked.cells)
-        lineage = LineageRepository(session)
-        lineage.add_links(submission.job.id, spec["datasets"], "estimation")
-        validation = (spec["validation"] or {}).get("datasets") or []
-        lineage.add_links(submission.job.id, validation, "validation")
+        store_job_links(session, submission.job)
     return submission
+
+
+def _lock_used(session: Session, spec: Mapping[str, Any]) -> None:
+    """Keep what a job uses from being deleted before the job is stored.
+
+    Raises
+    ------
+    InvalidRequest
+        If something was deleted since the job was checked.
+    """
+    try:
+        DatasetRepository(session).lock_used(list_used_datasets(spec))
+        runs = RunRepository(session)
+        for run in list_used_runs(spec):
+            JobRepository(session).share_lock(runs.get(run).job_id)
+            runs.get(run)
+    except RowNotFound as error:
+        raise InvalidRequest.from_fault("", f"{error} any more; it was just deleted") from None
 
 
 def check_limits(session: Session, job: Job, settings: Settings) -> None:
@@ -179,10 +206,10 @@ def to_job_out(
     now: datetime | None = None,
 ) -> JobOut:
     """Build the answer for a job, as of `now` (by default the present time)."""
-    model = job.spec["model"]
     return JobOut.from_source(
         job,
-        model=model["name"] if isinstance(model, Mapping) else model,
+        tags=job.tags or [],
+        model=find_model_name(job.spec),
         progress=ProgressOut.from_source(
             job,
             runs=job.n_runs,
@@ -203,9 +230,17 @@ def measure_seconds(job: Job, now: datetime) -> float | None:
     return max(((job.finished_at or now) - job.started_at).total_seconds(), 0.0)
 
 
-def list_jobs(session: Session, cursor: str | None, limit: int, states: list[JobState]) -> JobPage:
-    """List jobs, latest first."""
-    page = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
+def list_jobs(
+    session: Session,
+    cursor: str | None,
+    limit: int,
+    states: Sequence[JobState] = (),
+    chosen: ListFilter = NO_FILTER,
+) -> JobPage:
+    """List the jobs that meet a filter, latest first."""
+    page = JobRepository(session).list_page(
+        cursor=cursor, limit=limit, states=states, chosen=chosen
+    )
     items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in page.items]
     return JobPage(items=items, next=page.next)
 

@@ -49,5 +49,7 @@ def to_model_out(model: Model, version: int, document: Mapping[str, Any] | None)
         inputs={quantity.name: quantity.unit for quantity in model.inputs},
         outputs={output.name: output.unit for output in model.outputs},
         parameters={p.name: {name: getattr(p, name) for name in fields} for p in model.parameters},
+        note=None,
+        tags=[],
         document=document,
     )

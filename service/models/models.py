@@ -14,6 +14,7 @@ from service.core.errors import InvalidRequest, NotFound
 from service.models.catalogue import list_catalogue, to_builtin_out, to_model_out
 from service.models.schemas import ModelOut, ModelPage
 from service.repositories.models import ModelRepository
+from service.repositories.search import NO_FILTER, ListFilter
 from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
 from sysid.core.errors import UnknownModel, suggest_name
@@ -22,10 +23,17 @@ from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
 
 
-def list_models(session: Session, cursor: str | None, limit: int) -> ModelPage:
-    """List the built-in models (first page), then all versions of user models, latest first."""
-    stored = ModelRepository(session).list_page(cursor=cursor, limit=limit)
-    built_in = [] if cursor else list_catalogue()
+def list_models(
+    session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
+) -> ModelPage:
+    """List the built-in models (first page), then all versions of user models, latest first.
+
+    Built-in models have names only: a filter of tags or times excludes them.
+    """
+    stored = ModelRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
+    part = (chosen.name or "").lower()
+    is_first = not (cursor or chosen.terms or chosen.since or chosen.until)
+    built_in = [model for model in list_catalogue() if part in model.name] if is_first else []
     return ModelPage(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
 
 
@@ -122,7 +130,8 @@ def _list_names(session: Session) -> set[str]:
 
 def _to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
     document = row.document if with_document else None
-    return to_model_out(parse_model(row.document), row.version, document)
+    answer = to_model_out(parse_model(row.document), row.version, document)
+    return answer.model_copy(update={"note": row.note, "tags": row.tags or []})
 
 
 _IRRELEVANT_KEYS = ("name", "title", "description", "source", "parameters", "initial", "solver")

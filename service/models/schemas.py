@@ -39,6 +39,8 @@ class ModelOut(Answer):
     inputs: dict[str, str] = Field(description="unit of each input")
     outputs: dict[str, str] = Field(description="unit of each output")
     parameters: dict[str, ModelParameterOut] = Field(description="parameters by name")
+    note: str | None = Field(default=None, description="note of a user")
+    tags: list[str] = Field(default=[], description="tags of users")
     document: Annotated[Any, DescribedBy(ModelDocumentOut | None)] = Field(
         default=None, description="document of the model; null in lists"
     )

@@ -14,6 +14,7 @@ from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.formats.file_kinds import SUFFIXES
+from service.items.items import compute_etag
 from service.jobs.stored_run import StoredRun
 from service.models import models
 from service.models.schemas import ModelOut
@@ -37,9 +38,10 @@ from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageRepository
+from service.repositories.lineage import LineageRepository, find_tombstones
 from service.repositories.references import ReferenceRepository
 from service.repositories.runs import RunRepository
+from service.repositories.search import NO_FILTER, ListFilter
 from service.runs.comparison import compare_runs
 from service.runs.runs import parse_filters
 from service.storage.tables import Dataset, Job, Run
@@ -68,22 +70,56 @@ def reference_page(document: Mapping[str, Any]) -> str:
     )
 
 
-def jobs_page(session: Session, state: JobState | None, cursor: str | None) -> str:
-    """Render the list of jobs and the form of a new identification."""
+DATASET_FILTER_FIELDS = (
+    ("name", "Name", "part of it"),
+    ("tag", "Tag", ""),
+    ("label", "Label", "length_m=5"),
+    ("since", "Since", ""),
+    ("until", "Until", ""),
+)
+JOB_FILTER_FIELDS = (
+    DATASET_FILTER_FIELDS[0],
+    ("model", "Model", ""),
+    ("recording", "Recording", "id or name"),
+    *DATASET_FILTER_FIELDS[1:],
+)
+"""Fields of the filter of a list: name, label and hint."""
+
+
+def jobs_page(
+    session: Session,
+    state: JobState | None,
+    cursor: str | None,
+    chosen: ListFilter = NO_FILTER,
+    form: Mapping[str, str] | None = None,
+) -> str:
+    """Render the list of jobs and the form of a new identification.
+
+    Parameters
+    ----------
+    form : mapping of str to str, optional
+        The filter as the user typed it.
+    """
     states = [state] if state else []
-    page = JobRepository(session).list_page(cursor=cursor, limit=JOBS_PER_PAGE, states=states)
+    page = JobRepository(session).list_page(
+        cursor=cursor, limit=JOBS_PER_PAGE, states=states, chosen=chosen
+    )
     now = datetime.now(UTC)
     jobs = [to_job_view(job, find_rms_unit(session, job.spec), now) for job in page.items]
-    chosen = {"state": state.value} if state else {}
+    typed = dict(form or {})
+    query = {**typed, "state": state.value} if state else typed
     return render_template(
         "jobs.html",
         jobs=jobs,
         state=state.value if state else "",
-        states=[state_name.value for state_name in JobState],
+        states=[(one.value, _encode_query({**typed, "state": one.value})) for one in JobState],
+        query_without_state=_encode_query(typed),
+        form=typed,
+        filter_fields=JOB_FILTER_FIELDS,
         any_open=any(job.is_open for job in jobs),
         cursor=cursor,
-        filter_query=_encode_query(chosen),
-        next=_encode_query({**chosen, "cursor": page.next}) if page.next else "",
+        filter_query=_encode_query(query),
+        next=_encode_query({**query, "cursor": page.next}) if page.next else "",
         choices=list_choices(),
         defaults=DEFAULTS,
         recording_suffixes=",".join(SUFFIXES),
@@ -117,6 +153,7 @@ def job_page(
     return render_template(
         "job.html",
         job=view,
+        etag=compute_etag(job),
         obstacle=_describe_obstacle(session, job),
         runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in page.items],
         run=load_full_run(session, stored) if stored else None,
@@ -174,11 +211,24 @@ def run_page(session: Session, run_id: str, base_url: str) -> str:
     return job_page(session, run.job_id, base_url, run.id)
 
 
-def datasets_page(session: Session, cursor: str | None) -> str:
-    """Render the list of stored recordings, newest first."""
-    page = DatasetRepository(session).list_page(cursor=cursor, limit=JOBS_PER_PAGE)
-    following = _encode_query({"cursor": page.next}) if page.next else ""
-    return render_template("datasets.html", datasets=page.items, cursor=cursor, next=following)
+def datasets_page(
+    session: Session,
+    cursor: str | None,
+    chosen: ListFilter = NO_FILTER,
+    form: Mapping[str, str] | None = None,
+) -> str:
+    """Render the list of stored recordings, newest first; `form` is the filter as typed."""
+    page = DatasetRepository(session).list_page(cursor=cursor, limit=JOBS_PER_PAGE, chosen=chosen)
+    typed = dict(form or {})
+    return render_template(
+        "datasets.html",
+        datasets=page.items,
+        cursor=cursor,
+        form=typed,
+        filter_fields=DATASET_FILTER_FIELDS,
+        filter_query=_encode_query(typed),
+        next=_encode_query({**typed, "cursor": page.next}) if page.next else "",
+    )
 
 
 def dataset_page(session: Session, dataset_id: str) -> str:
@@ -195,13 +245,21 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         for edge in lineage.list_descendants(dataset.id)
         if edge.parent == dataset.id
     ]
+    deleted = {one.id: one.name for one in find_tombstones(session, [name for _, name, _ in edges])}
     return render_template(
         "dataset.html",
         dataset=dataset,
+        etag=compute_etag(dataset),
         height=signals.signals_height(dataset.n_channels),
         has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=[
-            {"direction": direction, "id": name, "relation": relation, "href": _object_href(name)}
+            {
+                "direction": direction,
+                "id": name,
+                "relation": relation,
+                "href": _object_href(name),
+                "deleted": deleted.get(name),
+            }
             for direction, name, relation in edges
         ],
     )

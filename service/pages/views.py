@@ -10,6 +10,7 @@ from service.core.job_fields import DATASETS_PATH
 from service.core.states import OPEN_STATES, JobState, StateName
 from service.core.text import format_count, format_value
 from service.core.wire import Answer
+from service.items.items import compute_etag
 from service.jobs.schemas import JobOut
 from service.jobs.submit import to_job_out
 from service.pages.diagnostics import Diagnostics, to_diagnostics
@@ -44,6 +45,9 @@ class RunView(Answer):
     error: str | None
     estimates: Sequence[EstimateView]
     warnings: Sequence[str]
+    note: str | None
+    tags: Sequence[str]
+    etag: str
     has_signals: bool
     heights: Mapping[str, int]
     diagnostics: Diagnostics
@@ -145,6 +149,8 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         unit=unit,
         estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
         warnings=result.get("warnings", ()),
+        tags=run.tags or (),
+        etag=compute_etag(run),
         has_signals=run.state is JobState.SUCCEEDED,
         heights=heights,
         diagnostics=to_diagnostics(result),

@@ -105,6 +105,13 @@ class Claim:
     is_new: bool = False
 
 
+class ProgramOfJob(NamedTuple):
+    """Version and fingerprint of a program that computes runs."""
+
+    version: str
+    fingerprint: str
+
+
 class LockedParcel(NamedTuple):
     """A parcel that is locked until the transaction ends, and its job, which is not."""
 
@@ -165,6 +172,7 @@ class LeaseQueue:
         held: Collection[str] = (),
         only: str | None = None,
         choose_size: SizeRule | None = None,
+        program: ProgramOfJob | None = None,
     ) -> Claim | None:
         """Claim a parcel of the first job that `admission` accepts; None if none waits.
 
@@ -179,6 +187,8 @@ class LeaseQueue:
             The only job that counts.
         choose_size : callable, optional
             Runs of the parcel at most. The others wait as another one. By default all of them.
+        program : ProgramOfJob, optional
+            What will compute the runs. The job names it.
         """
         wanted = Job.id.not_in(held) if only is None else Job.id == only
         admitted = true() if admission is None else admission.admits(Job)
@@ -195,6 +205,8 @@ class LeaseQueue:
         was_queued = job.state is JobState.QUEUED
         job.state, job.attempt = JobState.RUNNING, job.attempt + 1
         job.started_at = job.started_at or now
+        if program is not None:
+            job.version, job.fingerprint = program
         parcel.attempt, parcel.n_ended = job.attempt, 0
         parcel.lease_owner, parcel.lease_until = owner, now + lease
         self._session.flush()

@@ -51,7 +51,10 @@ def summarize_attempts(session: Session, lease: Lease) -> PreviousAttempts:
 def list_failure_reasons(session: Session, job_id: str, n_reasons: int) -> list[str]:
     """List some distinct reasons why runs of a job failed, those of the first runs first."""
     failed = select(Run.error).where(
-        Run.job_id == job_id, Run.state == JobState.FAILED, Run.error.is_not(None)
+        Run.job_id == job_id,
+        Run.state == JobState.FAILED,
+        Run.error.is_not(None),
+        Run.deleted_at.is_(None),
     )
     first = failed.group_by(Run.error).order_by(func.min(Run.number)).limit(n_reasons)
     return [str(reason) for reason in session.scalars(first)]

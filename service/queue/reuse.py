@@ -39,7 +39,8 @@ def find_computed_runs(
 ) -> dict[str, str]:
     """Return the first successful run of the project for each hash that has one.
 
-    Runs of deleted jobs are excluded: their signals are garbage and may be missing.
+    Deleted runs, and those of deleted jobs, are excluded: their signals are garbage and may be
+    missing.
 
     Parameters
     ----------
@@ -51,6 +52,7 @@ def find_computed_runs(
         first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
         query = first.where(
             Job.deleted_at.is_(None),
+            Run.deleted_at.is_(None),
             Run.project_id == (project_id or find_project(session)),
             Run.spec_hash.in_(chunk),
             Run.state == JobState.SUCCEEDED,
@@ -87,6 +89,8 @@ def take_over_runs(session: Session, lease: Lease, sources: Mapping[str, str]) -
 def _copy_outcome(run: str, source: Run) -> RunOutcome:
     values = {name: getattr(source, name) for name in _COPIED_COLUMNS}
     first = (source.result or {}).get("reused_from", source.id)
+    # A run that is being deleted has lost this column, not yet its result.
+    values["best_rms"] = values["best_rms"] or (source.result or {}).get("rms")
     values["result"] = {**(source.result or {}), "reused_from": first}
     return RunOutcome(run_id=run, state=JobState.SUCCEEDED, **values)
 

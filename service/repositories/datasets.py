@@ -11,10 +11,17 @@ from sqlalchemy.orm import Session
 from service.repositories.audit import record_action
 from service.repositories.lineage import LineageRepository, Relation
 from service.repositories.projects import check_stored_bytes
+from service.repositories.search import (
+    NO_FILTER,
+    ListFilter,
+    add_terms,
+    list_label_terms,
+    select_ids,
+)
 from service.storage.columns import Document, utc_now
 from service.storage.errors import RowNotFound
 from service.storage.sessions import find_project
-from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
+from service.storage.statements import RowPage, make_page, new_id
 from service.storage.tables import DEFAULT_PROJECT, Dataset
 
 
@@ -77,6 +84,14 @@ class DatasetRepository:
             return StoredDataset(existing, False)
         check_stored_bytes(self._session, self._project_id)
         LineageRepository(self._session, self._project_id).add_links(dataset.id, parents, relation)
+        segments = new.details.get("segments") or ()
+        labels = [
+            term
+            for segment in segments
+            if isinstance(segment, dict)
+            for term in list_label_terms(segment.get("labels") or {})
+        ]
+        add_terms(self._session, "dataset", dataset.id, labels, self._project_id)
         record_action(self._session, "dataset.add", dataset.id, self._project_id)
         return StoredDataset(dataset, True)
 
@@ -106,18 +121,24 @@ class DatasetRepository:
                 raise RowNotFound("dataset", dataset_id)
         return [rows[dataset_id] for dataset_id in wanted]
 
-    def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[Dataset]:
-        """List datasets, latest first."""
-        query = (
-            select(Dataset)
-            .where(*self._filter_project())
-            .order_by(Dataset.id.desc())
-            .limit(limit + 1)
-        )
-        if cursor is not None:
-            query = query.where(Dataset.id < check_id_cursor(cursor, "ds"))
-        rows = self._session.scalars(query).all()
+    def list_page(
+        self, *, cursor: str | None = None, limit: int = 50, chosen: ListFilter = NO_FILTER
+    ) -> RowPage[Dataset]:
+        """List the datasets that meet a filter, latest first."""
+        ids = select_ids(Dataset, self._project_id, chosen, cursor=cursor, limit=limit)
+        query = select(Dataset).where(Dataset.id.in_(list(self._session.scalars(ids))))
+        rows = sorted(self._session.scalars(query), key=lambda row: row.id, reverse=True)
         return make_page(rows, limit, (dataset.id for dataset in rows))
+
+    def lock_used(self, dataset_ids: Iterable[str]) -> None:
+        """Keep datasets from being deleted until the session ends; `RowNotFound` if one is gone."""
+        wanted = sorted(set(dataset_ids))
+        query = select(Dataset.id).where(*self._filter_project(), Dataset.id.in_(wanted))
+        lock = query.order_by(Dataset.id).with_for_update(read=True, key_share=True)
+        existing = set(self._session.scalars(lock))
+        for dataset_id in wanted:
+            if dataset_id not in existing:
+                raise RowNotFound("dataset", dataset_id)
 
     def delete(self, dataset_id: str) -> None:
         """Hide a dataset. Its object becomes garbage when no other row refers to it."""

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from service.core.states import OPEN_STATES, JobState
 from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
+from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
 from service.storage.sessions import find_project
@@ -29,13 +30,18 @@ QUEUE_CHANNEL = "lagid_queue"
 
 @dataclass(frozen=True, slots=True)
 class NewJob:
-    """A job to submit: `spec` is the validated body, `n_runs` counts the cells of its sweep."""
+    """A job to submit: `spec` is the validated body, `n_runs` counts the cells of its sweep.
+
+    `version` is that of the program that takes it, `spec_hash` the digest of the request.
+    """
 
     name: str
     spec: Document
     n_runs: int = 1
     priority: int = 0
     max_attempts: int = 3
+    version: str | None = None
+    spec_hash: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +113,19 @@ class JobRepository:
         return state
 
     def list_page(
-        self, *, cursor: str | None = None, limit: int = 50, states: Sequence[JobState] = ()
+        self,
+        *,
+        cursor: str | None = None,
+        limit: int = 50,
+        states: Sequence[JobState] = (),
+        chosen: ListFilter = NO_FILTER,
     ) -> RowPage[Job]:
-        """List jobs, latest first. The pages do not shift while new jobs arrive."""
+        """List the jobs that meet a filter, latest first.
+
+        The pages do not shift while new jobs arrive.
+        """
+        if chosen:
+            return self._search_page(chosen, states, cursor, limit)
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < check_id_cursor(cursor, "job"))
@@ -123,6 +139,16 @@ class JobRepository:
             rows = sorted(found, key=lambda job: job.id, reverse=True)[: limit + 1]
         else:
             rows = self._session.scalars(query).all()
+        return make_page(rows, limit, (job.id for job in rows))
+
+    def _search_page(
+        self, chosen: ListFilter, states: Sequence[JobState], cursor: str | None, limit: int
+    ) -> RowPage[Job]:
+        ids = select_ids(Job, self._project_id, chosen, cursor=cursor, limit=limit)
+        if states:
+            ids = ids.where(Job.state.in_(states))
+        query = select(Job).where(Job.id.in_(list(self._session.scalars(ids))))
+        rows = sorted(self._session.scalars(query), key=lambda job: job.id, reverse=True)
         return make_page(rows, limit, (job.id for job in rows))
 
     def cancel(self, job_id: str) -> Job:
@@ -163,7 +189,9 @@ class JobRepository:
                 f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
             )
         others = [state for state in JobState if state is not JobState.SUCCEEDED]
-        unsuccessful = update(Run).where(Run.job_id == job_id, Run.state.in_(others))
+        unsuccessful = update(Run).where(
+            Run.job_id == job_id, Run.state.in_(others), Run.deleted_at.is_(None)
+        )
         self._session.execute(
             unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
@@ -180,13 +208,31 @@ class JobRepository:
         return job
 
     def delete(self, job_id: str) -> None:
-        """Hide a finished job; objects of this job alone become garbage."""
-        job = self._lock_job(job_id)
+        """Hide a finished job; objects of this job alone become garbage.
+
+        Its runs are deleted later (`service.upkeep.retention`), because there may be many.
+
+        Raises
+        ------
+        RowConflict
+            If it is queued or running.
+        """
+        job = self.lock(job_id)
         if job.state in OPEN_STATES:
             raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
         job.deleted_at = utc_now()
+        self._session.execute(delete(IdempotencyKey).where(IdempotencyKey.job_id == job_id))
         record_action(self._session, "job.delete", job_id, self._project_id)
         self._session.flush()
+
+    def share_lock(self, job_id: str) -> None:
+        """Keep a job from being deleted until the session ends, for all who only use it."""
+        lock = select(Job.id).where(Job.id == job_id).with_for_update(read=True, key_share=True)
+        self._session.execute(lock)
+
+    def lock(self, job_id: str) -> Job:
+        """Return a job that nobody can change or use until the session ends; else `RowNotFound`."""
+        return self._lock_job(job_id, is_exclusive=True)
 
     def _filter_project(self) -> tuple[Any, ...]:
         return Job.project_id == self._project_id, Job.deleted_at.is_(None)
@@ -206,11 +252,11 @@ class JobRepository:
         )
         self._session.add(parcel)
 
-    def _lock_job(self, job_id: str) -> Job:
+    def _lock_job(self, job_id: str, *, is_exclusive: bool = False) -> Job:
         lock = (
             select(Job)
             .where(Job.id == job_id, *self._filter_project())
-            .with_for_update(key_share=True)
+            .with_for_update(key_share=not is_exclusive)
         )
         job = self._session.scalar(lock, execution_options={"populate_existing": True})
         if job is None:
@@ -226,6 +272,8 @@ class JobRepository:
             n_runs=new.n_runs,
             priority=new.priority,
             max_attempts=new.max_attempts,
+            version=new.version,
+            spec_hash=new.spec_hash,
             state=JobState.QUEUED,
             attempt=0,
             evaluations=0,

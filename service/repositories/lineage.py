@@ -5,21 +5,35 @@ It also has small queries of the use cases: datasets by name, names of a run, pr
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Literal, NamedTuple
 
 from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session, aliased
 
 from service.storage.sessions import find_project
-from service.storage.statements import insert_missing
+from service.storage.statements import insert_missing, split_chunks
 from service.storage.tables import (
     AcceptedReference,
     Dataset,
+    Job,
     LineageEdge,
+    ModelVersion,
+    Run,
     RunHistory,
 )
 
-Relation = Literal["derived", "merged", "estimation", "validation", "warm-start", "simulated"]
+Relation = Literal[
+    "derived",
+    "merged",
+    "estimation",
+    "validation",
+    "warm-start",
+    "reference",
+    "model",
+    "simulated",
+    "computed",
+]
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -38,12 +52,28 @@ class LineageRepository:
         self._session, self._project_id = session, project_id or find_project(session)
 
     def add_links(self, child: str, parents: Iterable[str], relation: Relation) -> None:
-        """Record that `child` was made from each of `parents`."""
-        edges = (
-            {"child": child, "parent": parent, "relation": relation, "project_id": self._project_id}
-            for parent in parents
+        """Record that `child` was made from each of `parents`, and a run among them in its job."""
+        edges: list[tuple[str, str, Relation]] = [(child, parent, relation) for parent in parents]
+        runs = [parent for _, parent, _ in edges if parent.startswith("run_")]
+        if runs:
+            query = select(Run.id, Run.job_id).where(
+                Run.id.in_(runs), Run.project_id == self._project_id
+            )
+            edges += [(run, job, "computed") for run, job in self._session.execute(query)]
+        rows = (
+            {"child": child, "parent": parent, "relation": kind, "project_id": self._project_id}
+            for child, parent, kind in edges
         )
-        insert_missing(self._session, LineageEdge, edges)
+        insert_missing(self._session, LineageEdge, rows)
+
+    def list_children(self, parents: Collection[str]) -> list[str]:
+        """List what was made from any of these objects, each child once, sorted."""
+        of_project = LineageEdge.project_id == self._project_id
+        children: set[str] = set()
+        for chunk in split_chunks(parents):
+            query = select(LineageEdge.child).where(of_project, LineageEdge.parent.in_(chunk))
+            children.update(self._session.scalars(query))
+        return sorted(children)
 
     def list_ancestors(self, identity: str) -> list[LineageLink]:
         """List every edge on the paths from the raw files to this object."""
@@ -70,6 +100,36 @@ class LineageRepository:
         )
         edges = self._session.scalars(query)
         return sorted(LineageLink(row.child, row.parent, row.relation) for row in edges)
+
+
+class Tombstone(NamedTuple):
+    """What is left of a deleted item of the lineage."""
+
+    id: str
+    name: str
+    deleted_at: datetime | None
+
+
+def find_tombstones(session: Session, identities: Collection[str]) -> list[Tombstone]:
+    """Find those of the objects that were deleted, the earliest first."""
+    found: list[Tombstone] = []
+    project = find_project(session)
+    for table in (Dataset, Job, ModelVersion):
+        query = select(table.id, table.name, table.deleted_at).where(
+            table.id.in_(identities), table.project_id == project, table.deleted_at.is_not(None)
+        )
+        found += [Tombstone(*row) for row in session.execute(query)]
+    query = select(Run.id, Job.name, func.coalesce(Run.deleted_at, Job.deleted_at)).join(
+        Job, Job.id == Run.job_id
+    )
+    gone = or_(Run.deleted_at.is_not(None), Job.deleted_at.is_not(None))
+    found += [
+        Tombstone(run, f"run of {name}", moment)
+        for run, name, moment in session.execute(
+            query.where(Run.id.in_(identities), Run.project_id == project, gone)
+        )
+    ]
+    return sorted(found)
 
 
 class WrittenProgress(NamedTuple):

@@ -9,10 +9,11 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.repositories.audit import record_action
+from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document, to_json, utc_now
 from service.storage.errors import RowNotFound
 from service.storage.sessions import find_project
-from service.storage.statements import RowPage, check_id_cursor, make_page, new_id
+from service.storage.statements import RowPage, make_page, new_id
 from service.storage.tables import ModelVersion
 
 _MAX_TRIES = 20
@@ -34,7 +35,7 @@ class ModelRepository:
 
     def add(self, name: str, document: Document) -> AddedModel:
         """Store a document as the next version of `name`, unless it equals the latest version."""
-        digest = hashlib.sha256(to_json(document).encode()).hexdigest()
+        digest = _hash_document(document)
         for _ in range(_MAX_TRIES):
             latest = self._find_latest(name)
             if latest is not None and latest.document_hash == digest:
@@ -54,17 +55,27 @@ class ModelRepository:
             raise RowNotFound("model", reference)
         return model
 
-    def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[ModelVersion]:
-        """List every version of every model, latest first."""
-        query = (
-            select(ModelVersion)
-            .where(*self._filter_project())
-            .order_by(ModelVersion.id.desc())
-            .limit(limit + 1)
+    def list_versions(self, name: str) -> list[ModelVersion]:
+        """List all versions of a model, latest first."""
+        query = select(ModelVersion).where(*self._filter_project(), ModelVersion.name == name)
+        return list(self._session.scalars(query.order_by(ModelVersion.version.desc())))
+
+    def find_document(self, name: str, document: Document) -> ModelVersion | None:
+        """Return the latest version of a model that has this document, if there is one."""
+        query = select(ModelVersion).where(
+            *self._filter_project(),
+            ModelVersion.name == name,
+            ModelVersion.document_hash == _hash_document(document),
         )
-        if cursor is not None:
-            query = query.where(ModelVersion.id < check_id_cursor(cursor, "mdl"))
-        rows = self._session.scalars(query).all()
+        return self._session.scalar(query.order_by(ModelVersion.version.desc()).limit(1))
+
+    def list_page(
+        self, *, cursor: str | None = None, limit: int = 50, chosen: ListFilter = NO_FILTER
+    ) -> RowPage[ModelVersion]:
+        """List every version of the models that meet a filter, latest first."""
+        ids = select_ids(ModelVersion, self._project_id, chosen, cursor=cursor, limit=limit)
+        query = select(ModelVersion).where(ModelVersion.id.in_(list(self._session.scalars(ids))))
+        rows = sorted(self._session.scalars(query), key=lambda row: row.id, reverse=True)
         return make_page(rows, limit, (model.id for model in rows))
 
     def delete(self, reference: str) -> None:
@@ -110,3 +121,7 @@ class ModelRepository:
         self._session.flush()
         record_action(self._session, "model.add", model.id, self._project_id)
         return model
+
+
+def _hash_document(document: Document) -> str:
+    return hashlib.sha256(to_json(document).encode()).hexdigest()

@@ -95,6 +95,14 @@ class ProjectRepository:
         record_action(self._session, "project.limit", project.id, project.id)
         return project
 
+    def change_retention(self, reference: str, days: float | None) -> Project:
+        """Change how many days ended jobs of a project are kept: 0 for ever, None by default."""
+        project = self.get(reference)
+        project.keep_days = days
+        self._session.flush()
+        record_action(self._session, "project.keep", project.id, project.id)
+        return project
+
     def lock_limits(self, project_id: str) -> ProjectLimits:
         """Read the limits of a project, and let no other transaction pass until this one ends.
 

@@ -8,6 +8,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.repositories.audit import record_action
+from service.repositories.search import NO_FILTER, ListFilter, select_items_with
 from service.storage.columns import Document
 from service.storage.errors import RowConflict, RowNotFound
 from service.storage.sessions import find_project
@@ -53,6 +54,7 @@ class ReferenceRepository:
                 run_id=run_id,
                 accepted_by=accepted_by,
                 note=note,
+                tags=None if latest is None else latest.tags,
                 number=1 if latest is None else latest.number + 1,
             )
             try:
@@ -87,8 +89,13 @@ class ReferenceRepository:
             raise RowNotFound("reference", name)
         return acceptances
 
-    def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[CurrentReference]:
-        """List the reference in use of every name, by name."""
+    def list_page(
+        self, *, cursor: str | None = None, limit: int = 50, chosen: ListFilter = NO_FILTER
+    ) -> RowPage[CurrentReference]:
+        """List the reference in use of every name that meets a filter, by name.
+
+        Times are those of the latest acceptance.
+        """
         of_project = AcceptedReference.project_id == self._project_id
         last = (
             select(AcceptedReference.name, func.max(AcceptedReference.number).label("number"))
@@ -99,13 +106,22 @@ class ReferenceRepository:
         )
         if cursor is not None:
             last = last.where(AcceptedReference.name > cursor)
-        chosen = last.subquery()
+        name, latest = AcceptedReference.name, func.max(AcceptedReference.accepted_at)
+        if chosen.name:
+            last = last.where(name.icontains(chosen.name, autoescape=True))
+        for term in chosen.terms:
+            last = last.where(name.in_(select_items_with("reference", self._project_id, term)))
+        if chosen.since is not None:
+            last = last.having(latest >= chosen.since)
+        if chosen.until is not None:
+            last = last.having(latest < chosen.until)
+        current = last.subquery()
         query = (
             select(AcceptedReference, Run.job_id, Run.labels, Run.estimates)
             .join(
-                chosen,
-                (AcceptedReference.name == chosen.c.name)
-                & (AcceptedReference.number == chosen.c.number),
+                current,
+                (AcceptedReference.name == current.c.name)
+                & (AcceptedReference.number == current.c.number),
             )
             .join(Run, Run.id == AcceptedReference.run_id)
             .where(of_project)
@@ -123,6 +139,15 @@ class ReferenceRepository:
             .limit(_MAX_NAMES)
         )
         return self._session.scalars(query).all()
+
+    def lock(self, name: str) -> Sequence[AcceptedReference]:
+        """Return the acceptances of a name, latest first, until the session ends as they are."""
+        query = select(AcceptedReference).where(*self._filter_name(name))
+        lock = query.order_by(AcceptedReference.number.desc()).with_for_update()
+        rows = self._session.scalars(lock, execution_options={"populate_existing": True}).all()
+        if not rows:
+            raise RowNotFound("reference", name)
+        return rows
 
     def _find_latest(self, name: str) -> AcceptedReference | None:
         query = select(AcceptedReference).where(*self._filter_name(name))

@@ -22,6 +22,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 from service.core.states import JobState
 from service.core.text_checks import MANY
 from service.repositories.history import HistoryPoint, MigrantPoint, unpack_history, unpack_migrants
+from service.repositories.search import select_items_with
 from service.storage.columns import Document, to_json
 from service.storage.errors import InvalidCursor, RowNotFound
 from service.storage.sessions import find_project
@@ -50,8 +51,15 @@ class RunRepository:
 
     def get(self, run_id: str) -> Run:
         """Return a run of this project; else raise `RowNotFound`."""
-        run = self._session.get(Run, run_id, populate_existing=True)
-        if run is None or run.project_id != self._project_id:
+        query = select(Run).join(Job, Job.id == Run.job_id)
+        query = query.where(
+            Run.id == run_id,
+            Run.project_id == self._project_id,
+            Run.deleted_at.is_(None),
+            Job.deleted_at.is_(None),
+        )
+        run = self._session.scalar(query, execution_options={"populate_existing": True})
+        if run is None:
             raise RowNotFound("run", run_id)
         return run
 
@@ -64,15 +72,20 @@ class RunRepository:
         states: Sequence[JobState] = (),
         cell: Mapping[str, Any] | None = None,
         labels: Mapping[str, Any] | None = None,
+        tags: Sequence[str] = (),
         order: RunOrder = "number",
         descending: bool = False,
     ) -> RowPage[Run]:
         """List the runs of a job, sorted by a column; runs without a value in it come last.
 
-        `cell` selects the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``. The
-        pages do not shift while runs finish, unless their values in the column change.
+        `cell` selects the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``.
+        `tags` selects those that have all of them. The pages do not shift while runs finish, unless
+        their values in the column change.
         """
-        conditions = [*self._filter_job(job_id)]
+        conditions = list(filter_job(job_id, self._project_id))
+        conditions += [
+            Run.id.in_(select_items_with("run", self._project_id, ("tag", tag))) for tag in tags
+        ]
         if states:
             conditions.append(Run.state.in_(states))
         for column, entries in ((Run.cell, cell), (Run.labels, labels)):
@@ -92,13 +105,15 @@ class RunRepository:
         return make_page(rows, limit, cursors)
 
     def count_created(self, job_id: str) -> int:
-        """Count the created runs of a job; they are always its first ones."""
-        last = self._session.scalar(select(func.max(Run.number)).where(*self._filter_job(job_id)))
+        """Count the created runs of a job, deleted ones too; they are always its first ones."""
+        of_job = Run.job_id == select_job_id(job_id, self._project_id)
+        last = self._session.scalar(select(func.max(Run.number)).where(of_job))
         return 0 if last is None else int(last) + 1
 
     def count_states(self, job_id: str) -> dict[JobState, int]:
         """Count the runs of a job in each state."""
-        query = select(Run.state, func.count()).where(*self._filter_job(job_id)).group_by(Run.state)
+        of_job = filter_job(job_id, self._project_id)
+        query = select(Run.state, func.count()).where(*of_job).group_by(Run.state)
         counts = dict(self._session.execute(query).all())
         return {state: counts.get(state, 0) for state in JobState}
 
@@ -114,17 +129,20 @@ class RunRepository:
         parts = select(MigrationLog.migrants).where(MigrationLog.run_id == self.get(run_id).id)
         return unpack_migrants(run_id, self._session.scalars(parts))
 
-    def _filter_job(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
-        return (Run.job_id == select_job_id(job_id, self._project_id),)
+
+def filter_job(job_id: str, project_id: str) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions that a run belongs to a job and was not deleted."""
+    return Run.job_id == select_job_id(job_id, project_id), Run.deleted_at.is_(None)
 
 
 def select_job_id(job_id: str, project_id: str) -> ScalarSelect[str]:
-    """Return the identifier of a job as a subquery, NULL in another project.
+    """Return the identifier of an undeleted job as a subquery, NULL in another project.
 
     The runs of a job need no condition on the project then. With one, SQLite may search all runs
     of the project.
     """
-    return select(Job.id).where(Job.id == job_id, Job.project_id == project_id).scalar_subquery()
+    query = select(Job.id).where(Job.id == job_id, Job.project_id == project_id)
+    return query.where(Job.deleted_at.is_(None)).scalar_subquery()
 
 
 def entry_equals(

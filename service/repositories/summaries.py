@@ -11,7 +11,7 @@ from sqlalchemy import String, Text, cast, select, type_coerce
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.repositories.runs import entry_equals, select_job_id
+from service.repositories.runs import entry_equals, filter_job
 from service.storage.columns import Document
 from service.storage.sessions import find_project
 from service.storage.statements import upsert
@@ -102,7 +102,7 @@ def read_run_table(session: Session, job_id: str, project_id: str | None = None)
             Run.valid,
             *(getattr(Run, name) for name in _FLOATS),
         )
-        .where(Run.job_id == select_job_id(job_id, project_id or find_project(session)))
+        .where(*filter_job(job_id, project_id or find_project(session)))
         .order_by(Run.number)
         .execution_options(yield_per=READ_ROWS)
     )
@@ -167,7 +167,7 @@ def find_quietest_run(
 ) -> Run | None:
     """Find the best valid run of a cell among those with the least noise; None without success."""
     query = select(Run).where(
-        Run.job_id == select_job_id(job_id, project_id or find_project(session)),
+        *filter_job(job_id, project_id or find_project(session)),
         Run.state == JobState.SUCCEEDED,
         Run.valid.is_(True),
         Run.best_rms.is_not(None),

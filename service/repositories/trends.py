@@ -6,7 +6,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
-from service.repositories.runs import select_job_id
+from service.repositories.runs import filter_job
 from service.storage.columns import Document
 from service.storage.sessions import find_project
 from service.storage.tables import Run
@@ -42,7 +42,7 @@ def read_trend_rows(
     query = (
         select(*columns)
         .where(
-            Run.job_id == select_job_id(job_id, project_id or find_project(session)),
+            *filter_job(job_id, project_id or find_project(session)),
             Run.state == JobState.SUCCEEDED,
         )
         .order_by(Run.number)
@@ -54,7 +54,6 @@ def read_trend_rows(
 def count_succeeded(session: Session, job_id: str, project_id: str | None = None) -> int:
     """Count the successful runs of a job."""
     query = select(func.count()).where(
-        Run.job_id == select_job_id(job_id, project_id or find_project(session)),
-        Run.state == JobState.SUCCEEDED,
+        *filter_job(job_id, project_id or find_project(session)), Run.state == JobState.SUCCEEDED
     )
     return int(session.scalar(query) or 0)

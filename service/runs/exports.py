@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,7 +76,7 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
         _compute_covariance(stored.result, values),
         _find_sample_time(stored, rows),
         {signal.name: _find_hold(signal.name, stored, rows) for signal in stored.model.inputs},
-        version("lagid"),
+        stored.result.get("version") or stored.job.version or "",
         _describe_provenance(stored, rows),
     )
 
@@ -154,6 +153,8 @@ def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, An
         "finished": None if run.finished_at is None else run.finished_at.isoformat(),
         "method": run.method,
         "seed": run.seed,
+        "spec_hash": run.spec_hash,
+        "fingerprint": stored.result.get("fingerprint"),
         "rms": run.best_rms,
         "fit_percent": stored.result.get("fit_percent"),
         "datasets": [descriptions.get(name, {"id": name}) for name in stored.body["datasets"]],

@@ -1,7 +1,5 @@
 """Use case of a run's response: measured and simulated outputs, stored or computed again."""
 
-import io
-from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import groupby
 
@@ -16,7 +14,6 @@ from service.formats.mcap import (
     FittedOutput,
     list_fitted_outputs,
     read_fitted_outputs,
-    write_fitted_outputs,
 )
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ExperimentOut, ResponseOut
@@ -56,13 +53,6 @@ def load_fitted_signals(
         is_final=True,
         before_wait=partial(release_connection, session),
     )
-
-
-def write_signals_file(run: str, fits: Sequence[FittedOutput]) -> bytes:
-    """Write the signals of a run as the file that a worker would have stored."""
-    target = io.BytesIO()
-    write_fitted_outputs(run, fits, target)
-    return target.getvalue()
 
 
 @lru_cache(maxsize=_CACHE_SIZE)

@@ -36,6 +36,7 @@ class RunQuery:
     states: Sequence[JobState] = ()
     cell: Sequence[str] = ()
     labels: Sequence[str] = ()
+    tags: Sequence[str] = ()
     order: RunOrder = "number"
     descending: bool = False
 
@@ -52,6 +53,7 @@ def list_runs(
         states=choice.states,
         cell=parse_filters("cell", choice.cell),
         labels=parse_filters("label", choice.labels),
+        tags=choice.tags,
         order=choice.order,
         descending=choice.descending,
     )
@@ -97,6 +99,10 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
             "state": run.state.value,
             "progress": _compute_progress(run, job, written),
             "error": run.error,
+            "seed": run.seed,
+            "spec_hash": run.spec_hash,
+            "note": run.note,
+            "tags": run.tags or [],
             "created_at": run.created_at,
             "started_at": run.started_at,
             "finished_at": run.finished_at,

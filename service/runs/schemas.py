@@ -57,6 +57,19 @@ class RunOut(Answer):
     reused_from: str | None = Field(
         default=None, description="the earlier run with the same specification"
     )
+    seed: int | None = Field(default=None, description="seed of the search")
+    spec_hash: str | None = Field(
+        default=None, description="digest of all that the result depends on"
+    )
+    version: str | None = Field(
+        default=None, description="version of the program that computed the result"
+    )
+    fingerprint: str | None = Field(
+        default=None,
+        description="digest of the kernels' program: equal ones give results equal bit for bit",
+    )
+    note: str | None = Field(default=None, description="note of a user")
+    tags: list[str] = Field(default=[], description="tags of users")
     created_at: datetime = Field(description="time when the run was made, UTC")
     started_at: datetime | None = Field(default=None, description="time of the start, UTC")
     finished_at: datetime | None = Field(default=None, description="time of the end, UTC")

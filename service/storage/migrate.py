@@ -34,7 +34,7 @@ def upgrade_database(database: Database, revision: str = "head") -> None:
     """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
-        _refuse_newer_database(_read_revision(connection))
+        _refuse_newer_database(read_revision(connection))
         command.upgrade(_make_config(connection), revision)
 
 
@@ -48,7 +48,7 @@ def downgrade_database(database: Database, revision: str = "base") -> None:
     """
     with database.get_waiting_engine(LOCK_WAIT_SECONDS).begin() as connection:
         _lock_migrations(connection)
-        _refuse_newer_database(_read_revision(connection))
+        _refuse_newer_database(read_revision(connection))
         command.downgrade(_make_config(connection), revision)
 
 
@@ -78,10 +78,17 @@ def find_head_revision() -> str | None:
     return ScriptDirectory.from_config(_make_config()).get_current_head()
 
 
+def list_revisions() -> list[str]:
+    """List all revisions that this program knows, the latest first."""
+    return [
+        script.revision for script in ScriptDirectory.from_config(_make_config()).walk_revisions()
+    ]
+
+
 def read_current_revision(database: Database) -> str | None:
     """Return the revision of the database; None before the first migration."""
     with database.engine.connect() as connection:
-        return _read_revision(connection)
+        return read_revision(connection)
 
 
 def check_revision(database: Database) -> None:
@@ -99,13 +106,14 @@ def list_differences(database: Database) -> list[str]:
         return [str(difference) for difference in compare_metadata(context, Base.metadata)]
 
 
-def _read_revision(connection: Connection) -> str | None:
+def read_revision(connection: Connection) -> str | None:
+    """Return the revision that a connection sees; None before the first migration."""
     return MigrationContext.configure(connection).get_current_revision()
 
 
 def _refuse_newer_database(current: str | None) -> None:
     scripts = ScriptDirectory.from_config(_make_config())
-    if current is not None and current not in {one.revision for one in scripts.walk_revisions()}:
+    if current is not None and current not in list_revisions():
         raise DatabaseIsNewer(current, scripts.get_current_head())
 
 

@@ -118,6 +118,15 @@ class Database:
         with self._read(info=self._info) as session:
             yield session
 
+    @contextmanager
+    def read_snapshot(self) -> Iterator[Connection]:
+        """Open a connection that sees one state of the database until the block ends."""
+        options: dict[str, Any] = dict(_READ_OPTIONS)
+        if not self.is_sqlite:  # where a reading transaction sees one state in any case
+            options["isolation_level"] = "REPEATABLE READ"
+        with self.engine.execution_options(**options).begin() as connection:
+            yield connection
+
     def get_waiting_engine(self, seconds: float) -> Engine:
         """Return an engine whose transactions wait `seconds` for locks of others."""
         return self.engine.execution_options(**{_BUSY_OPTION: seconds})

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, cast
 
@@ -184,6 +185,11 @@ def new_ids(prefix: IdPrefix, n: int) -> list[str]:
         f"{heads[number >> _TAIL_BITS]}{_PAIRS[number >> 10 & 1023]}{_PAIRS[number & 1023]}"
         for number in numbers
     ]
+
+
+def make_id_bound(prefix: IdPrefix, moment: datetime) -> str:
+    """Return the least identifier of an item that is made at this moment."""
+    return f"{prefix}_{_encode_base32(max(0, int(moment.timestamp() * 1000)) << _RANDOM_BITS)}"
 
 
 def check_id_cursor(cursor: str, prefix: IdPrefix) -> str:

@@ -26,6 +26,8 @@ WAITING_CONDITION = "lease_owner IS NULL"
 """Condition of the index of parcels that no dispatcher holds."""
 TOLD_CONDITION = "kind <> 'progress'"
 """Condition of the index of the events that a page lists."""
+DELETED_CONDITION = "deleted_at IS NOT NULL AND purged_at IS NULL"
+"""Condition of the index of the deleted jobs whose runs are still stored."""
 
 
 class Base(DeclarativeBase):
@@ -59,12 +61,14 @@ class Project(Base):
     """Owner of everything that a user creates.
 
     The limits are those of the settings where they are None, or there is none.
+    `keep_days` is how long its ended jobs are kept, in days. None: as the settings say.
     """
 
     __tablename__ = "projects"
 
     id: Mapped[str] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(unique=True, index=True)
+    keep_days: Mapped[float | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     max_open_jobs: Mapped[int | None]
     max_open_runs: Mapped[int | None]
@@ -138,6 +142,7 @@ class Dataset(Base):
             "source_key",
             unique=True,
         ),
+        _partial_index("ix_datasets_named", "deleted_at IS NULL", "project_id", "id", "name"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -153,6 +158,8 @@ class Dataset(Base):
     sample_time: Mapped[float | None]
     channels: Mapped[list[Any]]
     details: Mapped[Document]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
 
@@ -181,6 +188,8 @@ class ModelVersion(Base):
     version: Mapped[int]
     document: Mapped[Document] = mapped_column(OrderedJsonType)
     document_hash: Mapped[str]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
 
@@ -193,6 +202,10 @@ class Job(Base):
     progress over all runs. `best_rms` is the smallest RMS of any run so far. `n_reused` counts the
     runs taken over from other jobs. `floors` is the document that `service.dispatch.cramer_rao`
     computes for a job with noise.
+
+    `version` and `fingerprint` are those of the program that last started the job; until then
+    `version` is that of the program that took it. `spec_hash` is the digest of its request.
+    `purged_at` is set once the runs of a deleted job are gone.
     """
 
     __tablename__ = "jobs"
@@ -219,6 +232,15 @@ class Job(Base):
             "finished_at",
             "evaluations",
         ),
+        _partial_index("ix_jobs_named", "deleted_at IS NULL", "project_id", "id", "name"),
+        _partial_index(
+            "ix_jobs_ended",
+            "deleted_at IS NULL AND finished_at IS NOT NULL",
+            "project_id",
+            "finished_at",
+            "id",
+        ),
+        _partial_index("ix_jobs_deleted", DELETED_CONDITION, "deleted_at"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -241,10 +263,16 @@ class Job(Base):
     seconds_left: Mapped[float | None]
     error: Mapped[str | None]
     floors: Mapped[Document | None]
+    version: Mapped[str | None]
+    fingerprint: Mapped[str | None]
+    spec_hash: Mapped[str | None]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
+    purged_at: Mapped[datetime | None]
 
 
 class Parcel(Base):
@@ -284,7 +312,8 @@ class Run(Base):
     summaries over many runs. `rms_noise_free` is the RMS against the records before noise was
     added. `kills` counts how often in a row a worker died in this run alone without progress.
     `signals_sha256` names the object of its fitted signals. If several runs share an object, the
-    file of this run is `signals_size` bytes of it from `signals_start`.
+    file of this run is `signals_size` bytes of it from `signals_start`. A deleted run keeps its row
+    without results, so that the job does not compute it again.
     """
 
     __tablename__ = "runs"
@@ -325,9 +354,12 @@ class Run(Base):
     signals_start: Mapped[int | None] = mapped_column(LargeInteger)
     signals_size: Mapped[int | None] = mapped_column(LargeInteger)
     error: Mapped[str | None]
+    note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]
 
 
 class StoredSummary(Base):
@@ -414,7 +446,23 @@ class AcceptedReference(Base):
     run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"))
     accepted_by: Mapped[str | None]
     note: Mapped[str | None]
+    tags: Mapped[list[Any] | None]
     accepted_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class SearchTerm(Base):
+    """A term under which lists find an item: a tag, a label, a model or a dataset.
+
+    `kind` is that of the item and of the term, such as ``job:tag``. A page of a list is then one
+    range of the primary key.
+    """
+
+    __tablename__ = "search_terms"
+
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
+    kind: Mapped[str] = mapped_column(primary_key=True)
+    value: Mapped[str] = mapped_column(primary_key=True)
+    item_id: Mapped[str] = mapped_column(primary_key=True, index=True)
 
 
 class IdempotencyKey(Base):
@@ -425,7 +473,7 @@ class IdempotencyKey(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
     key: Mapped[str] = mapped_column(primary_key=True)
     request_hash: Mapped[str]
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), index=True)
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 

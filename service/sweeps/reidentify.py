@@ -6,8 +6,9 @@ from typing import Any
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
 from service.core.text_checks import find_text_fault
+from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from service.jobs import submit
-from service.jobs.schemas import PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX, JobIn, JobOut
+from service.jobs.schemas import PREVIOUS, JobIn, JobOut
 from service.storage.sessions import Database
 from service.sweeps.schemas import ReidentifyIn
 

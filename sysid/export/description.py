@@ -42,7 +42,7 @@ def describe_model(identified: IdentifiedModel) -> list[str]:
         lines.append("The coefficients hold for that sampling period only.")
     lines += [_describe_hold(identified, signal.name) for signal in model.inputs]
     if identified.version:
-        lines.append(f"Written by lagid {identified.version}.")
+        lines.append(f"Identified by lagid {identified.version}.")
     for key, value in identified.provenance.items():
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         lines.append(f"{key}: {text}")

@@ -7,7 +7,7 @@ without statistics of the tables, with those of the filled ones, and with those 
 import json
 import re
 from collections.abc import Callable, Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import islice
 from typing import Any
 
@@ -15,6 +15,8 @@ import pytest
 from sqlalchemy import text
 
 from service.core.states import JobState
+from service.items.deletion import delete_item, find_dependents
+from service.items.items import lock_item
 from service.queue.admission import Admission, count_unfinished
 from service.queue.leases import Claim, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
@@ -27,6 +29,7 @@ from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.lineage import LineageRepository
 from service.repositories.runs import RunRepository
+from service.repositories.search import ListFilter, add_terms
 from service.repositories.summaries import (
     find_quietest_run,
     read_run_table,
@@ -34,7 +37,7 @@ from service.repositories.summaries import (
     write_summary,
 )
 from service.repositories.trends import count_succeeded, read_trend_rows
-from service.storage.garbage import _find_named_hashes, _select_hashes
+from service.storage.garbage import _find_named_hashes, select_hashes
 from service.storage.sessions import Database
 from service.storage.tables import (
     DEFAULT_PROJECT,
@@ -45,12 +48,13 @@ from service.storage.tables import (
     RunHistory,
     StoredSummary,
 )
+from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
 from tests.database import record_statements
 from tests.stored import claimed, new_dataset
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
 GROWING = {"jobs", "runs", "events", "datasets", "checkpoints", "run_history", "migrations_log"}
-GROWING |= {"idempotency_keys", "lineage_edges", "job_summaries", "models"}
+GROWING |= {"idempotency_keys", "lineage_edges", "job_summaries", "models", "search_terms"}
 BOUNDED_INDEXES = ("ix_jobs_open", "ix_parcels_owned")
 """Indexes of open jobs: to read them whole is to read what is open."""
 NUMBERS = {
@@ -134,6 +138,7 @@ def filled(request: pytest.FixtureRequest) -> Filled:
             IdempotencyKey(key="k", project_id=DEFAULT_PROJECT, request_hash="", job_id=LARGE)
         )
         session.add(StoredSummary(job_id=ended.job.id, attempt=1, document={}))
+        add_terms(session, "job", ended.job.id, [("tag", "t"), ("model", "m")])
         LineageRepository(session).add_links("job_1", ["ds_1"], "estimation")
         DatasetRepository(session).add(new_dataset())
         history = {"digest": 1, "n_parameters": 1, "generation": 1, "evaluations": 1, "rms": 1.0}
@@ -145,6 +150,9 @@ def filled(request: pytest.FixtureRequest) -> Filled:
     copy_row(database, "idempotency_keys", N_OTHERS, key=pad("k", database))
     copy_row(database, "job_summaries", N_OTHERS, job_id=pad("job_0", database))
     copy_row(database, "lineage_edges", N_OTHERS, child=pad("job_0", database))
+    for kind in ("tag", "model"):
+        of_all = {"kind": f"'job:{kind}'", "value": f"'{kind[0]}'"}
+        copy_row(database, "search_terms", N_OTHERS, item_id=pad("job_0", database), **of_all)
     copy_row(
         database,
         "datasets",
@@ -227,6 +235,30 @@ def list_failed(at: Filled) -> None:
         assert [job.state for job in page.items] == [JobState.FAILED] * 20
         assert len(jobs.list_page(cursor=page.next, states=[JobState.FAILED]).items) == 10
         jobs.list_page(cursor=page.next)
+
+
+def search_lists(at: Filled) -> None:
+    since = datetime(1970, 1, 1, tzinfo=UTC)
+    chosen = ListFilter(name="tub", terms=(("tag", "t"), ("model", "m")), since=since)
+    with at[0].read_session() as session:
+        jobs, datasets = JobRepository(session), DatasetRepository(session)
+        page = jobs.list_page(chosen=chosen, limit=20)
+        assert len(page.items) == 20
+        jobs.list_page(cursor=page.next, chosen=chosen, states=[JobState.FAILED], limit=20)
+        later = ListFilter(until=datetime(2500, 1, 1, tzinfo=UTC))
+        for part in (ListFilter(name="TUB"), later):
+            assert len(jobs.list_page(chosen=part, limit=20).items) == 20
+        for part in (ListFilter(name="TEP"), later):
+            assert len(datasets.list_page(chosen=part, limit=20).items) == 20
+
+
+def delete_what_is_old(at: Filled) -> None:
+    limit = datetime(2020, 1, 1, tzinfo=UTC)
+    with at[0].write_session() as session:
+        assert not list_ended_jobs(session, limit)
+        assert not list_deleted_jobs(session, limit)
+        find_dependents(session, lock_item(session, "dataset", "ds_00000000001"))
+        delete_item(session, "job", "job_00000000100")
 
 
 def count_jobs(at: Filled) -> None:
@@ -335,7 +367,7 @@ def collect_garbage(at: Filled) -> None:
     with at[0].read_session() as session:
         assert len(_find_named_hashes(session, ["a00000000001", "c" * 64])) == 1
         DatasetRepository(session).list_page(limit=5)
-        for query in _select_hashes():
+        for query in select_hashes():
             column = query.selected_columns[0]
             part = session.scalars(query.where(column >= "ac", column < "acg").distinct())
             assert list(islice(part, 2)) == []
@@ -344,6 +376,8 @@ def collect_garbage(at: Filled) -> None:
 USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
     submit: ("ix_jobs_open",),
     list_failed: ("ix_jobs_by_state",),
+    search_lists: ("ix_jobs_named", "ix_datasets_named"),
+    delete_what_is_old: ("ix_jobs_ended", "ix_jobs_deleted", "ix_lineage_edges_parent"),
     count_jobs: ("ix_jobs_by_state",),
     show_job: ("ix_runs_job_id_best_rms", "ix_events_told"),
     stream_events: ("ix_events_job_id_id",),

@@ -1,5 +1,6 @@
 """Signals that a sweep does not store are computed again: the file is the same, byte for byte."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,10 @@ from service.core.errors import Conflict
 from service.core.states import JobState
 from service.datasets import recordings
 from service.datasets.datasets import add_recording
+from service.formats.mcap import write_fitted_outputs
 from service.jobs.stored_run import load_run
 from service.repositories.datasets import DatasetRepository
-from service.runs.fitted import load_fitted_signals, write_signals_file
+from service.runs.fitted import load_fitted_signals
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from sysid.data.records import Recording
@@ -84,7 +86,9 @@ def compute_again(place: Place, run: str) -> bytes:
     with place.database.read_session() as session:
         fits = load_fitted_signals(session, place.store, load_run(session, run))
     assert fits is not None
-    return write_signals_file(run, fits)
+    target = BytesIO()
+    write_fitted_outputs(fits, target)
+    return target.getvalue()
 
 
 @pytest.mark.parametrize("body", CASES.values(), ids=CASES.keys())

@@ -1,5 +1,6 @@
 """A server over a filled data folder, and Chromium to look at its pages."""
 
+import re
 import socket
 import threading
 import time
@@ -40,6 +41,8 @@ ARGUMENTS = [
 
 LIMIT_SECONDS = 180.0
 """How long an answer may take: compiling what it needs takes minutes beside other work."""
+REFUSED = re.compile("status of (409|412|422)")
+"""Answers to what a user may try; the page explains them."""
 LIMIT_MILLISECONDS = 1000 * LIMIT_SECONDS
 """The same of a page that shows something."""
 
@@ -144,7 +147,7 @@ def page(browser_context: BrowserContext) -> Iterator[Page]:
 
     def note(message: ConsoleMessage) -> None:
         # The browser itself reports every refused request; those of the form are meant to be.
-        if message.type == "error" and "status of 422" not in message.text:
+        if message.type == "error" and not REFUSED.search(message.text):
             wrong.append(message.text)
 
     tab.on("console", note)

@@ -363,7 +363,7 @@ def _end(database: Database, store: ObjectStore, claim: Claim, recording: Record
     with database.write_session() as session:
         run = _first(session, claim)
         target = io.BytesIO()
-        write_fitted_outputs(run, fits, target)
+        write_fitted_outputs(fits, target)
         migrants = [MigrantPoint(run, n, 1 + n // 4, n % 4, (n + 1) % 4, 5.0) for n in range(60)]
         outcome = RunOutcome(
             run_id=run,

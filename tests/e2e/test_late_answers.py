@@ -56,7 +56,7 @@ def test_a_model_chosen_before_does_not_replace_the_one_chosen_after(
     first = Held(page, r"/v1/models/tube$")
     page.goto(f"{site.url}{path}")
     first.wait()
-    page.locator("[name=model]").select_option("actuator")
+    page.locator("select[name=model]").select_option("actuator")
     inertia = page.locator("[data-parameter=J]").first
     expect(inertia).to_be_attached()
     first.let_go()
@@ -70,7 +70,7 @@ def test_nothing_can_be_typed_for_a_model_that_is_going_to_be_replaced(
     page.goto(f"{site.url}/new/noise-sweep")
     expect(page.get_by_label(re.compile(r"^true K\b"))).to_be_visible()  # of the tube
     second = Held(page, r"/v1/models/fopdt$")
-    page.locator("[name=model]").select_option("fopdt")
+    page.locator("select[name=model]").select_option("fopdt")
     expect(page.locator("[data-truth], [data-input], [data-parameter]")).to_have_count(0)
     second.let_go()
     expect(page.get_by_label(re.compile(r"^true K\b"))).to_be_visible()
@@ -83,7 +83,7 @@ def test_channels_follow_the_model_that_is_chosen_after_the_recordings(
     expect(page.locator("[data-parameter=K]").first).to_be_attached()
     page.get_by_label("label of tube 40 m").fill("40")
     expect(page.get_by_label("output y")).to_be_visible()
-    page.locator("[name=model]").select_option("actuator")
+    page.locator("select[name=model]").select_option("actuator")
     expect(page.get_by_label("output theta")).to_be_visible()
     expect(page.get_by_label("output y")).to_have_count(0)
 
@@ -91,9 +91,9 @@ def test_channels_follow_the_model_that_is_chosen_after_the_recordings(
 def test_the_form_shows_the_model_that_was_chosen_last(site: Site, page: Page) -> None:
     opened(site, page)
     first = Held(page, r"/v1/models/fopdt$")
-    page.locator("[name=model]").select_option("fopdt")
+    page.locator("select[name=model]").select_option("fopdt")
     first.wait()
-    page.locator("[name=model]").select_option("actuator")
+    page.locator("select[name=model]").select_option("actuator")
     equations = page.get_by_label("equations in YAML")
     expect(equations).to_have_value(re.compile("actuator"))
     first.let_go()
@@ -158,7 +158,7 @@ def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, page: Pag
     sent: list[Request] = []
     page.on("request", lambda one: sent.append(one) if one.method == "POST" else None)
     model = Held(page, r"/v1/models/fopdt$")
-    page.locator("[name=model]").select_option("fopdt")
+    page.locator("select[name=model]").select_option("fopdt")
     model.wait()
     page.locator("#job-form [type=submit]").click()
     page.wait_for_timeout(200)

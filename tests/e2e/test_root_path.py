@@ -58,3 +58,28 @@ def test_pages_work_below_the_path_of_a_proxy(
     page.get_by_role("button", name="Cancel").click()  # its event refreshes the page
     expect(page.locator(".chip").first).to_have_text("cancelled")
     assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []
+
+
+def test_items_are_found_edited_and_deleted_below_the_path(
+    address: str, filled: tuple[Path, Filled], page: Page
+) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{address}/jobs/{filled[1].failed}")
+    page.get_by_role("button", name="Edit").first.click()
+    dialog = page.get_by_role("dialog", name="Edit the job")
+    dialog.get_by_label("Tags").fill("suspect")
+    dialog.get_by_role("button", name="Save").click()
+    expect(page.locator(".annotations .tag")).to_have_text("suspect")
+    page.goto(f"{address}/")
+    page.get_by_text("Filter", exact=True).first.click()
+    form = page.get_by_role("search")
+    form.get_by_label("Tag").fill("suspect")
+    form.get_by_role("button", name="Filter").click()
+    expect(page.locator("table.jobs tbody tr")).to_have_count(1)
+    page.locator("table.jobs tbody a.name").click()
+    page.get_by_role("button", name="Delete").first.click()
+    dialog = page.get_by_role("dialog", name="Delete the job")
+    dialog.get_by_role("button", name="Delete").click()
+    expect(page).to_have_url(f"{address}/")
+    assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []

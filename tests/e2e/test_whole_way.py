@@ -40,7 +40,7 @@ def filled_in(service: Service, page: Page, path: Path, name: str) -> None:
     page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
     page.get_by_label("or upload a recording").set_input_files(path)
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
-    page.get_by_label("Model", exact=True).select_option("fopdt")
+    page.get_by_role("combobox", name="Model", exact=True).select_option("fopdt")
     expect(page.get_by_label("equations in YAML")).to_have_value(re.compile("name: fopdt"))
     page.get_by_label("name of the job").fill(name)
 

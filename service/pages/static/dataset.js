@@ -1,5 +1,6 @@
-// A dataset's page: its signals.
+// A dataset's page: its signals, and its dialogs.
 
+import './items.js';
 import { start } from './figures.js';
 
 start();

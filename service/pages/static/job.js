@@ -1,5 +1,6 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
+import './items.js';
 import { start, setQuery, listPlots, drawProfiles, redraw, watch } from './figures.js';
 import { Problem, address, post, put, refresh, throttle } from './live.js';
 
@@ -43,8 +44,6 @@ document.addEventListener('click', async ({ target }) => {
   const button = target.closest('button');
   if (!button) return;
   if (button.dataset.act) await act(button);
-  else if (button.dataset.dialog) document.getElementById(button.dataset.dialog).showModal();
-  else if ('close' in button.dataset) button.closest('dialog').close();
   else if ('copy' in button.dataset) await copy(button);
   else if (button.dataset.abscissa) chooseAbscissa(button);
   else if (button.dataset.profile) await drawProfiles(button);

@@ -101,7 +101,7 @@ def _list_routes(guarded: Guarded) -> list[tuple[str, APIRoute]]:
     return found
 
 
-def _list_bodies(path: str, victim: Side) -> list[dict[str, Any]]:
+def _list_bodies(method: str, path: str, victim: Side) -> list[dict[str, Any]]:
     """The arguments of requests that name what the victim has, by the path of a route."""
     channels = {"u": "u", "y": "y"}
     job = {"model": "fopdt", "datasets": [victim.dataset], "channels": channels}
@@ -148,6 +148,10 @@ def _list_bodies(path: str, victim: Side) -> list[dict[str, Any]]:
         "/v1/models": [{**copy_catalogue_document("fopdt"), "name": f"of-{len(victim.mark)}"}],
         "/v1/models:check": [{"name": victim.model}],
     }
+    if method == "DELETE":
+        return []  # what is deleted, others would not find
+    if method == "PATCH":
+        bodies = {path: [{"note": victim.mark, "tags": [victim.mark]}]}
     if path == "/v1/datasets":
         return [{"content": recording(n=60 + len(victim.mark)), "headers": CSV}]
     return [{"content": json.dumps(body), "headers": JSON} for body in bodies.get(path, [])]
@@ -156,7 +160,7 @@ def _list_bodies(path: str, victim: Side) -> list[dict[str, Any]]:
 def _list_requests(guarded: Guarded, victim: Side) -> Iterator[tuple[str, APIRoute, str, Any]]:
     for method, route in _list_routes(guarded):
         is_reading = method in ("GET", "HEAD", "OPTIONS")
-        arguments = [{}] if is_reading else _list_bodies(route.path, victim)
+        arguments = [{}] if is_reading else _list_bodies(method, route.path, victim)
         if route.body_field is not None or "requestBody" in (route.openapi_extra or {}):
             assert arguments or route.path in ("/sign-in", "/keys"), f"no body for {route.path}"
         known = {**victim.ids, **({"name": FIGURES} if "/figures/" in route.path else {})}

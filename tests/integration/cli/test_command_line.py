@@ -102,7 +102,7 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
     [
         (["submitt"], "no such command 'submitt'. Did you mean 'submit'?"),
         (["identify", "a.csv"], "missing option '--model' (lagid identify --help)"),
-        (["jobs", "--stat", "queued"], "no such option: --stat (Possible options: --state)"),
+        (["jobs", "--stat", "queued"], "no such option: --stat (Possible options: --state, --tag)"),
         (["jobs", "--state", "late"], "invalid value for '--state': 'late' is not one of"),
         (
             ["runs", "profile", "run_1", "--points", "2"],

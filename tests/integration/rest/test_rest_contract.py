@@ -24,6 +24,7 @@ STREAMED = ("stream_events",)
 # What an example refers to is there only after these; all others come in the document's order.
 FIRST = ("simulate_dataset", "derive_dataset", "add_model", "accept_reference")
 LAST = ("cancel_job", "resume_job")
+DELETIONS = ("delete_reference", "delete_model", "delete_run", "delete_job", "delete_dataset")
 
 
 class World(NamedTuple):
@@ -32,6 +33,8 @@ class World(NamedTuple):
     server: TestClient
     document: dict[str, Any]
     names: dict[str, str]
+    doomed: dict[str, str]
+    """What the deletions delete."""
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,14 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         parts = parts_of(server)
         carried_out(parts, batch)
         runs = carried_out(parts, pair)
+        doomed_job = post("/v1/jobs", "submit_job", algorithm=SMALL, sweep=twice)
+        doomed = {
+            examples.RUN: carried_out(parts, doomed_job)[0],
+            examples.JOB: doomed_job,
+            examples.DATASET_ID: post(
+                "/v1/datasets:simulate", "simulate_dataset", name="doomed", samples=50
+            ),
+        }
         names = {
             examples.DATASET_ID: dataset,
             examples.RUN: runs[0],
@@ -60,7 +71,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             examples.JOB: batch,
             "waiting": post("/v1/jobs", "submit_job"),
         }
-        yield World(server, document, names)
+        yield World(server, document, names, doomed)
 
 
 def list_examples(world: World) -> list[tuple[str, str, dict[str, Any]]]:
@@ -70,7 +81,8 @@ def list_examples(world: World) -> list[tuple[str, str, dict[str, Any]]]:
         for path, methods in world.document["paths"].items()
         for method, operation in methods.items()
     ]
-    rank = {name: n - len(FIRST) for n, name in enumerate(FIRST)} | dict.fromkeys(LAST, 1)
+    rank = {name: n - len(FIRST) for n, name in enumerate(FIRST)}
+    rank |= {name: n + 1 for n, name in enumerate(LAST + DELETIONS)}
     return sorted(all_of_them, key=lambda entry: rank.get(entry[2]["operationId"], 0))
 
 
@@ -81,6 +93,8 @@ def fill_path(world: World, path: str, operation: dict[str, Any]) -> str:
     names = world.names
     if operation["operationId"] in LAST:
         names = {**names, examples.JOB: names["waiting"]}
+    if operation["operationId"] in DELETIONS:
+        names = {**names, **world.doomed}
     for name, real in names.items():
         path = path.replace(name, real)
     return path

@@ -1,9 +1,12 @@
 """Datasets over REST: stored once, read in parts, derived, simulated, traced back."""
 
+from hashlib import sha256
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
 from service.formats.mcap import read_mcap
@@ -172,6 +175,28 @@ def test_an_input_is_the_same_as_a_formula_and_as_a_frequency(server: TestClient
         values.append(read_mcap(content).channel("y").values)
     np.testing.assert_allclose(values[0], values[1], atol=1e-9)
     np.testing.assert_allclose(values[0], values[2], atol=1e-9)
+
+
+def test_a_file_names_its_source_and_the_recorded_clock(server: TestClient) -> None:
+    rows = [f"2026-01-31T08:00:{second:02d}Z,{second},{second % 7}" for second in range(30)]
+    content = "\n".join(["time,u,y", *rows]).encode()
+    stored = server.post("/v1/datasets?name=clock", content=content, headers=CSV).json()
+    assert stored["started_at"] == "2026-01-31T08:00:00+00:00"
+    derived = server.post(
+        f"/v1/datasets/{stored['id']}:derive", json={"steps": [{"trim": {"start": 5}}]}
+    ).json()
+    assert derived["started_at"] == stored["started_at"]
+    files = {
+        one["id"]: server.get(f"/v1/datasets/{one['id']}/content").content
+        for one in (stored, derived)
+    }
+    metadata = [
+        next(make_reader(BytesIO(file)).iter_metadata()).metadata for file in files.values()
+    ]
+    assert metadata[0]["source"] == sha256(content).hexdigest()
+    assert (metadata[1]["source"], metadata[1]["parents"]) == ("", stored["id"])
+    assert [one["started_at"] for one in metadata] == [stored["started_at"]] * 2
+    assert "2026-01-31T08:00:00" in server.get(f"/datasets/{stored['id']}").text
 
 
 def test_lineage_leads_from_a_derived_dataset_to_its_source(

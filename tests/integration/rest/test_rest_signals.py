@@ -1,16 +1,19 @@
 """The fitted signals of runs that were stored together, over REST: each run has its own file."""
 
+import json
 from collections.abc import Iterator
+from io import BytesIO
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.dispatch import fitted_signals
-from service.formats.mcap import read_fitted_outputs
+from service.formats.mcap import read_fitted_outputs, read_mcap, read_run_metadata
 from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
@@ -91,7 +94,54 @@ def test_a_run_that_is_taken_over_shows_the_same_signals(served: Served) -> None
         first, second = (
             served.server.get(f"/v1/runs/{run}/signals.mcap").content for run in (old, new)
         )
-        assert first == second
+        fits = [read_fitted_outputs(content) for content in (first, second)]
+        assert fits[0][0].simulated.tobytes() == fits[1][0].simulated.tobytes()
+        about = read_run_metadata(second)
+        assert (about["run"], about["reused_from"]) == (new, old)  # a file of its own
+
+
+def test_the_file_of_a_run_says_what_it_was_made_from(served: Served) -> None:
+    run = served.runs[1]
+    told = served.server.get(f"/v1/runs/{run}").json()
+    content = served.server.get(f"/v1/runs/{run}/signals.mcap").content
+    about = read_run_metadata(content)
+    assert (about["run"], about["job"]) == (run, told["job"])
+    for name in ("version", "fingerprint", "spec_hash"):
+        assert about[name] == told[name]
+        assert told[name]
+    assert json.loads(about["seed"]) == told["seed"]
+    assert json.loads(about["model"])["name"] == "fopdt"
+    estimates = {one["name"]: one["value"] for one in told["parameters"]}
+    assert {one["name"]: one["value"] for one in json.loads(about["parameters"])} == estimates
+    (dataset,) = json.loads(about["datasets"])
+    assert dataset["id"] == served.body["datasets"][0]
+    stored = served.server.get(f"/v1/datasets/{dataset['id']}").json()
+    assert dataset["sha256"] == stored["sha256"]
+    summary = make_reader(BytesIO(content)).get_summary()
+    assert summary is not None
+    assert {channel.topic for channel in summary.channels.values()} == {"/fit", "/inputs"}
+    recording = read_mcap(content)
+    whole = read_mcap(served.server.get(f"/v1/datasets/{dataset['id']}/content").content)
+    np.testing.assert_array_equal(
+        recording.channel("estimation 1/u/input").values, whole.channel("u").values
+    )
+
+
+def test_a_job_and_an_export_name_the_program_that_identified(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = served.server.get(f"/v1/runs/{served.runs[0]}").json()["job"]
+    told = served.server.get(f"/v1/jobs/{job}").json()
+    run = served.server.get(f"/v1/runs/{served.runs[0]}").json()
+    assert (told["version"], told["fingerprint"]) == (run["version"], run["fingerprint"])
+    assert len(told["spec_hash"]) == 64
+    with served.parts.database.write_session() as session:
+        row = session.get_one(Run, served.runs[0])
+        row.result = {**(row.result or {}), "version": "0.0.7"}
+    exported = served.server.get(f"/v1/runs/{served.runs[0]}/export?format=python").text
+    assert "Identified by lagid 0.0.7." in exported
+    document = served.server.get(f"/v1/runs/{served.runs[0]}/export").json()
+    assert document["lagid"] == "0.0.7"
 
 
 def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(

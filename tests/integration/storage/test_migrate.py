@@ -14,11 +14,13 @@ import migrations
 from service.core.states import JobState
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
+from service.repositories.datasets import DatasetRepository
+from service.repositories.lineage import LineageLink, LineageRepository
 from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
-from service.storage.tables import Base, Event, Job, Project, Run, StoredSummary
-from tests.stored import claim, claimed, parcels_of, record_success, submit
+from service.storage.tables import Base, Event, Job, Project, Run, SearchTerm, StoredSummary
+from tests.stored import claim, claimed, new_dataset, parcels_of, record_success, submit
 
 HEAD = migrate.find_head_revision()
 VERSIONS = Path(migrations.__file__).parent / "versions"
@@ -106,6 +108,37 @@ def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):
     assert (held.attempt, held.lease_owner) == (leased.lease.attempt, "d3")
     again = claim(database, "d4")
     assert (again.job.id, again.runs, again.is_new) == (job, range(6), False)
+
+
+def test_stored_jobs_and_datasets_are_found_by_what_they_already_had(empty_database):
+    axis = {"path": "/datasets", "values": ["ds_1", "ds_2"], "labels": [{"x": 5.0}, {"x": 10}]}
+    spec = {"model": {"name": "pump"}, "datasets": ["ds_1"], "sweep": {"axes": [axis]}}
+    migrate.upgrade_database(empty_database)
+    first, (run,) = claimed(empty_database, spec={"model": "tube", "datasets": ["ds_3"]})
+    later, _ = claimed(empty_database, spec={**spec, "warm_start": run})
+    with empty_database.write_session() as session:
+        segments = [{"labels": {"length_m": 5}}]
+        new = new_dataset(details={"segments": segments})
+        data = DatasetRepository(session).add(new).dataset.id
+    migrate.downgrade_database(empty_database, "0002")
+    migrate.upgrade_database(empty_database)
+    found = {(kind, value, item) for _, kind, value, item in rows(empty_database, SearchTerm)}
+    job = later.job.id
+    assert found == {
+        ("job:model", "tube", first.job.id),
+        ("job:dataset", "ds_3", first.job.id),
+        ("job:model", "pump", job),
+        ("job:dataset", "ds_1", job),
+        ("job:dataset", "ds_2", job),
+        ("job:label", "x=5", job),
+        ("job:label", "x=10", job),
+        ("dataset:label", "length_m=5", data),
+    }
+    with empty_database.read_session() as session:
+        lineage = LineageRepository(session)
+        assert lineage.list_ancestors(job) == sorted(
+            [LineageLink(job, run, "warm-start"), LineageLink(run, first.job.id, "computed")]
+        )
 
 
 def rows(database, kind):

@@ -1,4 +1,4 @@
-"""Bytes over HTTP: of several files in one object each answer has its own, whole or in part."""
+"""Bytes over HTTP: each answer has those of its object, whole or in part."""
 
 import asyncio
 from functools import partial
@@ -9,32 +9,28 @@ import pytest
 from starlette.requests import Request
 
 from service.api import content
-from service.api.content import ByteRange, content_response, receive_upload
+from service.api.content import content_response, receive_upload
 from service.core.errors import StaleVersion, StalledRequest, UnsatisfiableRange
 from service.core.settings import Settings
 from tests.rest import awaited
 
-FIRST, SECOND = b"0123456789", b"abcdefgh"
-OBJECT = "f" * 64
-PLACES = {"first": ByteRange(0, 10), "second": ByteRange(10, 18), "whole": None}
-WHOLE = {"first": FIRST, "second": SECOND, "whole": FIRST + SECOND}
+WHOLE = {"first": b"0123456789", "second": b"abcdefgh"}
 
 
-class OneObject:
-    """A store with both files in one object."""
+class TwoObjects:
+    """A store with two objects, which have names in the place of hashes."""
 
     def get_size(self, sha256: str) -> int:
-        assert sha256 == OBJECT
-        return len(FIRST + SECOND)
+        return len(WHOLE[sha256])
 
     def get_stream(self, sha256: str, start: int, length: int) -> list[bytes]:
-        return [(FIRST + SECOND)[start : start + length]]
+        return [WHOLE[sha256][start : start + length]]
 
 
 def answer(file: str, method: str = "GET", **headers: str) -> Any:
     pairs = [(name.replace("_", "-").encode(), text.encode()) for name, text in headers.items()]
     request = Request({"type": "http", "method": method, "path": "/", "headers": pairs})
-    return content_response(request, OneObject(), OBJECT, "run.mcap", PLACES[file])
+    return content_response(request, TwoObjects(), file, "run.mcap")
 
 
 def body(response: Any) -> bytes:
@@ -44,7 +40,7 @@ def body(response: Any) -> bytes:
     return awaited(read)
 
 
-@pytest.mark.parametrize("file", PLACES)
+@pytest.mark.parametrize("file", WHOLE)
 def test_a_file_comes_whole_with_its_length(file: str) -> None:
     found = answer(file)
     assert (found.status_code, body(found)) == (200, WHOLE[file])
@@ -52,7 +48,7 @@ def test_a_file_comes_whole_with_its_length(file: str) -> None:
     assert answer(file, "HEAD").headers["content-length"] == str(len(WHOLE[file]))
 
 
-@pytest.mark.parametrize("file", PLACES)
+@pytest.mark.parametrize("file", WHOLE)
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -84,12 +80,12 @@ def test_a_range_outside_the_file_is_refused_also_if_the_object_goes_on(text: st
 
 @pytest.mark.parametrize("text", ["bytes=0-1,3-4", "bytes=-", "lines=0-1", "bytes=x-"])
 def test_a_range_that_is_not_understood_gives_the_whole_file(text: str) -> None:
-    assert body(answer("second", range=text)) == SECOND
+    assert body(answer("second", range=text)) == WHOLE["second"]
 
 
 def test_each_file_has_its_own_version() -> None:
-    tags = {file: answer(file).headers["etag"] for file in PLACES}
-    assert len(set(tags.values())) == 3
+    tags = {file: answer(file).headers["etag"] for file in WHOLE}
+    assert len(set(tags.values())) == len(WHOLE)
     for file, tag in tags.items():
         assert answer(file, if_none_match=tag).status_code == 304
         assert answer(file, if_none_match=f'"x", W/{tag}').status_code == 304

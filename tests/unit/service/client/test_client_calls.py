@@ -143,6 +143,20 @@ def test_a_page_is_fetched_when_its_first_item_is_wanted() -> None:
         assert asked == [None, "2"]
 
 
+@pytest.mark.parametrize("kind", ["datasets", "models", "jobs", "references"])
+def test_lists_and_iterators_ask_with_the_same_filters(kind: str) -> None:
+    asked = []
+
+    def give_page(request: httpx.Request) -> httpx.Response:
+        asked.append((request.url.params.get("name"), request.url.params.get_list("tag")))
+        return httpx.Response(200, json={"items": [], "next": None})
+
+    with Client("http://here", transport=httpx.MockTransport(give_page)) as client:
+        getattr(client, kind)(name="tube", tag=["a", "b"])
+        list(getattr(client, f"iterate_{kind}")(name="tube", tag=["a", "b"]))
+    assert asked == [("tube", ["a", "b"])] * 2
+
+
 def test_a_list_of_runs_becomes_a_table() -> None:
     estimate = {"name": "L", "value": 0.5, "stderr": None, "status": "fixed", "unit": "s"}
     run = {"number": 0, "cell": {"/seed": 1}, "parameters": [estimate], "warnings": ["w"]}

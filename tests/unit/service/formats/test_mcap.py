@@ -3,6 +3,7 @@
 import struct
 import zlib
 from dataclasses import replace
+from datetime import UTC, datetime
 from io import BytesIO
 
 import numpy as np
@@ -19,9 +20,11 @@ from mcap.stream_reader import StreamReader
 from service.formats import mcap_writer
 from service.formats.limits import DEFAULT_LIMITS
 from service.formats.mcap import (
+    FittedInput,
     FittedOutput,
     read_fitted_outputs,
     read_mcap,
+    read_run_metadata,
     write_fitted_outputs,
     write_recording,
 )
@@ -277,7 +280,7 @@ def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
         FittedOutput("validation", 2, "y", "m", later, np.array([1, np.nan, 2.0]), np.zeros(3)),
     ]
     stream = BytesIO()
-    write_fitted_outputs("run_1", fits, stream)
+    write_fitted_outputs(fits, stream)
     for fit, back in zip(fits, read_fitted_outputs(stream.getvalue()), strict=True):
         assert (back.experiment, back.name, back.unit) == (fit.experiment, fit.name, fit.unit)
         for part in ("times", "measured", "simulated"):
@@ -285,8 +288,32 @@ def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
     summary = make_reader(BytesIO(stream.getvalue())).get_summary()
     assert summary is not None
     topics = {channel.topic for channel in summary.channels.values()}
-    assert topics == {"/fit/run_1", "/fit/run_1/2"}
+    assert topics == {"/fit", "/fit/2"}
     assert b"y_residual" in next(iter(summary.schemas.values())).data
+
+
+def test_inputs_and_origin_of_a_run_are_in_its_file_under_fixed_topics() -> None:
+    slow, started = TIMES[::2], datetime(2026, 1, 31, 8, tzinfo=UTC)
+    fits = [FittedOutput("estimation", 1, "y", "m", TIMES, TIMES + 1, TIMES)]
+    inputs = [
+        FittedInput("estimation", 1, Channel("u", TIMES, TIMES, "V", "zero")),
+        FittedInput("estimation", 1, Channel("w", slow, slow)),
+        FittedInput("validation", 1, Channel("u", TIMES, TIMES * 2, "V")),
+    ]
+    stream = BytesIO()
+    write_fitted_outputs(fits, stream, inputs=inputs, run={"run": "run_1"}, started_at=started)
+    content = stream.getvalue()
+    summary = make_reader(BytesIO(content)).get_summary()
+    assert summary is not None
+    topics = [channel.topic for channel in summary.channels.values()]
+    assert topics == ["/fit", "/inputs", "/inputs/2", "/inputs/3"]
+    assert read_run_metadata(content) == {"run": "run_1"}
+    assert len(read_fitted_outputs(content)) == 1
+    back = read_mcap(content)
+    assert back.started_at == started
+    held = back.channel("estimation 1/u/input")
+    assert (held.unit, held.hold) == ("V", "zero")
+    np.testing.assert_array_equal(back.channel("validation 1/u/input").values, TIMES * 2)
 
 
 def test_the_widest_recording_is_written_within_the_limits_of_the_reader() -> None:

@@ -1,0 +1,1 @@
+"""What users do with a stored item of any kind: find, edit, delete."""

@@ -1,0 +1,67 @@
+"""Housekeeping of the web process: retention, removal of deleted rows, and of their objects."""
+
+import logging
+import threading
+import time
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.storage.errors import StorageError
+from service.storage.garbage import delete_orphans
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+from service.upkeep.retention import delete_expired_jobs, purge_deleted_jobs
+
+_log = logging.getLogger(__name__)
+
+FIRST_PAUSE_SECONDS = 60.0
+"""Pause after the start, so that a service that starts is not slowed."""
+PAUSE_SECONDS = 600.0
+COLLECT_SECONDS = 3600.0
+"""Pause between two collections of objects, which list the whole store."""
+
+
+class Housekeeper:
+    """Keeps the data in order in a separate thread until `stopping` is set."""
+
+    def __init__(
+        self,
+        database: Database,
+        store: ObjectStore,
+        keep_days: float | None,
+        stopping: threading.Event,
+    ) -> None:
+        self._database, self._store, self._keep_days = database, store, keep_days
+        self._stopping = stopping
+        self._collected_at = time.monotonic()
+        self._has_garbage = False
+        self._thread = threading.Thread(target=self._run_loop, name="housekeeper", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait for the present pass to end, once `stopping` is set."""
+        self._thread.join(5.0)
+
+    def run_pass(self) -> None:
+        """Delete expired jobs, remove the rows of deleted ones, and then their objects."""
+        deleted = delete_expired_jobs(self._database, self._keep_days)
+        if deleted:
+            _log.info("retention deleted %s", ", ".join(deleted))
+        n_runs = purge_deleted_jobs(self._database)
+        self._has_garbage = self._has_garbage or bool(deleted) or n_runs > 0
+        if self._has_garbage and time.monotonic() - self._collected_at > COLLECT_SECONDS:
+            n_objects, n_bytes = delete_orphans(self._database, self._store)
+            _log.info("removed %d objects, %d bytes", n_objects, n_bytes)
+            self._collected_at, self._has_garbage = time.monotonic(), False
+
+    def _run_loop(self) -> None:
+        pause = FIRST_PAUSE_SECONDS
+        while not self._stopping.wait(pause):
+            pause = PAUSE_SECONDS
+            try:
+                self.run_pass()
+            except (SQLAlchemyError, StorageError) as error:  # tried again at the next pass
+                _log.warning("housekeeping failed: %s", str(error).splitlines()[0])

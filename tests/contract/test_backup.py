@@ -1,0 +1,320 @@
+"""Backups hold every row and object, and are restored bit for bit: both databases, both stores."""
+
+import json
+import threading
+import zipfile
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from service.access.keys import create_key
+from service.core.states import JobState
+from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
+from service.queue.leases import LeaseQueue
+from service.repositories.history import HistoryPoint, pack_history
+from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.references import ReferenceRepository
+from service.storage import migrate
+from service.storage.columns import utc_now
+from service.storage.errors import LeaseLost
+from service.storage.objects import ObjectStore, open_store
+from service.storage.sessions import Database
+from service.storage.statements import insert_missing
+from service.storage.tables import (
+    DEFAULT_PROJECT,
+    ApiKey,
+    AuditEntry,
+    Base,
+    Checkpoint,
+    Event,
+    RunHistory,
+    WebSession,
+)
+from service.upkeep import backup
+from service.upkeep.backup import InvalidBackup, TargetInUse, restore_backup, write_backup
+from tests.contract.test_items import add_dataset, edit, end_job
+from tests.database import KINDS, empty_postgres, empty_sqlite
+from tests.stored import Clock, claim, parcels_of, submit
+
+Rows = dict[str, list[tuple[Any, ...]]]
+
+
+def read_rows(database: Database) -> Rows:
+    """All rows of all tables that a backup holds."""
+    with database.engine.connect() as connection:
+        return {
+            table.name: sorted(map(tuple, connection.execute(select(table))), key=repr)
+            for table in Base.metadata.sorted_tables
+            if table.name not in backup._SKIPPED_TABLES
+        }
+
+
+def read_objects(store: ObjectStore) -> dict[str, bytes]:
+    return {one.sha256: store.get_bytes(one.sha256) for one in store.list_objects()}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ObjectStore:
+    return open_store(f"file://{tmp_path}/objects")
+
+
+@pytest.fixture
+def filled(database: Database, store: ObjectStore) -> Database:
+    """A database with rows of many tables, and the objects that they name."""
+    sha256 = store.put_stream([b"recording" * 1000]).sha256
+    data = add_dataset(database, name="größe [m³]", sha256=sha256)
+    job, (run, _) = end_job(
+        database, (JobState.SUCCEEDED, JobState.FAILED), dataset=data, model={"z": 1, "name": "a"}
+    )
+    edit(database, "job", job, tags=["good"], note="two\nlines, “quoted”")
+    point = HistoryPoint(run, 0, 0, 1, 10, 0.1 + 0.2, "genetic", (1e-300,))
+    with database.write_session() as session:
+        ReferenceRepository(session).accept_run("tube", run)
+        insert_missing(session, RunHistory, pack_history([point]))
+        state = {"job_id": job, "attempt": 1, "evaluations": 2**40, "state": bytes(range(256))}
+        session.add(Checkpoint(run_id=run, **state))
+        JobRepository(session).submit(NewJob("open", {}), key="k")
+        DispatcherRepository(session).add_dispatcher("d1", {LEASE_SECONDS_KEY: 30.0})
+    return database
+
+
+@pytest.fixture(params=KINDS)
+def target(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    """An empty database without tables, of both kinds."""
+    folder = tmp_path / "target"
+    folder.mkdir()
+    with empty_sqlite(folder) if request.param == "sqlite" else empty_postgres() as database:
+        yield database
+
+
+def test_a_restored_place_has_the_same_rows_and_objects(
+    filled: Database, store: ObjectStore, target: Database, tmp_path: Path
+) -> None:
+    """Also from one kind of database into the other."""
+    file, other = tmp_path / "b.zip", open_store(f"file://{tmp_path}/other")
+    written = write_backup(filled, store, file)
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert restore_backup(target, other, file) == written
+    assert read_rows(target) == read_rows(filled)
+    assert read_objects(other) == read_objects(store)
+    assert migrate.list_differences(target) == []
+    with target.read_session() as session:
+        job = JobRepository(session).list_page().items[1]
+        assert list(job.spec["model"]) == ["z", "name"]  # the order of keys is kept
+    with target.write_session() as session:  # further rows are numbered after the restored ones
+        last = max(session.scalars(select(Event.id)))
+        JobRepository(session).submit(NewJob("next", {}))
+        assert max(session.scalars(select(Event.id))) > last
+
+
+def test_leased_parcels_of_a_backup_are_claimed_again(
+    database: Database, target: Database, tmp_path: Path
+) -> None:
+    store, clock = open_store(f"file://{tmp_path}/objects"), Clock()
+    job = submit(database, n_runs=6)
+    with database.write_session() as session:
+        held = LeaseQueue(session, clock).claim_job("d1", choose_size=lambda _: 4)
+        assert held is not None
+    write_backup(database, store, tmp_path / "b.zip")
+    restore_backup(target, open_store(f"file://{tmp_path}/other"), tmp_path / "b.zip")
+    assert [parcel.lease_owner for parcel in parcels_of(target, job)] == ["d1", None]
+    clock.advance(3600)
+    with target.write_session() as session:
+        LeaseQueue(session, clock).reap_expired()
+    claims = [claim(target, "d2", clock), claim(target, "d3", clock)]
+    assert [one and one.runs for one in claims] == [range(4), range(4, 6)]
+    with target.write_session() as session, pytest.raises(LeaseLost):
+        LeaseQueue(session, clock).append_event(held.lease, "log", {"message": "late"})
+
+
+def test_keys_and_the_audit_log_are_restored_and_sessions_of_browsers_are_not(
+    database: Database, target: Database, tmp_path: Path
+) -> None:
+    store = open_store(f"file://{tmp_path}/objects")
+    with database.write_session() as session:
+        key = create_key(session, DEFAULT_PROJECT, "laptop", "write")
+        expires_at = utc_now() + timedelta(days=1)
+        session.add(WebSession(digest="d", key_id=key.row.id, expires_at=expires_at))
+    write_backup(database, store, tmp_path / "b.zip")
+    for force in (False, True):
+        other = open_store(f"file://{tmp_path}/other")
+        restore_backup(target, other, tmp_path / "b.zip", force=force)
+        with target.write_session() as session:
+            assert session.scalars(select(ApiKey.digest)).all() == [key.row.digest]
+            assert [row.action for row in session.scalars(select(AuditEntry))] == ["key.create"]
+            assert session.scalars(select(WebSession)).all() == []
+            session.add(WebSession(digest="e", key_id=key.row.id, expires_at=expires_at))
+
+
+def test_a_backup_goes_from_a_folder_into_a_bucket_and_back(
+    sqlite_database: Database, tmp_path: Path, bucket: str
+) -> None:
+    folder, remote = open_store(f"file://{tmp_path}/objects"), open_store(bucket)
+    sha256 = folder.put_stream([b"x" * 100_000]).sha256
+    add_dataset(sqlite_database, sha256=sha256)
+    for number, (source, sink) in enumerate(
+        ((folder, remote), (remote, open_store(f"file://{tmp_path}/again")))
+    ):
+        file, place = tmp_path / f"{number}.zip", tmp_path / str(number)
+        place.mkdir()
+        write_backup(sqlite_database, source, file)
+        with empty_sqlite(place) as restored:
+            assert restore_backup(restored, sink, file).objects == 1
+            assert read_rows(restored) == read_rows(sqlite_database)
+        assert sink.get_bytes(sha256) == b"x" * 100_000
+
+
+def test_a_backup_is_one_state_although_others_write_meanwhile(
+    filled: Database, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, write_table = read_rows(filled), backup._write_table
+
+    def write_and_let_others_submit(*parts: Any) -> dict[str, Any]:
+        def submit() -> None:
+            with filled.write_session() as session:
+                JobRepository(session).submit(NewJob("late", {}))
+
+        thread = threading.Thread(target=submit)
+        thread.start()
+        thread.join()
+        return write_table(*parts)
+
+    monkeypatch.setattr(backup, "_write_table", write_and_let_others_submit)
+    report = write_backup(filled, store, tmp_path / "b.zip")
+    monkeypatch.undo()
+    assert read_rows(filled) != before
+    assert report.rows == {name: len(rows) for name, rows in before.items()}
+
+
+def test_a_place_with_rows_or_objects_is_refused_without_force(
+    filled: Database, store: ObjectStore, target: Database, tmp_path: Path
+) -> None:
+    file = tmp_path / "b.zip"
+    write_backup(filled, store, file)
+    with pytest.raises(TargetInUse, match=r"store is not empty.*--force"):
+        restore_backup(target, store, file)
+    other = open_store(f"file://{tmp_path}/other")
+    restore_backup(target, other, file)
+    with target.write_session() as session:
+        JobRepository(session).submit(NewJob("mine", {}))
+    with pytest.raises(TargetInUse, match=r"rows in .*jobs.*--force"):
+        restore_backup(target, open_store(f"file://{tmp_path}/empty"), file)
+    restore_backup(target, other, file, force=True)
+    assert read_rows(target) == read_rows(filled)
+    with target.write_session() as session:
+        DispatcherRepository(session).add_dispatcher("d2", {LEASE_SECONDS_KEY: 30.0})
+    with pytest.raises(TargetInUse, match="dispatcher d2"):
+        restore_backup(target, other, file, force=True)
+
+
+def test_a_backup_of_an_earlier_revision_is_upgraded(
+    empty_database: Database, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    migrate.upgrade_database(empty_database, "0002")
+    tables = Base.metadata.sorted_tables
+    known = {"projects": ["id", "name", "created_at"]}
+    manifest = {
+        "format": 1,
+        "version": "0",
+        "revision": "0002",
+        "missing": [],
+        "tables": {
+            name: {
+                "columns": [[c, "time" if c == "created_at" else "text"] for c in columns],
+                "rows": 1,
+                "sha256": "",
+            }
+            for name, columns in known.items()
+        },
+    }
+    row = json.dumps(["proj_old", "old", "2026-01-01T00:00:00+00:00"]) + "\n"
+    file = tmp_path / "old.zip"
+    monkeypatch.setattr(backup, "_check_table", lambda *_: None)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("tables/projects.jsonl", row)
+        archive.writestr("manifest.json", json.dumps(manifest))
+    migrate.downgrade_database(empty_database)
+    restore_backup(empty_database, store, file)
+    assert [one[0] for one in read_rows(empty_database)["projects"]] == ["proj_old"]
+    assert len(read_rows(empty_database)) == len(tables) - 2
+    migrate.check_revision(empty_database)
+
+
+def damage(file: Path, name: str, content: bytes | None) -> None:
+    """Replace a member of an archive, or leave it out."""
+    with zipfile.ZipFile(file) as archive:
+        members = {one.filename: archive.read(one) for one in archive.infolist()}
+    with zipfile.ZipFile(file, "w") as archive:
+        for member, data in members.items():
+            if member != name:
+                archive.writestr(member, data)
+            elif content is not None:
+                archive.writestr(member, content)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("manifest.json", None, "no manifest.json"),
+        ("manifest.json", b"{}", "format 1"),
+        ("manifest.json", b'{"format": 1, "revision": "9999", "version": "9"}', "lagid 9 wrote it"),
+        ("tables/jobs.jsonl", b"[]\n", "table jobs is damaged"),
+        ("tables/jobs.jsonl", None, "no table jobs"),
+        ("object", b"other", "object .* is damaged"),
+    ],
+)
+def test_a_damaged_backup_is_refused_and_changes_no_row(
+    sqlite_database: Database, tmp_path: Path, name: str, content: bytes | None, reason: str
+) -> None:
+    source = open_store(f"file://{tmp_path}/objects")
+    sha256 = source.put_stream([b"data"]).sha256
+    add_dataset(sqlite_database, sha256=sha256)
+    file = tmp_path / "b.zip"
+    write_backup(sqlite_database, source, file)
+    damage(file, f"objects/{sha256}" if name == "object" else name, content)
+    place = tmp_path / "place"
+    place.mkdir()
+    with empty_sqlite(place) as restored:
+        with pytest.raises(InvalidBackup, match=reason):
+            restore_backup(restored, open_store(f"file://{place}/objects"), file)
+        assert migrate.read_current_revision(restored) is None
+
+
+@pytest.mark.parametrize("size", [0, 10, -1])
+def test_a_truncated_backup_is_refused(
+    sqlite_database: Database, tmp_path: Path, size: int
+) -> None:
+    store, file = open_store(f"file://{tmp_path}/objects"), tmp_path / "b.zip"
+    write_backup(sqlite_database, store, file)
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(InvalidBackup, match="no complete ZIP"):
+        restore_backup(sqlite_database, store, file, force=True)
+
+
+def test_an_object_that_the_store_has_lost_is_reported(
+    sqlite_database: Database, tmp_path: Path
+) -> None:
+    add_dataset(sqlite_database, sha256="e" * 64)
+    store = open_store(f"file://{tmp_path}/objects")
+    report = write_backup(sqlite_database, store, tmp_path / "b.zip")
+    assert (report.objects, report.missing) == (0, ("e" * 64,))
+
+
+def test_a_backup_that_fails_leaves_the_earlier_file(
+    sqlite_database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "b.zip"
+    file.write_bytes(b"earlier")
+
+    def fail(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(backup, "_write_table", fail)
+    with pytest.raises(OSError, match="No space"):
+        write_backup(sqlite_database, open_store(f"file://{tmp_path}/objects"), file)
+    assert file.read_bytes() == b"earlier"
+    assert not list(tmp_path.glob("*.part"))
