@@ -273,6 +273,7 @@ class Dispatcher:
                 self._claim_next(lease.job_id)  # so that the job does not wait in between
             if not is_whole and retry_transient(recorder.end_parcel):
                 self._forget_parcel(lease)
+                self._leases.forget_lease(lease)
                 return
             last_steps = retry_transient(
                 partial(build_end_maker, self._database, lease, held.parts)
@@ -303,7 +304,7 @@ class Dispatcher:
         if lease in self._lost:
             self._lost.discard(lease)
             return
-        try:
+        try:  # the lease is renewed until the end is written
             with bind_lease(lease):
                 retry_transient(
                     recorder.cancel_parcel
@@ -314,6 +315,8 @@ class Dispatcher:
         except LeaseLost as error:
             with bind_lease(lease):
                 _log.warning("the end of the job was not written: %s", error)
+        finally:
+            self._leases.forget_lease(lease)
 
     def _forget_parcel(self, lease: Lease) -> None:
         del self._recorders[lease]
@@ -322,8 +325,6 @@ class Dispatcher:
         if not held.parcels:
             del self._jobs[lease.job_id]
         metrics.held_jobs.set(len(self._jobs))
-        if lease not in self._lost:
-            self._leases.forget_lease(lease)
 
     def _release_jobs(self, *, lost: bool = False) -> None:
         self._side_jobs.stop()

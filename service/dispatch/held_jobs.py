@@ -77,7 +77,12 @@ class HeldJob:
         self._n_last, self._claimed_at = len(claim.runs), self.stopwatch()
 
     def choose_size(self, job: Job, n_sharing: int = 1) -> int:
-        """Choose how many runs the next parcel has, if `n_sharing` dispatchers work."""
+        """Choose how many runs the next parcel has, if `n_sharing` dispatchers work.
+
+        All of them if some start from others.
+        """
+        if may_wait(self.job):
+            return job.n_runs
         read_in = max(self.stopwatch() - self._claimed_at, 1e-3)
         change = PARCEL_SECONDS * (1 - UNREAD_PART) / read_in
         by_time = self._n_last * min(max(change, 1 / MAX_CHANGE), MAX_CHANGE)

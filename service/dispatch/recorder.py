@@ -406,6 +406,7 @@ class RunRecorder:
         except BaseException:
             batch.pending.append(self._pending)
             self._pending = batch.pending
+            self._count_reused(batch.reused_outcomes)
             self._has_new_progress = True
             raise
         self._note_written(batch)
@@ -413,10 +414,7 @@ class RunRecorder:
     def _note_written(self, batch: _Batch) -> None:
         self._pending.started[:0] = batch.pending.started  # those beyond `MAX_STARTED`
         self._results_written_at = batch.taken_at
-        reused = batch.reused_outcomes
-        self._evaluations += sum(outcome.evaluations for outcome in reused)
-        self._generation = max([self._generation, *(outcome.generations for outcome in reused)])
-        self._best = min([self._best, *_list_rms(reused)])
+        self._count_reused(batch.reused_outcomes)
         if batch.progress is not None:
             self._progress_written_at = batch.taken_at
         if batch.with_checkpoints:
@@ -427,6 +425,12 @@ class RunRecorder:
                 live.migrants = len(state.migrations)
             if batch.with_checkpoints and live.state is state:
                 live.changed = False
+
+    def _count_reused(self, reused: list[RunOutcome]) -> None:
+        """Count runs whose results were taken over, once they are committed."""
+        self._evaluations += sum(outcome.evaluations for outcome in reused)
+        self._generation = max([self._generation, *(outcome.generations for outcome in reused)])
+        self._best = min([self._best, *_list_rms(reused)])
 
     def _compute_progress(self) -> JobProgress:
         """Compute the parcel's progress; its generation is that of the most advanced run."""

@@ -12,9 +12,10 @@ All times come from one clock: that of PostgreSQL, or with SQLite that of the ho
 makes the reaper late or early. But the attempt alone decides which dispatcher may write.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from itertools import groupby
 from typing import Any, Literal, NamedTuple
 
 from sqlalchemy import (
@@ -218,11 +219,28 @@ class LeaseQueue:
         """Leave only the first runs in a parcel; the others wait as a new one."""
         stop = parcel.first + max(size, 1)
         if stop < parcel.stop:
+            measured = self._count_evaluations(parcel.job_id, stop) if parcel.evaluations else 0
             rest = Parcel(
-                job_id=parcel.job_id, first=stop, stop=parcel.stop, attempt=parcel.attempt
+                job_id=parcel.job_id,
+                first=stop,
+                stop=parcel.stop,
+                attempt=parcel.attempt,
+                evaluations=min(measured, parcel.evaluations),
+                lost_leases=parcel.lost_leases,
             )
             self._session.add(rest)
-            parcel.stop = stop
+            parcel.stop, parcel.evaluations = stop, parcel.evaluations - rest.evaluations
+
+    def _count_evaluations(self, job_id: str, first: int) -> int:
+        """Count the evaluations of the runs from number `first` on, as far as they are stored."""
+        later = Run.job_id == job_id, Run.number >= first
+        ended = select(func.sum(Run.evaluations)).where(*later, ~Run.state.in_(OPEN_STATES))
+        begun = (
+            select(func.sum(Checkpoint.evaluations))
+            .join(Run, Run.id == Checkpoint.run_id)
+            .where(*later, Run.state.in_(OPEN_STATES))
+        )
+        return sum(int(self._session.scalar(query) or 0) for query in (ended, begun))
 
     def recover_claim(self, owner: str, held: Collection[Lease]) -> Claim | None:
         """Return a parcel that this owner claimed without receiving the answer, if there is one.
@@ -327,6 +345,9 @@ class LeaseQueue:
         others = select(Parcel.first).where(Parcel.job_id == job.id, Parcel.first != parcel.first)
         if self._session.scalar(others.limit(1)) is None:
             return False
+        if job.cancel_requested:  # parcels that were cancelled stay until the job ends
+            self._cancel_parcel(parcel, job)
+            return True
         self._session.delete(parcel)
         self._session.flush()
         self._note_left(job)
@@ -375,7 +396,7 @@ class LeaseQueue:
         """
         parcel, job = self.lock_lease(lease)
         if lost:
-            self._fail_or_retry(parcel, job, others_progressed=others_progressed)
+            self._settle_lost([parcel], job, {lease.owner} if others_progressed else set())
             return
         job = self._lock_job(lease.job_id)
         if job.cancel_requested:
@@ -417,15 +438,9 @@ class LeaseQueue:
         lost_owners = frozenset(str(parcel.lease_owner) for parcel in lost)
         busy = {owner for owner in lost_owners if self.has_progressed(owner)}
         fates: dict[str, JobState] = {}
-        for parcel in lost:
-            if fates.get(parcel.job_id) is JobState.FAILED:
-                continue  # this parcel has ended with its job
-            job = self._session.get_one(
-                Job, parcel.job_id, options=[_DEFER_SPEC], populate_existing=True
-            )
-            fates[job.id] = self._fail_or_retry(
-                parcel, job, others_progressed=parcel.lease_owner in busy
-            )
+        for job_id, parcels in groupby(lost, key=lambda parcel: parcel.job_id):
+            job = self._session.get_one(Job, job_id, options=[_DEFER_SPEC], populate_existing=True)
+            fates[job_id] = self._settle_lost(list(parcels), job, busy)
         queued, failed, cancelled = (
             tuple(job for job, fate in fates.items() if fate is state)
             for state in (JobState.QUEUED, JobState.FAILED, JobState.CANCELLED)
@@ -467,32 +482,44 @@ class LeaseQueue:
         if n_left:
             raise RowConflict(f"{job_id} cannot succeed: {n_left} of its runs did not finish")
 
-    def _fail_or_retry(self, parcel: Parcel, job: Job, *, others_progressed: bool) -> JobState:
-        """Decide on a lost parcel, which is locked; return its fate."""
-        this = Parcel.job_id == parcel.job_id, Parcel.first == parcel.first
-        progressed = self._session.scalar(select(Parcel.first).where(*this, _has_progressed()))
-        parcel.lost_leases = parcel.lost_leases + 1 if progressed is None else 1
-        is_spared = others_progressed and progressed is None
-        max_losses = job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
-        has_failed = parcel.lost_leases >= max_losses
-        if has_failed:
+    def _settle_lost(self, parcels: Sequence[Parcel], job: Job, busy: Collection[str]) -> JobState:
+        """Decide on lost parcels of a job, which are locked; return the fate of the job.
+
+        All parcels are locked before the job, as everywhere: else a writer of another parcel would
+        wait for the job, and be waited for.
+        """
+        failed = [parcel for parcel in parcels if self._count_loss(parcel, job, busy)]
+        self._session.flush()
+        if failed:
             lock_parcels(self._session, job.id)
         job = self._lock_job(job.id)
-        job.lost_leases = parcel.lost_leases
-        if job.cancel_requested:
-            self._cancel_parcel(parcel, job)
-            return JobState.CANCELLED
-        if has_failed:
+        job.lost_leases = max(parcel.lost_leases for parcel in parcels)
+        if failed and not job.cancel_requested:
             self._end_job(
                 job,
                 JobState.FAILED,
-                f"gave up after {parcel.lost_leases} attempts without progress: the dispatcher or "
-                f"its workers stopped. The last dispatcher was {parcel.lease_owner}. See its log, "
-                "then resume the job.",
+                f"gave up after {failed[0].lost_leases} attempts without progress: the dispatcher "
+                f"or its workers stopped. The last dispatcher was {failed[0].lease_owner}. See "
+                "its log, then resume the job.",
             )
             return JobState.FAILED
-        self._requeue_parcel(parcel, job)
-        return JobState.QUEUED
+        for parcel in parcels:
+            if not job.cancel_requested:
+                self._requeue_parcel(parcel, job)
+            elif not job.state.is_terminal:
+                self._cancel_parcel(parcel, job)
+        return JobState.CANCELLED if job.cancel_requested else JobState.QUEUED
+
+    def _count_loss(self, parcel: Parcel, job: Job, busy: Collection[str]) -> bool:
+        """Count the loss of a parcel; return whether it was lost too often without progress.
+
+        `busy` are owners of which another parcel progressed.
+        """
+        this = Parcel.job_id == parcel.job_id, Parcel.first == parcel.first
+        progressed = self._session.scalar(select(Parcel.first).where(*this, _has_progressed()))
+        parcel.lost_leases = parcel.lost_leases + 1 if progressed is None else 1
+        is_spared = parcel.lease_owner in busy and progressed is None
+        return parcel.lost_leases >= job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
 
     def _end_job(self, job: Job, state: JobState, error: str | None) -> None:
         job.state, job.error, job.finished_at = state, error, self._read_clock()

@@ -213,8 +213,9 @@ class RunWriter:
             self._session.execute(
                 update(Run).where(lost).values(signals), execution_options=RETURNING_OPTIONS
             )
-        is_open = Run.state.in_(OPEN_STATES)
-        ended = select(Run.id).where(Run.id == Checkpoint.run_id, ~is_open)
+        # A cancelled run keeps its own: a resumed job goes on from it.
+        has_ended = Run.state.in_((JobState.SUCCEEDED, JobState.FAILED))
+        ended = select(Run.id).where(Run.id == Checkpoint.run_id, has_ended)
         self._session.execute(
             delete(Checkpoint).where(Checkpoint.job_id == self._lease.job_id, ended.exists()),
             execution_options={"synchronize_session": False},

@@ -4,6 +4,7 @@ import threading
 from datetime import timedelta
 
 import pytest
+from sqlalchemy import select
 
 from service.core.states import JobState
 from service.dispatch import dispatcher, held_jobs
@@ -15,7 +16,9 @@ from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
+from service.storage.tables import Checkpoint
 from tests.dispatching import Place, carry_out
+from tests.results import conclude, write_results
 from tests.stored import job_of, parcels_of, record_outcomes, runs_of, state_of, submit
 from workers.inline_executor import InlineExecutor
 
@@ -180,6 +183,55 @@ def test_a_cancelled_job_ends_with_its_last_holder_also_if_that_one_dies(databas
     assert state_of(database, first.job.id) is JobState.RUNNING
     assert reap(database, "d2").cancelled == (second.job.id,)
     assert state_of(database, first.job.id) is JobState.CANCELLED
+
+
+def test_a_cancelled_job_ends_although_the_runs_of_its_last_holder_ended_first(database, shared):
+    first, second = shared
+    with database.write_session() as session:
+        JobRepository(session).cancel(first.job.id)
+    with database.write_session() as session:
+        LeaseQueue(session).cancel_parcel(second.lease)
+    end_runs(database, first)
+    assert end_parcel(database, first)
+    assert state_of(database, first.job.id) is JobState.CANCELLED
+    assert parcels_of(database, first.job.id) == []
+
+
+def test_checkpoints_of_cancelled_runs_outlive_what_other_holders_write(database, shared):
+    first, second = shared
+    runs = [run.id for run in pending(database, second)]
+    with database.write_session() as session:
+        RunWriter(session, second.lease).save_checkpoints([(run, 7, b"state") for run in runs])
+        JobRepository(session).cancel(first.job.id)
+    with database.write_session() as session:
+        LeaseQueue(session).cancel_parcel(second.lease)
+    write_results(database, first.lease, {pending(database, first)[0].id: conclude()})
+    with database.read_session() as session:
+        assert set(session.scalars(select(Checkpoint.run_id))) == set(runs)
+
+
+def test_a_split_leaves_losses_and_evaluations_with_their_runs(database, shared):
+    first, second = shared
+    for got, evaluations in ((first, 400), (second, 1000)):
+        for run in pending(database, got):
+            outcome = RunOutcome(
+                run_id=run.id, state=JobState.SUCCEEDED, evaluations=evaluations // SIZE
+            )
+            record_outcomes(database, got.lease, outcome)
+        with database.write_session() as session:
+            LeaseQueue(session).write_progress(got.lease, JobProgress(evaluations))
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(first.lease, JobState.FAILED, "as told")
+    with database.write_session() as session:
+        JobRepository(session).resume(first.job.id)
+    again = claim(database, "d3")
+    assert [one.evaluations for one in parcels_of(database, first.job.id)] == [400, 1000]
+    with database.write_session() as session:
+        LeaseQueue(session).write_progress(again.lease, JobProgress(400))
+    assert job_of(database, first.job.id).evaluations == 1400
+    assert reap(database, "d3").requeued == (first.job.id,)
+    claim(database, "d4", 1)
+    assert [one.lost_leases for one in parcels_of(database, first.job.id)] == [1, 1, 0]
 
 
 def test_losses_are_counted_for_each_parcel_and_the_first_that_has_too_many_fails_the_job(

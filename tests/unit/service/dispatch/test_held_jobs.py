@@ -24,10 +24,10 @@ def describe_job(n_runs: int = 1_000_000, n_done: int = 0, warm_start: str | Non
     return SimpleNamespace(n_runs=n_runs, n_done=n_done, spec=spec)
 
 
-def hold(size: int, seconds: float) -> tuple[HeldJob, Any]:
+def hold(size: int, seconds: float, **fields: Any) -> tuple[HeldJob, Any]:
     """A job whose last parcel had so many runs, `seconds` ago."""
     now = [0.0]
-    parts: Any = SimpleNamespace(job=describe_job())
+    parts: Any = SimpleNamespace(job=describe_job(**fields))
     held = HeldJob(parts, cast(Any, None), stopwatch=lambda: now[0])
     source: Any = SimpleNamespace(n_unread=0)
     held.add_parcel(Claim(Lease("job", 1, "d"), parts.job, range(size)), source)
@@ -50,6 +50,12 @@ def test_the_last_runs_are_divided_between_the_dispatchers():
     assert held.choose_size(describe_job(100_000, 99_990), n_sharing=4) == FIRST_RUNS
     held, _ = hold(MAX_RUNS, 0.0)
     assert held.choose_size(describe_job()) == MAX_RUNS
+
+
+def test_a_chain_is_never_divided():
+    """Neither by a dispatcher that was taken for dead, and claims its own job again."""
+    held, _ = hold(FIRST_RUNS, 1.0, warm_start="previous")
+    assert held.choose_size(describe_job(warm_start="previous")) == 1_000_000
 
 
 def test_another_parcel_is_wanted_when_little_is_unread():
