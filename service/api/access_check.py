@@ -8,7 +8,6 @@ from urllib.parse import quote
 
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers
 from starlette.requests import Request, cookie_parser
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -26,8 +25,6 @@ from service.pages.render import shown_account
 from service.storage.errors import StorageError
 
 COOKIE = "lagid_session"
-REQUEST_ID_HEADER = "X-Request-ID"
-MAX_REQUEST_ID_CHARACTERS = 100
 
 
 class AccessCheck:
@@ -53,7 +50,6 @@ class AccessCheck:
             await self._refuse(request, error)(scope, receive, send)
             return
         request.state.caller = caller
-        request.state.request_id = _read_request_id(request.headers)
         shown_account.set(caller if caller.name else None)
         await self._app(scope, receive, send)
 
@@ -97,6 +93,8 @@ def is_still_admitted(request: Request, parts: Parts) -> bool:
 def read_credentials(request: Request, settings: Settings) -> Credentials:
     """Read what a request shows of its sender.
 
+    Behind a proxy that authenticates, any ``Authorization`` but that of a key is the proxy's own.
+
     Raises
     ------
     Unauthorized
@@ -105,7 +103,9 @@ def read_credentials(request: Request, settings: Settings) -> Credentials:
     token = None
     if "authorization" in request.headers:
         scheme, _, token = request.headers["authorization"].partition(" ")
-        if scheme.lower() != "bearer" or not token.strip():
+        if settings.auth_mode == "proxy" and not token.strip().startswith("lagid_"):
+            token = None
+        elif scheme.lower() != "bearer" or not token.strip():
             raise Unauthorized(
                 f"found the authorization scheme {scheme!r:.30}; need `Bearer lagid_…`",
                 is_wrong=True,
@@ -116,10 +116,3 @@ def read_credentials(request: Request, settings: Settings) -> Credentials:
         tuple(request.headers.getlist(settings.proxy_header)),
         request.state.peer,
     )
-
-
-def _read_request_id(headers: Headers) -> str | None:
-    """Read the identifier that a proxy or a client gave the request; None if it has none."""
-    text = headers.get(REQUEST_ID_HEADER, "")
-    is_usable = text.isascii() and text.isprintable() and len(text) <= MAX_REQUEST_ID_CHARACTERS
-    return text if text and is_usable else None

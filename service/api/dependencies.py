@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from service.access.callers import Caller
 from service.api.event_feed import EventFeed
 from service.api.failure_delay import FailureDelay
+from service.api.request_log import get_request_id
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database, SessionOwner
@@ -69,7 +70,7 @@ CallerDep = Annotated[Caller, Depends(get_caller)]
 def get_parts(request: Request, caller: CallerDep) -> Parts:
     """Return the parts of this process for the caller."""
     parts: Parts = request.app.state.parts
-    return parts.open_for(caller.to_owner(request.state.request_id))
+    return parts.open_for(caller.to_owner(get_request_id(request)))
 
 
 PartsDep = Annotated[Parts, Depends(get_parts)]

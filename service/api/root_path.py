@@ -9,7 +9,7 @@ def get_service_path(scope: Scope) -> str:
     """Return the path of a request below the root path."""
     path: str = scope["path"]
     rest = path.removeprefix(scope.get("root_path", ""))
-    return rest if rest.startswith("/") else path
+    return rest if rest.startswith("/") else path if rest else "/"
 
 
 class RootPath:

@@ -48,9 +48,18 @@ def choose_url(url: str | None) -> str:
 
 
 def choose_key(key: str | None) -> str | None:
-    """Return the API key: as given, else that of LAGID_API_KEY, else none."""
+    """Return the API key: as given, else that of LAGID_API_KEY, else none.
+
+    Raises
+    ------
+    ClientError
+        If it cannot be sent.
+    """
     given = (os.environ.get(name) for name in KEY_VARIABLES)
-    return key or next((value for value in given if value), None)
+    chosen = (key or next((value for value in given if value), "")).strip()
+    if not (chosen.isascii() and chosen.isprintable()):  # it is not quoted: it may be secret
+        raise ClientError("the API key has characters that no key has; copy it again")
+    return chosen or None
 
 
 def make_auth_header(key: str | None) -> dict[str, str]:

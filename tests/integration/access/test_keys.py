@@ -318,6 +318,17 @@ def test_the_audit_log_says_who_did_what(guarded: Guarded) -> None:
     following = guarded.ask("GET", f"/v1/audit?limit=1&cursor={page['next']}", admin).json()
     assert [page["items"][0], following["items"][0]] == entries[:2]
     refused(guarded.ask("GET", "/v1/audit?cursor=x", admin), 422, "invalid")
+    equations = {
+        "name": "tank",
+        "form": "difference",
+        "states": {"x": "1"},
+        "parameters": {"a": {"lower": 0, "upper": 1}},
+        "equations": {"x": "a*x(k-1)"},
+        "outputs": {"y": "x"},
+    }
+    added = guarded.ask("POST", "/v1/models", writer, json=equations)
+    entry = guarded.ask("GET", "/v1/audit?limit=1", admin).json()["items"][0]
+    assert entry["request_id"] == added.headers["X-Request-ID"]
     other = guarded.ask("GET", "/v1/audit", guarded.add_key()).json()["items"]
     assert stored not in {entry["object_id"] for entry in other}
 

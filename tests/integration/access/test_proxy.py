@@ -34,6 +34,18 @@ def test_a_user_of_the_proxy_may_write_and_only_named_ones_may_manage(behind: Gu
     assert behind.ask("POST", "/v1/models:check", json=model, headers={"X-User": "a"}).is_success
 
 
+def test_credentials_that_a_proxy_passes_on_are_its_own(behind: Guarded) -> None:
+    for passed_on in ("Basic Z3JhY2U6c2VjcmV0", "Bearer eyJhbGciOiJSUzI1NiJ9.e30.x"):
+        headers = {"X-User": "grace", "Authorization": passed_on}
+        user = behind.ask("GET", "/v1/access", headers=headers).json()
+        assert user["actor"] == "user:grace"
+        refused(
+            behind.ask("GET", "/v1/access", headers={"Authorization": passed_on}),
+            401,
+            "unauthorized",
+        )
+
+
 def test_without_one_user_the_proxy_or_a_key_is_needed(behind: Guarded) -> None:
     for names in ([], [""], ["a\tb"], ["a" * 101], ["grace", "ada@lab"]):
         headers = [("X-User", name) for name in names]

@@ -94,6 +94,10 @@ def test_scripts_ask_for_paths_of_the_service_only_by_its_address() -> None:
                 assert line[: place.start()].endswith("address("), (script.name, line)
 
 
+def test_the_root_path_without_a_slash_is_the_first_page(server: TestClient) -> None:
+    assert server.get(ROOT_PATH, follow_redirects=False).status_code == 200
+
+
 @pytest.mark.parametrize("path", ["lagid", "/a b", "//x", "/a?b", "http://x/"])
 def test_a_root_path_that_is_none_is_refused(path: str) -> None:
     with pytest.raises(ValidationError, match="root_path"):

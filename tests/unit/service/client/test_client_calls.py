@@ -11,7 +11,7 @@ import pytest
 
 from service.api.write_contract import DOCUMENT_FILE
 from service.client.async_client import AsyncClient
-from service.client.calls import WaitTimeout
+from service.client.calls import ClientError, WaitTimeout, choose_key
 from service.client.client import Client
 from service.client.rows import Rows
 from tests.repository import ROOT
@@ -95,6 +95,13 @@ def test_address_and_key_come_from_the_environment(monkeypatch: pytest.MonkeyPat
     assert ask() == ("http://there/lagid", "Bearer secret")
     assert str(asked[-1].url) == "http://there/lagid/v1/jobs/x"
     assert ask("http://here", "mine") == ("http://here", "Bearer mine")
+
+
+def test_a_key_loses_its_line_end_and_a_wrong_one_is_not_quoted() -> None:
+    assert choose_key("lagid_1_2\n") == "lagid_1_2"
+    with pytest.raises(ClientError) as refusal:
+        choose_key("lagid_1_\x07secret")
+    assert "secret" not in str(refusal.value)
 
 
 def run_for_ever(_: httpx.Request) -> httpx.Response:
