@@ -9,7 +9,21 @@ from typing import TYPE_CHECKING
 from sysid.core.lazy_names import load_on_first_use
 
 if TYPE_CHECKING:
-    from sysid.core.errors import SysidError, UnreadableFile
+    from sysid.core.errors import (
+        DivergedEverywhere,
+        InvalidModel,
+        InvalidRecord,
+        InvalidSettings,
+        MissingLibrary,
+        NothingIdentifiable,
+        RecordTooShort,
+        SysidError,
+        UnknownModel,
+        UnknownParameter,
+        UnreadableFile,
+        UnreadableResult,
+        UnwritableFile,
+    )
     from sysid.core.settings import (
         GeneticAlgorithm,
         IslandChange,
@@ -33,23 +47,34 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Channel",
+    "DivergedEverywhere",
     "Estimate",
     "GeneticAlgorithm",
     "History",
     "Identification",
+    "InvalidModel",
+    "InvalidRecord",
+    "InvalidSettings",
     "IslandChange",
     "Loss",
     "Migration",
+    "MissingLibrary",
     "Noise",
+    "NothingIdentifiable",
     "Parameter",
     "Problem",
     "ReadingNote",
     "Record",
+    "RecordTooShort",
     "Recording",
     "SequenceSearch",
     "Stop",
     "SysidError",
+    "UnknownModel",
+    "UnknownParameter",
     "UnreadableFile",
+    "UnreadableResult",
+    "UnwritableFile",
     "catalogue",
     "export_model",
     "identify",
@@ -62,7 +87,21 @@ DISTRIBUTION = "lagid"
 """Tells this package from others of the name; `lagid` looks at it."""
 
 _PUBLIC_NAMES = {
-    "core.errors": ("SysidError", "UnreadableFile"),
+    "core.errors": (
+        "DivergedEverywhere",
+        "InvalidModel",
+        "InvalidRecord",
+        "InvalidSettings",
+        "MissingLibrary",
+        "NothingIdentifiable",
+        "RecordTooShort",
+        "SysidError",
+        "UnknownModel",
+        "UnknownParameter",
+        "UnreadableFile",
+        "UnreadableResult",
+        "UnwritableFile",
+    ),
     "core.settings": (
         "GeneticAlgorithm",
         "IslandChange",

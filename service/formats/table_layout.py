@@ -357,6 +357,7 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     same = [row for row in fit if len(row.fields) == block.width] or fit
     if same:
         last = same[-1]
+        _check_widths(rows, last, block.width)
         above = same[-2] if len(same) > 1 else None
         if above is not None and _is_unit_row(last.fields, above.fields):
             return above, last.fields, above.fields
@@ -371,6 +372,22 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     if block.width == 1:
         raise _build_narrow_error(first.fields[0])
     raise _build_header_error(first.place + 1)
+
+
+def _check_widths(rows: Sequence[_Row], last: _Row, width: int) -> None:
+    """Refuse a row of another width amid the data, of which `last` is one: no header has values."""
+    if "text" in map(classify_cell, last.fields):
+        return
+    full = [row for row in rows if len(row.fields) == width]
+    header = next((row for row in full if "text" in map(classify_cell, row.fields)), None)
+    if header is None:
+        return
+    for row in rows:
+        if row.place > header.place and len(row.fields) != width:
+            raise UnreadableFile(
+                f"this row has {len(row.fields)} fields, but the header has {width}",
+                row=row.place + 1,
+            )
 
 
 def _build_header_error(row: int | None) -> UnreadableFile:

@@ -34,7 +34,6 @@ class Housekeeper:
         self._database, self._store, self._keep_days = database, store, keep_days
         self._stopping = stopping
         self._collected_at = time.monotonic()
-        self._has_garbage = False
         self._thread = threading.Thread(target=self._run_loop, name="housekeeper", daemon=True)
 
     def start(self) -> None:
@@ -50,12 +49,13 @@ class Housekeeper:
         deleted = delete_expired_jobs(self._database, self._keep_days)
         if deleted:
             _log.info("retention deleted %s", ", ".join(deleted))
-        n_runs = purge_deleted_jobs(self._database)
-        self._has_garbage = self._has_garbage or bool(deleted) or n_runs > 0
-        if self._has_garbage and time.monotonic() - self._collected_at > COLLECT_SECONDS:
+        purge_deleted_jobs(self._database)
+        # Deleted recordings and refused uploads leave objects too, also of an earlier process.
+        if time.monotonic() - self._collected_at > COLLECT_SECONDS:
             n_objects, n_bytes = delete_orphans(self._database, self._store)
-            _log.info("removed %d objects, %d bytes", n_objects, n_bytes)
-            self._collected_at, self._has_garbage = time.monotonic(), False
+            if n_objects:
+                _log.info("removed %d objects, %d bytes", n_objects, n_bytes)
+            self._collected_at = time.monotonic()
 
     def _run_loop(self) -> None:
         pause = FIRST_PAUSE_SECONDS

@@ -687,3 +687,18 @@ def test_a_long_preamble_is_skipped() -> None:
     assert notes == (f"the header is in row {LATE + 1}; the lines before it were skipped",)
     sheet = write_sheet([["meta", k] for k in range(LATE)] + [["t", "u"], [0, 1], [1, 2]])
     assert read_with_notes(sheet)[0].samples == 2
+
+
+@pytest.mark.parametrize("row", [3, 50, 100, 150])
+@pytest.mark.parametrize("change", [",9", ""])
+def test_a_row_of_another_width_is_named_wherever_it_is(
+    tmp_path: Path, row: int, change: str
+) -> None:
+    rows = [f"{0.1 * k:.1f},{k % 2},{0.5 * k}" for k in range(240)]
+    rows[row - 2] = rows[row - 2] + change if change else rows[row - 2].rpartition(",")[0]
+    file = tmp_path / "bad.csv"
+    file.write_text("\n".join(["t,u,y", *rows]))
+    found = 4 if change else 2
+    with pytest.raises(UnreadableFile, match=f"has {found} fields, but the header has 3") as error:
+        read_recording(file)
+    assert error.value.row == row
