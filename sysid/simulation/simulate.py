@@ -1,5 +1,7 @@
 """Simulation of a model with given parameter values."""
 
+from __future__ import annotations  # help shows the names of types, not what they stand for
+
 import re
 from collections.abc import Mapping
 from dataclasses import replace
