@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from service.cli.common import (
     DATA_HELP,
+    MODEL_SUFFIXES,
     OUTPUT_PANEL,
     STANDARD_INPUT,
     AsJson,
@@ -28,6 +29,7 @@ from service.cli.common import (
     err,
     fail,
     fail_usage,
+    file_origins,
     format_estimate,
     name_file,
     out,
@@ -41,8 +43,15 @@ from service.cli.common import (
     upload_origins,
     write_file,
 )
-from service.core.errors import to_field_errors
-from sysid.core.errors import InvalidRecord, InvalidSettings, UnreadableFile
+from service.core.errors import FieldError, to_field_errors
+from sysid.core.errors import (
+    InvalidRecord,
+    InvalidSettings,
+    SysidError,
+    UnknownModel,
+    UnreadableFile,
+    split_pointer,
+)
 from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
@@ -239,49 +248,67 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     """
     from pydantic import ValidationError
 
-    from service.core.errors import FieldError, to_field_errors
     from service.core.validation import explain_errors
     from service.jobs.schemas import JobIn
-    from sysid.core.errors import SysidError
     from sysid.models.catalogue.load import resolve_model
 
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:
-        fail(FIELD_ORIGINS.describe_faults(explain_errors(error.errors(), body, JobIn)), 2)
+        faults = explain_errors(error.errors(), body, JobIn)
+        fail_usage(FIELD_ORIGINS.describe_faults(_suggest_parameters(faults, body["model"])))
     if job.validation is not None and job.validation.datasets is not None:
         fail_usage(f"--set validation: {SERVER_SETTINGS['validation.datasets']}")
     try:
         model = resolve_model(body["model"])
     except SysidError as error:
-        fail(
-            FIELD_ORIGINS.describe_faults(
-                FieldError(
-                    "/model" + fault.pointer.removeprefix("/model"), fault.detail, fault.column
-                )
-                for fault in to_field_errors(error)
-            )
-        )
+        _refuse_model(body["model"], error)
     from service.jobs.record_checks import find_setting_faults
     from sysid.models.model import build_initial_parameters
 
     parameters = (*model.parameters, *build_initial_parameters(model, pieces))
     faults = find_setting_faults(job.to_normal_form(), model, parameters)
     if faults:
-        fail(FIELD_ORIGINS.describe_faults(faults))
+        fail_usage(FIELD_ORIGINS.describe_faults(faults))
     return job, model
+
+
+def _suggest_parameters(faults: Iterable[FieldError], name: str) -> Iterator[FieldError]:
+    """Suggest ``parameters.L`` where a setting begins with the name of a parameter."""
+    from sysid.models.catalogue.load import resolve_model
+
+    try:
+        names = [parameter.name for parameter in resolve_model(name).parameters]
+    except SysidError:  # a fault of its own, which is reported once the settings are right
+        names = []
+    for fault in faults:
+        parts = split_pointer(fault.pointer)
+        if parts and parts[0] in names:
+            yield replace(
+                fault,
+                detail=f"did you mean parameters.{parts[0]}, as in parameters.{parts[0]}.upper=2?",
+            )
+        else:
+            yield fault
+
+
+def _refuse_model(name: str, error: SysidError) -> NoReturn:
+    """End the command with the faults of a model, at its option or in its file."""
+    path = Path(name)
+    if isinstance(error, UnknownModel) or not (path.is_file() and name.endswith(MODEL_SUFFIXES)):
+        faults = to_field_errors(error)
+        fail_usage(FIELD_ORIGINS.describe_faults(replace(f, pointer="/model") for f in faults))
+    fail(file_origins(path).describe_faults(to_field_errors(error)))
 
 
 @contextmanager
 def _report_core_faults() -> Iterator[None]:
     """End the command with the core's errors, reported where the user typed."""
-    from service.core.errors import to_field_errors
-    from sysid.core.errors import SysidError
-
     try:
         yield
     except SysidError as error:
-        fail(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+        is_argument = isinstance(error, InvalidSettings)
+        fail(FIELD_ORIGINS.describe_faults(to_field_errors(error)), 2 if is_argument else 1)
 
 
 def _refuse_server_settings(change: str, parts: list[str]) -> None:
