@@ -320,7 +320,8 @@ def format_cell(value: object) -> str:
 
 def format_estimate(estimate: Mapping[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
-    return plain_estimate(estimate["value"], estimate["stderr"])
+    is_bound = estimate.get("status") == "at bound"
+    return plain_estimate(estimate["value"], estimate["stderr"], is_bound=is_bound)
 
 
 def describe_status(estimate: Mapping[str, Any]) -> str:

@@ -1,12 +1,13 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -28,6 +29,7 @@ from service.cli.common import (
     err,
     fail,
     fail_usage,
+    file_origins,
     format_estimate,
     name_file,
     out,
@@ -41,14 +43,22 @@ from service.cli.common import (
     upload_origins,
     write_file,
 )
-from service.core.errors import to_field_errors
-from sysid.core.errors import UnreadableFile, suggest_name
+from service.core.errors import FieldError, to_field_errors
+from sysid.core.errors import (
+    InvalidRecord,
+    InvalidSettings,
+    SysidError,
+    UnknownModel,
+    UnreadableFile,
+    split_pointer,
+)
 from sysid.core.settings import NOISE_MODELS
 from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
     from service.jobs.schemas import JobIn
     from sysid.data.records import Record, Recording
+    from sysid.identification.arguments import ReadRecords
     from sysid.identification.result import Identification
     from sysid.models.model import Model
     from sysid.uncertainty.estimates import Posterior
@@ -113,7 +123,7 @@ def identify(
         typer.Option(
             metavar="SIGNAL=CHANNEL,…",
             help="Channel of each signal of the model: u=P1,y=P2. By default of the same name, "
-            "else in their order, inputs first.",
+            "else by usual names (input, output), else in their order, inputs first.",
         ),
     ] = None,
     validation: Annotated[
@@ -168,19 +178,21 @@ def identify(
     reading = FileOptions(sample_time, tuple(split_names(segments)))
     recording = read_input_file(data, reading)
     body, loaded = check_body(unchecked, max(1, len(recording.segments)))
-    records = _extract_records(recording, Path(name_file(data)), loaded, body)
-    validation_records = []
-    if validation is not None:
-        validation_records = _extract_records(
-            read_input_file(validation, reading), validation, loaded, body
-        )
+    with _report_core_faults():
+        read = _extract_records(recording, Path(name_file(data)), loaded, body)
+        validation_records: Sequence[Record] = ()
+        if validation is not None:
+            validation_records = _extract_records(
+                read_input_file(validation, reading), validation, loaded, body
+            ).records
     from sysid.core.jit import announce_compilation, read_clock
 
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
-        result = _run_identification(loaded, records, validation_records, body, quiet=as_json)
+        result = _run_identification(loaded, read.records, validation_records, body, quiet=as_json)
     seconds = read_clock() - begun
-    print_result(loaded, result, seconds, output, as_json=as_json)
+    result = replace(result, warnings=(*read.notes, *result.warnings))
+    print_result(loaded, result, seconds, output, as_json=as_json, printed=read.notes)
     if report is not None:
         _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
 
@@ -236,48 +248,67 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     """
     from pydantic import ValidationError
 
-    from service.core.errors import FieldError, to_field_errors
     from service.core.validation import explain_errors
     from service.jobs.schemas import JobIn
-    from sysid.core.errors import SysidError
+    from sysid.models.catalogue.load import resolve_model
 
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:
-        fail(FIELD_ORIGINS.describe_faults(explain_errors(error.errors(), body, JobIn)), 2)
+        faults = explain_errors(error.errors(), body, JobIn)
+        fail_usage(FIELD_ORIGINS.describe_faults(_suggest_parameters(faults, body["model"])))
     if job.validation is not None and job.validation.datasets is not None:
         fail_usage(f"--set validation: {SERVER_SETTINGS['validation.datasets']}")
     try:
-        model = _load_model(body["model"])
+        model = resolve_model(body["model"])
     except SysidError as error:
-        fail(
-            FIELD_ORIGINS.describe_faults(
-                FieldError(
-                    "/model" + fault.pointer.removeprefix("/model"), fault.detail, fault.column
-                )
-                for fault in to_field_errors(error)
-            )
-        )
+        _refuse_model(body["model"], error)
     from service.jobs.record_checks import find_setting_faults
     from sysid.models.model import build_initial_parameters
 
     parameters = (*model.parameters, *build_initial_parameters(model, pieces))
     faults = find_setting_faults(job.to_normal_form(), model, parameters)
     if faults:
-        fail(FIELD_ORIGINS.describe_faults(faults))
+        fail_usage(FIELD_ORIGINS.describe_faults(faults))
     return job, model
+
+
+def _suggest_parameters(faults: Iterable[FieldError], name: str) -> Iterator[FieldError]:
+    """Suggest ``parameters.L`` where a setting begins with the name of a parameter."""
+    from sysid.models.catalogue.load import resolve_model
+
+    try:
+        names = [parameter.name for parameter in resolve_model(name).parameters]
+    except SysidError:  # a fault of its own, which is reported once the settings are right
+        names = []
+    for fault in faults:
+        parts = split_pointer(fault.pointer)
+        if parts and parts[0] in names:
+            yield replace(
+                fault,
+                detail=f"did you mean parameters.{parts[0]}, as in parameters.{parts[0]}.upper=2?",
+            )
+        else:
+            yield fault
+
+
+def _refuse_model(name: str, error: SysidError) -> NoReturn:
+    """End the command with the faults of a model, at its option or in its file."""
+    path = Path(name)
+    if isinstance(error, UnknownModel) or not (path.is_file() and name.endswith(MODEL_SUFFIXES)):
+        faults = to_field_errors(error)
+        fail_usage(FIELD_ORIGINS.describe_faults(replace(f, pointer="/model") for f in faults))
+    fail(file_origins(path).describe_faults(to_field_errors(error)))
 
 
 @contextmanager
 def _report_core_faults() -> Iterator[None]:
     """End the command with the core's errors, reported where the user typed."""
-    from service.core.errors import to_field_errors
-    from sysid.core.errors import SysidError
-
     try:
         yield
     except SysidError as error:
-        fail(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+        is_argument = isinstance(error, InvalidSettings)
+        fail(FIELD_ORIGINS.describe_faults(to_field_errors(error)), 2 if is_argument else 1)
 
 
 def _refuse_server_settings(change: str, parts: list[str]) -> None:
@@ -324,8 +355,12 @@ def print_result(
     output: Path | None,
     *,
     as_json: bool,
+    printed: Sequence[str] = (),
 ) -> None:
-    """Print the estimates, as tables or as JSON; `output` is a file of the JSON."""
+    """Print the estimates, as tables or as JSON; `output` is a file of the JSON.
+
+    Warnings that are `printed` already are in the JSON only.
+    """
     from service.runs.result import to_result_document
     from sysid.identification.summary import describe_residuals
 
@@ -372,7 +407,11 @@ def print_result(
     if result.residual_tests is not None and result.residual_tests.passed is not None:
         out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
     _print_posterior(result.posterior)
-    for warning in result.warnings:
+    _print_notes(warning for warning in result.warnings if warning not in printed)
+
+
+def _print_notes(warnings: Iterable[str]) -> None:
+    for warning in warnings:
         err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
 
 
@@ -414,8 +453,8 @@ def _format_fit(fit: float, why: str = "the output is constant") -> str:
 
 def _run_identification(
     model: "Model",
-    records: "list[Record]",
-    validation_records: "list[Record]",
+    records: "Sequence[Record]",
+    validation_records: "Sequence[Record]",
     body: "JobIn",
     *,
     quiet: bool,
@@ -462,47 +501,32 @@ def _run_identification(
         )
 
 
-def _load_model(name: str) -> "Model":
-    from sysid.models.catalogue.load import load_model
-
-    return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
-
-
-def _assign_other_channels(
-    recording: "Recording", model: "Model", channels: Mapping[str, str]
-) -> dict[str, str]:
-    """Assign the channels that are left to the signals that are left, in order, inputs first.
-
-    Only if there are as many of both, after those of the same name are matched.
-    """
-    from sysid.models.signals import match_names
-
-    names = [signal.name for signal in model.inputs] + [signal.name for signal in model.outputs]
-    _, signals, left = match_names(names, recording.names, channels)
-    if not signals or len(signals) != len(left):
-        return {}
-    assigned = dict(zip(signals, left, strict=True))
-    pairs = ",".join(f"{signal}={name}" for signal, name in assigned.items())
-    err.print(f"note: channels assigned in their order: --channels {pairs}", markup=False)
-    return assigned
+def _write_channels_option(channels: Mapping[str, str]) -> str:
+    """Write the option that gives the channel of each signal, as a shell reads it."""
+    pairs = ",".join(f"{signal}={channel}" for signal, channel in channels.items())
+    return f"--channels {pairs if '…' in pairs else quote(pairs)}"
 
 
 def _extract_records(
     recording: "Recording", path: Path, model: "Model", body: "JobIn"
-) -> "list[Record]":
-    from service.datasets.signal_channels import map_channels
+) -> "ReadRecords":
+    """Return the records of a recording, with a note about channels that were guessed.
 
-    named = {**_assign_other_channels(recording, model, body.channels), **body.channels}
-    channels = map_channels(model, named, body.hold)
-    missing = {
-        signal: f"channel {channel!r} for signal {signal!r}{suggest_name(channel, recording.names)}"
-        for signal, channel in channels.by_signal.items()
-        if channel not in recording.names
-    }
-    if missing:
-        options = " ".join(f"--channels {signal}=NAME" for signal in missing)
-        fail(
-            f"--channels: {path} has no {', no '.join(missing.values())}. "
-            f"Name the channels of the file: {options}"
-        )
-    return list(channels.cut_records(recording, path.stem))
+    The note is printed at once, because the search may refuse what was guessed.
+    """
+    from service.datasets.signal_channels import map_channels
+    from sysid.identification.arguments import ReadRecords, describe_assignment
+    from sysid.models.signals import assign_recording
+
+    try:
+        assigned = assign_recording(model, recording, body.channels, _write_channels_option)
+    except InvalidRecord as error:
+        fail_usage(f"{path}: {error}")
+    except InvalidSettings as error:
+        fail_usage(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
+    channels = map_channels(model, assigned.by_signal, body.hold)
+    records = channels.cut_records(recording, path.stem)
+    note = describe_assignment(assigned, records)
+    if note:
+        err.print(f"note: {note}", markup=False)
+    return ReadRecords(records, (note,) if note else (), assigned.by_signal)

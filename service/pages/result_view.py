@@ -95,7 +95,8 @@ def _to_posterior_view(parameter: Document) -> PosteriorView:
 def to_estimate_view(estimate: Document) -> EstimateView:
     """Build a row of the table from an entry of the result's ``parameters``."""
     stderr = estimate["stderr"]
-    value, error = format_estimate(estimate["value"], stderr)
+    is_bound = estimate["status"] == "at bound"
+    value, error = format_estimate(estimate["value"], stderr, is_bound=is_bound)
     bounds = [estimate[name] for name in ("lower", "upper") if estimate[name] is not None]
     return EstimateView(
         name=estimate["name"],

@@ -26,29 +26,41 @@ def format_number(value: float | None, digits: int = 4) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def format_estimate(value: float, stderr: float | None) -> tuple[str, str]:
-    """Format an estimate and its standard error, both to the error's second significant digit."""
+def format_estimate(
+    value: float, stderr: float | None, *, is_bound: bool = False
+) -> tuple[str, str]:
+    """Format an estimate and its standard error, both to the error's second significant digit.
+
+    A value that is a bound is not rounded to its error.
+    """
     if not _is_positive(stderr):
         return format_number(value, 6), ""
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return format_number(value, 6), format_number(stderr, 2)
+    if is_bound:
+        return f"{value:.6g}".replace("-", "−"), f"{stderr:.{decimals}f}"
     rounded = [f"{v:.{decimals}f}".replace("-", "−") for v in (value, stderr)]
     return rounded[0], rounded[1]
 
 
-def join_estimate(value: float, stderr: float | None) -> str:
+def join_estimate(value: float, stderr: float | None, *, is_bound: bool = False) -> str:
     """Format an estimate and its standard error as one text, ``0.1193 ± 0.0004``."""
-    return " ± ".join(filter(None, format_estimate(value, stderr)))
+    return " ± ".join(filter(None, format_estimate(value, stderr, is_bound=is_bound)))
 
 
-def plain_estimate(value: float, stderr: float | None) -> str:
-    """Format an estimate and its error for terminals and notes, readable by programs."""
+def plain_estimate(value: float, stderr: float | None, *, is_bound: bool = False) -> str:
+    """Format an estimate and its error for terminals and notes, readable by programs.
+
+    A value that is a bound is not rounded to its error, which may be far larger.
+    """
     if not _is_positive(stderr):
         return f"{value:.6g}"
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return f"{value:.6g} ± {stderr:.2g}"
+    if is_bound:
+        return f"{value:.6g} ± {stderr:.{decimals}f}"
     return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 

@@ -11,7 +11,8 @@ from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
 from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns
 from sysid.models.model import Model
-from sysid.models.signals import Assignment, assign_channels, assign_record
+from sysid.models.signals import Assignment, assign_channels, assign_record, assign_recording
+from sysid.residuals.onset_delay import find_unprompted_output
 
 Data: TypeAlias = Record | Recording | Labelled
 """One recording: a record, a recording without roles, or a table of another library."""
@@ -44,9 +45,25 @@ def read_records(
     check_kinds({"channels": channels})
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
-    notes = dict.fromkeys(assigned.note for _, assigned in parts if assigned.note)
+    records = tuple(record for record, _ in parts)
+    assignments = {assigned.note: assigned for _, assigned in parts if assigned.note}
+    notes = tuple(describe_assignment(one, records) for one in assignments.values())
     by_signal = parts[0][1].by_signal if parts else {}
-    return ReadRecords(tuple(record for record, _ in parts), tuple(notes), by_signal)
+    return ReadRecords(records, notes, by_signal)
+
+
+def describe_assignment(assigned: Assignment, records: Sequence[Record]) -> str:
+    """Describe how channels were guessed, and whether inputs and outputs may be swapped.
+
+    They may be where the order alone decided and an output moves before any input. Empty if no
+    channel was guessed.
+    """
+    if assigned.may_be_swapped and any(map(find_unprompted_output, records)):
+        return (
+            f"{assigned.note}. Perhaps inputs and outputs are swapped: an output begins to move "
+            "before any input"
+        )
+    return assigned.note
 
 
 def _read_one(
@@ -58,7 +75,7 @@ def _read_one(
         yield record, Assignment({named.name: channel.name for named, channel in pairs}, note)
         return
     if isinstance(data, Recording):
-        assigned = assign_channels(model, data.names, channels)
+        assigned = assign_recording(model, data, channels)
         recording = data
     elif is_labelled(data):
         columns = read_columns(data, "the table")

@@ -64,8 +64,9 @@ def identify(
         Settings of the search. Default: the improved genetic algorithm.
     channels : mapping of str to str
         Channel of each signal of the model: ``{"u": "P1"}``. A signal that is not given takes the
-        channel of its name. If as many channels are left as signals, their order decides, inputs
-        first. A warning of the result says so.
+        channel of its name, then one of a usual name such as ``output`` or ``PV``. If as many
+        channels are left as signals, their order decides, inputs first. A warning of the result
+        says so.
     seed : int
         The same seed gives the same result, bit for bit.
     parameters : mapping

@@ -26,7 +26,7 @@ def summarise_result(found: Identification) -> str:
     rows = [
         (
             estimate.name,
-            plain_estimate(estimate.value, estimate.stderr),
+            plain_estimate(estimate.value, estimate.stderr, is_bound=estimate.status == "at bound"),
             "" if estimate.unit == "1" else estimate.unit,
             estimate.status,
         )
@@ -165,10 +165,11 @@ def _shorten(text: str) -> str:
 
 def _write_cells(estimate: Estimate) -> str:
     interval = format_interval(estimate.interval95, estimate.stderr) or DASH
+    is_bound = estimate.status == "at bound"
     why = f" <small>{escape(estimate.reason)}</small>" if estimate.reason else ""
     cells = (
         f"<b>{escape(estimate.name)}</b>",
-        escape(join_estimate(estimate.value, estimate.stderr)),
+        escape(join_estimate(estimate.value, estimate.stderr, is_bound=is_bound)),
         "" if estimate.unit == "1" else escape(estimate.unit),
         escape(interval),
         f"{escape(estimate.status)}{why}",

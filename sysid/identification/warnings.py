@@ -80,7 +80,12 @@ def collect_warnings(
     messages += _warn_early_response(problem) or warn_unrecorded_input(
         problem, analysis, is_contradicted=is_contradicted
     )
-    messages += [text for estimate in analysis.estimates if (text := _warn_unidentified(estimate))]
+    active_names = {bound.name for bound in analysis.active_bounds or ()}
+    messages += [
+        text
+        for estimate in analysis.estimates
+        if (text := _warn_unidentified(estimate, is_told=estimate.name in active_names))
+    ]
     delay_names = find_delay_parameters(problem)
     if analysis.uncertainty is not None:
         messages += [
@@ -208,14 +213,18 @@ def _compute_rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _warn_unidentified(estimate: Estimate) -> str:
+def _warn_unidentified(estimate: Estimate, *, is_told: bool) -> str:
+    """Warn about an estimate that the data do not determine.
+
+    `is_told`: another warning says at which bound it lies, and which bounds to widen.
+    """
     low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
     side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
     unit = format_unit(estimate.unit)
     position = f"lies at its {side} bound {bound:g}{unit}"
     match estimate.status:
         case "at bound":
-            return f"{estimate.name} {position}"
+            return "" if is_told else f"{estimate.name} {position}"
         case "group" | "unidentifiable":
             also = f"; it {position}" if estimate.value == bound else ""
             return f"{estimate.name} is not identified: {estimate.reason}{also}"

@@ -1,27 +1,72 @@
-"""Assign the channels of a recording to the signals of a model: by name, else by order."""
+"""Assign the channels of a recording to the signals of a model: by name, else by order.
 
-from collections.abc import Mapping, Sequence
+Some names say which side a channel is on, in any case: ``U`` and ``Y``, ``input`` and ``output``.
+The names of a controller's output, ``OP``, ``CO`` and ``MV``, say so beside the process value
+``PV`` only. Alone, ``CO`` may be a gas.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, Record, Recording
+from sysid.data.table_rules import split_headings
 from sysid.models.model import Model
+
+ChannelOption: TypeAlias = Callable[[Mapping[str, str]], str]
+"""Writes the option that gives the channel of each signal, as the user would type it."""
+
+_USUAL_INPUTS = re.compile(r"(u|in|input)[ _]*[0-9]*", re.IGNORECASE)
+_USUAL_OUTPUTS = re.compile(r"(y|out|output|pv)[ _]*[0-9]*", re.IGNORECASE)
+_CONTROLLER_OUTPUTS = re.compile(r"(op|mv)[ _]*[0-9]*|co", re.IGNORECASE)
+_PROCESS_VALUES = re.compile(r"pv[ _]*[0-9]*", re.IGNORECASE)
 
 
 class Assignment(NamedTuple):
-    """The channel of every signal, and a note about those that were assigned by their order."""
+    """The channel of every signal, and a note about those that were guessed.
+
+    Attributes
+    ----------
+    by_signal : dict of str to str
+        Signal → channel.
+    note : str
+        How signals were assigned whose channels do not have their names; empty if there are none.
+    may_be_swapped : bool
+        Whether the order alone decided which channel is an input and which is an output.
+    """
 
     by_signal: dict[str, str]
     note: str = ""
+    may_be_swapped: bool = False
+
+
+def write_argument(channels: Mapping[str, str]) -> str:
+    """Write the argument that gives the channel of each signal in Python.
+
+    Examples
+    --------
+    >>> write_argument({"u": "P1"})
+    "channels={'u': 'P1'}"
+    """
+    pairs = ", ".join(
+        f"{signal!r}: {channel if channel == '…' else repr(channel)}"
+        for signal, channel in channels.items()
+    )
+    return f"channels={{{pairs}}}"
 
 
 def assign_channels(
-    model: Model, names: Sequence[str], channels: Mapping[str, str] | None = None
+    model: Model,
+    names: Sequence[str],
+    channels: Mapping[str, str] | None = None,
+    option: ChannelOption = write_argument,
 ) -> Assignment:
     """Assign channels to all signals of a model: as given, else by name, else by order.
 
-    The order decides only if as many channels are left as signals. Inputs come first.
+    The order decides only if as many channels are left as signals. Inputs come first, except
+    channels with usual names of the other side.
 
     Parameters
     ----------
@@ -29,6 +74,8 @@ def assign_channels(
         The channels.
     channels : mapping of str to str, optional
         Model's name → channel's name.
+    option : callable, optional
+        Writes the option that gives channels, for the note and the message.
 
     Raises
     ------
@@ -42,17 +89,48 @@ def assign_channels(
     given = dict(channels or {})
     _check_given(given, signals, names)
     assigned, left, free = match_names(signals, names, given)
-    if left and len(left) != len(free):
+    guessed, basis = _guess_channels(model, left, free)
+    if len(guessed) < len(left):
         inputs = ", ".join(signal.name for signal in model.inputs) or "none"
         outputs = ", ".join(output.name for output in model.outputs)
-        example = ", ".join(f"{signal!r}: …" for signal in left)
         raise InvalidRecord(
             f"model {model.name!r} has inputs {inputs} and outputs {outputs}; the recording has "
             f"{', '.join(names) or 'no channels'}. Say which channel is which: "
-            f"channels={{{example}}}"
+            f"{option(dict.fromkeys(left, '…'))}"
         )
-    by_order = dict(zip(left, free, strict=True)) if left else {}
-    return Assignment({**assigned, **by_order}, _describe_order(by_order))
+    has_inputs = any(signal.name in guessed for signal in model.inputs)
+    has_outputs = any(output.name in guessed for output in model.outputs)
+    return Assignment(
+        {**assigned, **guessed},
+        _describe_guess(guessed, basis, option),
+        basis == _ORDER and has_inputs and has_outputs,
+    )
+
+
+def assign_recording(
+    model: Model,
+    recording: Recording,
+    channels: Mapping[str, str] | None = None,
+    option: ChannelOption = write_argument,
+) -> Assignment:
+    """Assign the channels of a recording, as `assign_channels` does.
+
+    A channel may also be given as its heading in the file, with its unit: ``Heater [%]``.
+
+    Raises
+    ------
+    InvalidSettings
+        If `channels` names a signal or channel that does not exist.
+    InvalidRecord
+        If a signal has no channel; the message lists both.
+    """
+    units = {channel.name: channel.unit for channel in recording.channels}
+    given = {}
+    for signal, channel in (channels or {}).items():
+        [(name, unit)] = split_headings([str(channel)])
+        is_heading = channel not in units and unit and units.get(name) == unit
+        given[signal] = name if is_heading else channel
+    return assign_channels(model, recording.names, given, option)
 
 
 def assign_record(
@@ -87,7 +165,8 @@ def assign_record(
         renamed.append(_rename_channels(side, assigned))
     if renamed == [record.inputs, record.outputs]:
         return record, ""
-    return replace(record, inputs=renamed[0], outputs=renamed[1]), _describe_order(by_order)
+    note = _describe_guess(by_order, _ORDER, write_argument)
+    return replace(record, inputs=renamed[0], outputs=renamed[1]), note
 
 
 def name_inputs(
@@ -184,8 +263,62 @@ def _check_given(given: Mapping[str, str], signals: Sequence[str], names: Sequen
             raise InvalidSettings(f"/channels/{signal}", detail)
 
 
-def _describe_order(by_order: Mapping[str, str]) -> str:
-    if not by_order:
+_ORDER = "their order"
+_NAMES = "usual names of inputs and outputs"
+
+
+def _guess_channels(
+    model: Model, left: Sequence[str], free: Sequence[str]
+) -> tuple[dict[str, str], str]:
+    """Guess the channels of the signals that are left, and say by what; empty if it is unclear."""
+    guessed = _match_letters(left, free)
+    rest = [name for name in free if name not in guessed.values()]
+    inputs = [s.name for s in model.inputs if s.name in left and s.name not in guessed]
+    outputs = [s.name for s in model.outputs if s.name in left and s.name not in guessed]
+    by_side = {name: _find_side(name, free) for name in rest}
+    usual_inputs = [name for name in rest if by_side[name] == "input"]
+    usual_outputs = [name for name in rest if by_side[name] == "output"]
+    if all(
+        len(usual) == len(wanted)
+        for usual, wanted in ((usual_inputs, inputs), (usual_outputs, outputs))
+        if wanted
+    ):
+        guessed |= dict(zip(inputs, usual_inputs, strict=False))
+        guessed |= dict(zip(outputs, usual_outputs, strict=False))
+        return guessed, _NAMES
+    if len(rest) != len(inputs) + len(outputs):
+        return {}, ""
+    if len(usual_inputs) > len(inputs) or len(usual_outputs) > len(outputs):
+        usual_inputs, usual_outputs = [], []
+    others = [name for name in rest if name not in (*usual_inputs, *usual_outputs)]
+    chosen = {*usual_inputs, *others[: len(inputs) - len(usual_inputs)]}
+    ordered = [name for name in rest if name in chosen]
+    ordered += [name for name in rest if name not in chosen]
+    bases = [_NAMES] if guessed or usual_inputs or usual_outputs else []
+    guessed |= dict(zip((*inputs, *outputs), ordered, strict=True))
+    return guessed, " and ".join([*bases, _ORDER])
+
+
+def _match_letters(signals: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Match signals and channels whose names differ in upper and lower case only."""
+    matched = {}
+    for signal in signals:
+        alike = [name for name in names if name.casefold() == signal.casefold()]
+        rivals = [other for other in signals if other.casefold() == signal.casefold()]
+        if len(alike) == len(rivals) == 1:
+            matched[signal] = alike[0]
+    return matched
+
+
+def _find_side(name: str, names: Sequence[str]) -> str:
+    """Find the side that the usual name of a channel says: input or output; empty if none."""
+    has_process_value = any(_PROCESS_VALUES.fullmatch(other) for other in names)
+    if _USUAL_INPUTS.fullmatch(name) or (has_process_value and _CONTROLLER_OUTPUTS.fullmatch(name)):
+        return "input"
+    return "output" if _USUAL_OUTPUTS.fullmatch(name) else ""
+
+
+def _describe_guess(guessed: Mapping[str, str], basis: str, option: ChannelOption) -> str:
+    if not guessed:
         return ""
-    pairs = ", ".join(f"{signal!r}: {channel!r}" for signal, channel in by_order.items())
-    return f"channels were assigned by their order. To choose, give channels={{{pairs}}}"
+    return f"channels were assigned by {basis}. To choose, give {option(guessed)}"

@@ -12,6 +12,7 @@ from sysid.models.model import Model
 from sysid.models.parse import parse_model
 
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+_LISTED_SUFFIXES = ", ".join(MODEL_SUFFIXES)
 _CATALOGUE_FOLDER = Path(__file__).parent
 
 
@@ -94,7 +95,20 @@ def resolve_model(source: ModelSource) -> Model:
             ]
         )
     is_file = isinstance(source, str) and source.lower().endswith(MODEL_SUFFIXES)
+    if isinstance(source, str) and not is_file and source not in catalogue():
+        _refuse_other_path(Path(source))
     return load_model(Path(source) if is_file else source)  # type: ignore[arg-type]
+
+
+def _refuse_other_path(path: Path) -> None:
+    """Refuse a folder, or a file that is no model, such as a recording."""
+    if path.is_dir():
+        found = "is a folder"
+    elif path.is_file():
+        found = f"is no model file; it may be a recording. Model files end in {_LISTED_SUFFIXES}"
+    else:
+        return
+    raise InvalidModel([Fault("", f"{path} {found}. Need a built-in model or a model file")])
 
 
 def read_document(path: Path) -> Any:

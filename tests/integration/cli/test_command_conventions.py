@@ -111,8 +111,8 @@ def test_identify_reads_csv_and_mcap_from_standard_input(ask: Ask, tmp_path: Pat
     assert ask("dataset", "download", "steps", "-o", "steps.mcap").code == 0
     again = ask.read_json(*words, stdin=(tmp_path / "steps.mcap").read_bytes())
     assert again["parameters"] == found["parameters"]
-    line = check_refusal(ask(*words, "--channels", "u=volts", stdin=recording()))
-    assert line.startswith("lagid: --channels: standard input has no channel 'volts'")
+    line = check_refusal(ask(*words, "--channels", "u=volts", stdin=recording()), 2)
+    assert line.startswith("lagid: --channels u: there is no channel 'volts'")
     quiet = ask(*words, "--quiet", "--output", "found.json", stdin=recording())
     assert quiet.stderr == ""
     assert "±" in quiet.stdout

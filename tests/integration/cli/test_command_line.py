@@ -277,6 +277,8 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
     [
         (["--model", "fopd"], "did you mean 'fopdt'?"),
         (["--model", "missing.yaml"], "missing.yaml"),
+        (["--model", "."], "--model: . is a folder"),
+        (["--model", "fopdt", "--set", "L.upper=20"], "did you mean parameters.L"),
         (["--model", "fopdt", "--channels", "u=volts"], "no channel 'volts'"),
         (["--model", "fopdt", "--channels", "w=u"], "no signal 'w'"),
         (
@@ -298,7 +300,7 @@ def test_identify_samples_the_posterior_as_far_as_the_budget_goes(
     ],
 )
 def test_a_mistake_of_identify_is_one_line(data: Path, words: list[str], expected: str) -> None:
-    assert expected in check_refusal(run_lagid("identify", data, *words))
+    assert expected in check_refusal(run_lagid("identify", data, *words), 2)
 
 
 def test_identify_tells_all_that_cannot_be_read_first(data: Path) -> None:

@@ -108,3 +108,20 @@ def test_a_report_without_its_libraries_is_refused_before_the_search(
     assert "--report needs plotly: pip install 'lagid[server]'" in check_refusal(
         run_lagid(*words), 2
     )
+
+
+def test_the_report_and_the_result_say_how_channels_were_assigned(tmp_path: Path) -> None:
+    path, result = tmp_path / "swapped.csv", tmp_path / "result.json"
+    rows = recording().decode().splitlines()[1:]
+    cells = [row.split(",") for row in rows]
+    path.write_text("t,Oven out,Heater\n" + "\n".join(f"{t},{y},{u}" for t, u, y in cells))
+    files = ("--report", str(tmp_path / "report.html"), "--output", str(result))
+    done = run_lagid("identify", str(path), "--model", "fopdt", *QUICK, *files)
+    assert done.code == 0, done.stderr
+    option = "--channels 'u=Oven out,y=Heater'"  # as a shell reads it
+    note = f"channels were assigned by their order. To choose, give {option}"
+    assert done.stderr.count(note) == 1
+    assert "Perhaps inputs and outputs are swapped" in done.stderr
+    assert any(note in warning for warning in json.loads(result.read_text())["warnings"])
+    shown = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "channels were assigned by their order" in shown

@@ -126,6 +126,15 @@ def test_an_estimate_at_its_bound_is_told() -> None:
     assert any(w == "a lies at its lower bound 1.5 N/m³" for w in found.warnings)
 
 
+def test_a_bound_that_is_to_be_widened_is_told_once() -> None:
+    found = identify(
+        DUFFING_MODEL, record(clean()), parameters={"c": (5.0, 9.0)}, loss=Loss(noise_model="white")
+    )
+    assert found["c"].status == "at bound"
+    [note] = [w for w in found.warnings if w.startswith(("c is at its", "c lies at its"))]
+    assert note.startswith("c is at its lower bound 5 N·s/m. To widen: ")
+
+
 def test_progress_is_told_and_ends_at_the_result() -> None:
     states: list[RunState] = []
     found = identify(DUFFING_MODEL, record(noisy()), progress=states.append)

@@ -3,7 +3,7 @@
 import pytest
 
 from service.runs.comparison import find_furthest_pair
-from sysid.core.text import plain_estimate
+from sysid.core.text import join_estimate, plain_estimate
 
 
 def estimate(value: float, stderr: float | None) -> dict[str, object]:
@@ -35,3 +35,9 @@ def test_values_are_cut_at_the_second_digit_of_their_error(
     value: float, stderr: float | None, text: str
 ) -> None:
     assert plain_estimate(value, stderr) == text
+
+
+def test_a_bound_is_not_rounded_to_the_error_of_its_estimate() -> None:
+    assert plain_estimate(0.2, 835.0) == "0 ± 835"
+    assert plain_estimate(0.2, 835.0, is_bound=True) == "0.2 ± 835"
+    assert join_estimate(-0.2, 835.0, is_bound=True) == "−0.2 ± 835"

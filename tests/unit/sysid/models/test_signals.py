@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, UnknownModel
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel, Record, Recording
 from sysid.models.catalogue.load import load_model, resolve_model
-from sysid.models.signals import assign_channels, assign_record
+from sysid.models.signals import assign_channels, assign_record, assign_recording
 
 MODEL = load_model("fopdt")
 T = np.arange(3.0)
@@ -33,7 +33,7 @@ def names(one: Record) -> tuple[list[str], list[str]]:
     ],
 )
 def test_what_is_given_or_has_the_name_needs_no_note(channels, given, assigned) -> None:
-    assert assign_channels(MODEL, channels, given) == (assigned, "")
+    assert assign_channels(MODEL, channels, given) == (assigned, "", False)
 
 
 @pytest.mark.parametrize(
@@ -46,10 +46,63 @@ def test_what_is_given_or_has_the_name_needs_no_note(channels, given, assigned) 
     ],
 )
 def test_the_order_decides_where_as_many_are_left_and_is_told(channels, given, assigned) -> None:
-    found, note = assign_channels(MODEL, channels, given)
+    found, note, may_be_swapped = assign_channels(MODEL, channels, given)
     assert found == assigned
+    assert may_be_swapped == (len(given) == 0 and "u" not in channels)
     told = [signal for signal in assigned if f"{signal!r}: {assigned[signal]!r}" in note]
     assert told == [s for s in assigned if s not in given and assigned[s] != s]
+
+
+@pytest.mark.parametrize(
+    ("channels", "u", "y"),
+    [
+        (["Y", "U"], "U", "Y"),
+        (["output", "input"], "input", "output"),
+        (["Out", "In"], "In", "Out"),
+        (["PV", "OP"], "OP", "PV"),
+        (["PV", "CO"], "CO", "PV"),
+        (["pv", "mv"], "mv", "pv"),
+        (["y1", "u1"], "u1", "y1"),
+        (["SP", "PV", "OP"], "OP", "PV"),
+        (["y", "P1", "U"], "U", "y"),
+    ],
+)
+def test_usual_names_decide_before_the_order(channels: list[str], u: str, y: str) -> None:
+    found, note, may_be_swapped = assign_channels(MODEL, channels)
+    assert found == {"u": u, "y": y}
+    assert "usual names of inputs and outputs" in note
+    assert f"'u': {u!r}" in note
+    assert not may_be_swapped
+
+
+@pytest.mark.parametrize(
+    ("channels", "u", "basis"),
+    [
+        (["fuel", "CO"], "fuel", "by their order"),
+        (["valve", "CO2"], "valve", "by their order"),
+        (["PV1", "PV2"], "PV1", "by their order"),
+        (["PV", "heater"], "heater", "usual names of inputs and outputs and their order"),
+        (["oven", "input"], "input", "usual names of inputs and outputs and their order"),
+    ],
+)
+def test_the_order_decides_about_other_names(channels: list[str], u: str, basis: str) -> None:
+    found, note, _ = assign_channels(MODEL, channels)
+    assert found["u"] == u
+    assert f"{basis}. To choose" in note
+
+
+def test_usual_names_of_too_many_channels_do_not_decide() -> None:
+    with pytest.raises(InvalidRecord, match="Say which channel is which"):
+        assign_channels(MODEL, ["PV1", "PV2", "OP"])
+
+
+@pytest.mark.parametrize("text", ["Heater", "Heater [%]", "Heater (%)"])
+def test_a_channel_may_be_given_as_its_heading(text: str) -> None:
+    recording = Recording((Channel("Oven", T, T, "°C"), Channel("Heater", T, T, "%")))
+    given = {"u": text, "y": "Oven"}
+    assert assign_recording(MODEL, recording, given).by_signal == {"u": "Heater", "y": "Oven"}
+    with pytest.raises(InvalidSettings, match=r"no channel 'Heater \[K\]'"):
+        assign_recording(MODEL, recording, {"u": "Heater [K]"})
 
 
 def test_a_signal_without_a_channel_is_told_with_all_channels() -> None:
