@@ -267,9 +267,9 @@ def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     from sysid.models.model import build_initial_parameters
 
     parameters = (*model.parameters, *build_initial_parameters(model, pieces))
-    faults = find_setting_faults(job.to_normal_form(), model, parameters)
-    if faults:
-        fail_usage(FIELD_ORIGINS.describe_faults(faults))
+    wrong = find_setting_faults(job.to_normal_form(), model, parameters)
+    if wrong:
+        fail_usage(FIELD_ORIGINS.describe_faults(wrong))
     return job, model
 
 
