@@ -74,7 +74,16 @@ class Fault:
 
 
 class InvalidModel(SysidError, ValueError):
-    """A model document has faults."""
+    """A model document has faults.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_model({"name": "x", "form": "differential"})
+    ... except InvalidModel as error:
+    ...     print(error.faults[0].pointer)
+    /states
+    """
 
     def __init__(self, faults: Iterable[Fault]) -> None:
         self.faults = tuple(faults)
@@ -82,7 +91,16 @@ class InvalidModel(SysidError, ValueError):
 
 
 class UnknownModel(SysidError, LookupError):
-    """No built-in model has that name."""
+    """No built-in model has that name.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_model("fopd")
+    ... except UnknownModel as error:
+    ...     print(error)
+    there is no model 'fopd'; did you mean 'fopdt'?
+    """
 
     def __init__(self, name: str, valid: Iterable[str]) -> None:
         super().__init__(f"there is no model {name!r}{suggest_name(name, valid)}")
@@ -90,7 +108,16 @@ class UnknownModel(SysidError, LookupError):
 
 
 class InvalidRecord(SysidError, ValueError):
-    """A recording cannot be used: its channels, times or values."""
+    """A recording cannot be used: its channels, times or values.
+
+    Examples
+    --------
+    >>> try:
+    ...     Channel("u", [0.0, 1.0], [2.0])
+    ... except InvalidRecord as error:
+    ...     print(str(error).partition(";")[0])
+    channel 'u' has times of shape (2,) and values of shape (1,)
+    """
 
 
 class Advice(NamedTuple):
@@ -164,7 +191,14 @@ class UnreadableFile(SysidError, ValueError):
 
 
 class RecordTooShort(SysidError, ValueError):
-    """A record is shorter than the model's memory."""
+    """A record is shorter than the model's memory.
+
+    Examples
+    --------
+    >>> error = RecordTooShort(2.0, 5.0, "the model")
+    >>> error.needed
+    5.0
+    """
 
     def __init__(
         self, duration: float, needed: float, what: str, why: str = "", cure: str = ""
@@ -178,7 +212,16 @@ class RecordTooShort(SysidError, ValueError):
 
 
 class InvalidSettings(SysidError, ValueError):
-    """A setting of the search or of the problem is invalid."""
+    """A setting of the search or of the problem is invalid.
+
+    Examples
+    --------
+    >>> try:
+    ...     GeneticAlgorithm(population=1)
+    ... except InvalidSettings as error:
+    ...     print(error)
+    /algorithm/population: found 1; need 4 or more
+    """
 
     def __init__(self, pointer: str, detail: str) -> None:
         super().__init__(f"{pointer}: {detail}")
@@ -186,7 +229,13 @@ class InvalidSettings(SysidError, ValueError):
 
 
 class DivergedEverywhere(SysidError, ArithmeticError):
-    """No candidate of a search gave a finite simulation."""
+    """No candidate of a search gave a finite simulation.
+
+    Examples
+    --------
+    >>> issubclass(DivergedEverywhere, ArithmeticError)
+    True
+    """
 
     def __init__(self, evaluations: int) -> None:
         super().__init__(
@@ -197,7 +246,13 @@ class DivergedEverywhere(SysidError, ArithmeticError):
 
 
 class NothingIdentifiable(SysidError, ValueError):
-    """No free parameter has an effect on the output."""
+    """No free parameter has an effect on the output.
+
+    Examples
+    --------
+    >>> issubclass(NothingIdentifiable, ValueError)
+    True
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         super().__init__(
@@ -207,7 +262,13 @@ class NothingIdentifiable(SysidError, ValueError):
 
 
 class UnknownParameter(SysidError, KeyError):
-    """A result has no parameter of that name."""
+    """A result has no parameter of that name.
+
+    Examples
+    --------
+    >>> print(UnknownParameter("k", ("K", "T")))
+    there is no parameter 'k'; known are K, T
+    """
 
     def __init__(self, name: object, valid: Iterable[str]) -> None:
         hint = f"; the names are {', '.join(valid)}"
@@ -221,21 +282,42 @@ class UnknownParameter(SysidError, KeyError):
 
 
 class UnreadableResult(SysidError, ValueError):
-    """A file of a result or of an identified model cannot be used."""
+    """A file of a result or of an identified model cannot be used.
+
+    Examples
+    --------
+    >>> try:
+    ...     load_identified("gone.json")
+    ... except UnreadableResult as error:
+    ...     print(error)
+    gone.json: it cannot be read: No such file or directory
+    """
 
     def __init__(self, path: object, detail: str) -> None:
         super().__init__(f"{path}: {detail}")
 
 
 class UnwritableFile(SysidError):
-    """A file cannot be written; what was there before is whole."""
+    """A file cannot be written; what was there before is whole.
+
+    Examples
+    --------
+    >>> print(UnwritableFile("found.json", "the disk is full"))
+    found.json: it cannot be written: the disk is full
+    """
 
     def __init__(self, path: object, detail: str) -> None:
         super().__init__(f"{path}: it cannot be written: {detail}")
 
 
 class MissingLibrary(SysidError, ImportError):
-    """A call needs a library that is not installed."""
+    """A call needs a library that is not installed.
+
+    Examples
+    --------
+    >>> issubclass(MissingLibrary, ImportError)
+    True
+    """
 
     def __init__(self, call: str, library: str) -> None:
         super().__init__(
