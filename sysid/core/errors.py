@@ -38,6 +38,11 @@ class SysidError(Exception):
     ... except SysidError as error:
     ...     print(error)
     there is no model 'fopd'; did you mean 'fopdt'?
+    >>> try:
+    ...     load_model("mine.yaml")
+    ... except UnknownModel as error:
+    ...     print(error)
+    there is no model 'mine.yaml'; a file is a path: Path('mine.yaml')
     """
 
 
@@ -100,10 +105,17 @@ class UnknownModel(SysidError, LookupError):
     ... except UnknownModel as error:
     ...     print(error)
     there is no model 'fopd'; did you mean 'fopdt'?
+    >>> try:
+    ...     load_model("mine.yaml")
+    ... except UnknownModel as error:
+    ...     print(error)
+    there is no model 'mine.yaml'; a file is a path: Path('mine.yaml')
     """
 
     def __init__(self, name: str, valid: Iterable[str]) -> None:
-        super().__init__(f"there is no model {name!r}{suggest_name(name, valid)}")
+        is_file = name.endswith((".yaml", ".yml", ".json"))
+        hint = f"; a file is a path: Path({name!r})" if is_file else suggest_name(name, valid)
+        super().__init__(f"there is no model {name!r}{hint}")
         self.name = name
 
 

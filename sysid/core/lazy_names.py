@@ -1,4 +1,4 @@
-"""Public names of a package that are loaded from their modules on first use."""
+"""Load on first use: public names of a package, and libraries that a user may not have."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -30,3 +30,19 @@ def load_on_first_use(package: str, modules: Mapping[str, str]) -> Callable[[str
         return value
 
     return load_name
+
+
+def load_library(name: str, call: str) -> Any:
+    """Load a library that only `call` needs.
+
+    Raises
+    ------
+    MissingLibrary
+        If it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        from sysid.core.errors import MissingLibrary  # `import lagid` does without
+
+        raise MissingLibrary(call, name.partition(".")[0]) from None

@@ -6,7 +6,7 @@ wire schemas, the forms and the command line take them from here.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 from sysid.core.errors import InvalidSettings
 
@@ -232,8 +232,8 @@ class Loss:
 
     With the noise model ``ar1`` the search minimises squares. Then generalised least squares
     under first-order noise gives the estimates
-    (`sysid.identification.generalised_least_squares`). ``auto`` selects ``ar1`` for free runs by
-    squares with coloured residuals and an integrating model
+    (`sysid.identification.generalised_least_squares`). ``auto`` selects, for free runs by
+    squares with coloured residuals, the one that predicts left-out data better
     (`sysid.identification.noise_model_choice`), else ``white``.
 
     Examples
@@ -263,6 +263,10 @@ class Loss:
             )
 
 
+Weights: TypeAlias = Mapping[str, float | Sequence[float]]
+"""Weight of each output: one number, or one for each experiment."""
+
+
 @dataclass(frozen=True, slots=True)
 class FitSettings:
     """Settings of a fit, besides its model and its records.
@@ -275,20 +279,25 @@ class FitSettings:
         Free run or one step ahead.
     loss : Loss
         Loss to minimise.
-    weights : mapping of str to float or None
-        Weight of each output. None: 1 for one output, else 1 / its standard deviation.
+    weights : mapping of str to float or sequence of float, or None
+        Weight of each output, one number or one for each experiment. None: 1 for one output, else
+        1 / its standard deviation; then the noise of each output in each experiment is estimated.
     skip : int
         First samples of each output that are not scored.
     scored_from : tuple of float or None
         For each record the time (s) from which samples are scored. None: all samples.
+    deviations : tuple of tuple of float, or None
+        Relative standard deviation of the noise by experiment and output, which divides the
+        weight. None: all are equal.
     """
 
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     prediction: PredictionKind = "simulation"
     loss: Loss = field(default_factory=Loss)
-    weights: Mapping[str, float] | None = None
+    weights: Weights | None = None
     skip: int = 0
     scored_from: tuple[float, ...] | None = None
+    deviations: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", dict(self.parameters))

@@ -4,10 +4,19 @@ This module imports the standard library only, so that every command may use it.
 """
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeGuard
 
 DASH = "–"
+RELATIVE_UNIT = "σ"
+"""Unit of the RMS over several outputs: the standard deviation of each."""
+_SETTING = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
+"""A field of a job in a note, as in a job file: ``loss: {noise_model: ar1}``.
+
+Text after "the model" is excluded: it names a field of the model document, which no option sets.
+"""
+_AT_BOUND, _UNSETTLED = "at bound", "not settled"  # statuses of an estimate
 _THIN_SPACE = "\u202f"  # narrow no-break space: joins a number to its unit
 
 
@@ -26,47 +35,47 @@ def format_number(value: float | None, digits: int = 4) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def format_estimate(
-    value: float, stderr: float | None, *, is_bound: bool = False
-) -> tuple[str, str]:
+def format_estimate(value: float, stderr: float | None, *, status: str = "") -> tuple[str, str]:
     """Format an estimate and its standard error, both to the error's second significant digit.
 
-    A value that is a bound is not rounded to its error.
+    A value "at bound" is not rounded to its error. One of a search that did not settle has no
+    error: its distance from the optimum is unknown.
     """
-    if not _is_positive(stderr):
+    if not _is_positive(stderr) or status == _UNSETTLED:
         return format_number(value, 6), ""
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return format_number(value, 6), format_number(stderr, 2)
-    if is_bound:
+    if status == _AT_BOUND:
         return f"{value:.6g}".replace("-", "−"), f"{stderr:.{decimals}f}"
     rounded = [f"{v:.{decimals}f}".replace("-", "−") for v in (value, stderr)]
     return rounded[0], rounded[1]
 
 
-def join_estimate(value: float, stderr: float | None, *, is_bound: bool = False) -> str:
+def join_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
     """Format an estimate and its standard error as one text, ``0.1193 ± 0.0004``."""
-    return " ± ".join(filter(None, format_estimate(value, stderr, is_bound=is_bound)))
+    return " ± ".join(filter(None, format_estimate(value, stderr, status=status)))
 
 
-def plain_estimate(value: float, stderr: float | None, *, is_bound: bool = False) -> str:
+def plain_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
     """Format an estimate and its error for terminals and notes, readable by programs.
 
-    A value that is a bound is not rounded to its error, which may be far larger.
+    A value "at bound" is not rounded to its error, which may be far larger. One of a search that
+    did not settle has no error.
     """
-    if not _is_positive(stderr):
+    if not _is_positive(stderr) or status == _UNSETTLED:
         return f"{value:.6g}"
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return f"{value:.6g} ± {stderr:.2g}"
-    if is_bound:
+    if status == _AT_BOUND:
         return f"{value:.6g} ± {stderr:.{decimals}f}"
     return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 
-def format_interval(ends: Sequence[float] | None, stderr: float | None) -> str:
-    """Format a 95 % interval, to the digits of the standard error."""
-    if ends is None:
+def format_interval(ends: Sequence[float] | None, stderr: float | None, *, status: str = "") -> str:
+    """Format a 95 % interval, to the digits of the standard error; empty without one."""
+    if ends is None or status == _UNSETTLED:
         return ""
     low, high = (format_estimate(end, stderr)[0] for end in ends)
     return f"{low} … {high}"
@@ -84,8 +93,33 @@ def format_unit(symbol: str) -> str:
     return "" if symbol in ("1", "") else f"{_THIN_SPACE}{symbol}"
 
 
+def find_rms_unit(units: Mapping[str, str], find_recorded: Callable[[str], str]) -> str:
+    """Find the unit of the RMS: that of the output, or σ for several outputs together.
+
+    Parameters
+    ----------
+    units : mapping of str to str
+        Output → its unit in the model; a model that fits any unit has "1".
+    find_recorded : callable
+        Finds the unit of the channel that was recorded for an output without a unit.
+
+    Examples
+    --------
+    >>> find_rms_unit({"y": "1"}, {"y": "°C"}.get)
+    '°C'
+    >>> find_rms_unit({"x": "m", "v": "m/s"}, {}.get)
+    'σ'
+    """
+    if len(units) > 1:
+        return RELATIVE_UNIT
+    output, unit = next(iter(units.items()), ("", ""))
+    return find_recorded(output) if unit == "1" else unit or "1"
+
+
 def plain_unit(symbol: str | None) -> str:
-    """Format a unit after a plain space, for terminals and notes."""
+    """Format a unit after a plain space, for terminals and notes; σ is spelled out."""
+    if symbol == RELATIVE_UNIT:
+        return " standard deviations"
     return "" if symbol in (None, "", "1") else f" {symbol}"
 
 
@@ -97,6 +131,22 @@ def bracket_unit(symbol: str | None) -> str:
 def append_unit(name: str, symbol: str | None) -> str:
     """Format a heading with its unit, ``T [s]``; the unit σ stands for several outputs together."""
     return f"{name}{bracket_unit(symbol)}"
+
+
+def rewrite_settings(note: str, write: Callable[[str, str, str], str]) -> str:
+    """Rewrite a note so that it names settings as the reader types them, not as a job file does.
+
+    Parameters
+    ----------
+    write : callable
+        Writes a setting from the field, the name in it and the value.
+
+    Examples
+    --------
+    >>> rewrite_settings("use hold: {u: zero}", lambda *parts: "{}.{}={}".format(*parts))
+    'use hold.u=zero'
+    """
+    return _SETTING.sub(lambda match: write(*match.groups()), note)
 
 
 def _is_positive(stderr: float | None) -> TypeGuard[float]:

@@ -35,7 +35,7 @@ _RESERVED_WORDS = (
     "between between_on_grid held sample past lately n t p step steps i part stage slope work "
     "points grid ratio ramp half width meets place whole averaged averaged_on_grid sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
-    "BUFSIZ RAND_MAX"
+    "BUFSIZ RAND_MAX pchip_rise pchip_slope"
 )
 _LINE_WIDTH = 92
 
@@ -56,6 +56,12 @@ class CLanguage(TargetLanguage):
         function = FUNCTIONS[name].c
         self.called_functions.add(function)
         return f"{function}({', '.join(arguments)})"
+
+    def write_table(self, name: str, argument: str, x: list[str], y: list[str]) -> str:
+        """Write a call of a table with its points."""
+        self.called_functions.add(name)
+        points = [f"(const double[]){{{', '.join(values)}}}" for values in (x, y)]
+        return f"{name}({argument}, {len(x)}, {', '.join(points)})"
 
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """Write a power and its level."""
@@ -91,6 +97,10 @@ class CLanguage(TargetLanguage):
         """Write a time lag that is not negative."""
         least = f"fmax({text}, 0.0)"
         return f"floor({least} + 0.5)" if is_whole else least
+
+    def write_limit(self, delay: str) -> str:
+        """Write a time lag that is at most 1e9 steps."""
+        return f"fmin({delay}, 1e9)"
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
         """Write the first line of a loop over the steps."""
@@ -559,10 +569,81 @@ static double greatest(double a, double b)
     return isnan(a) || a > b ? a : b;
 }
 """
+_CLIP = """\
+static double clip(double x, double lower, double upper)
+{
+    return least(greatest(x, lower), upper);
+}
+"""
+_MODULO = """\
+/* Remainder of x/y with the sign of y. */
+static double modulo(double x, double y)
+{
+    const double rest = fmod(x, y);
+    return rest*y < 0.0 ? rest + y : rest;
+}
+"""
+_TABLE = """\
+/* Value of a table of n points at x, linear; its end values outside. */
+static double table(double x, int n, const double *xs, const double *ys)
+{
+    int i = 0;
+    if (!(x > xs[0]))
+        return isnan(x) ? x : ys[0];
+    if (x >= xs[n - 1])
+        return ys[n - 1];
+    while (x >= xs[i + 1])
+        ++i;
+    return ys[i] + (x - xs[i])*((ys[i + 1] - ys[i])/(xs[i + 1] - xs[i]));
+}
+"""
+_PCHIP = """\
+static double pchip_rise(int i, const double *xs, const double *ys)
+{
+    return (ys[i + 1] - ys[i])/(xs[i + 1] - xs[i]);
+}
+
+/* Slope of a monotone cubic at its point i of n. */
+static double pchip_slope(int i, int n, const double *xs, const double *ys)
+{
+    const int left = i == 0 ? 0 : i == n - 1 ? n - 2 : i - 1;
+    const int right = i == 0 ? 1 : i == n - 1 ? n - 3 : i;
+    if (n == 2)
+        return pchip_rise(0, xs, ys);
+    const double a = pchip_rise(left, xs, ys), b = pchip_rise(right, xs, ys);
+    const double h = xs[left + 1] - xs[left], w = xs[right + 1] - xs[right];
+    if (0 < i && i < n - 1)
+        return a*b > 0.0 ? 3.0*(h + w)/((2.0*w + h)/a + (w + 2.0*h)/b) : 0.0;
+    const double slope = ((2.0*h + w)*a - h*b)/(h + w);
+    if (!(slope*a > 0.0))
+        return 0.0;
+    return !(a*b > 0.0) && fabs(slope) > 3.0*fabs(a) ? 3.0*a : slope;
+}
+
+/* Value at x of a monotone cubic through n points; its end values outside. */
+static double pchip(double x, int n, const double *xs, const double *ys)
+{
+    int i = 0;
+    if (!(x > xs[0]))
+        return isnan(x) ? x : ys[0];
+    if (x >= xs[n - 1])
+        return ys[n - 1];
+    while (x >= xs[i + 1])
+        ++i;
+    const double h = xs[i + 1] - xs[i], part = x - xs[i], mean = pchip_rise(i, xs, ys);
+    const double over = mean - pchip_slope(i, n, xs, ys);
+    const double under = pchip_slope(i + 1, n, xs, ys) - mean;
+    return ys[i] + part*(mean - over + part*((2.0*over - under)/h + part*(under - over)/(h*h)));
+}
+"""
 HELPERS: Mapping[str, str] = {
     "sign": _SIGN,
     "least": _LEAST,
     "greatest": _GREATEST,
+    "clip": _CLIP,
+    "modulo": _MODULO,
+    "table": _TABLE,
+    "pchip": _PCHIP,
     "between": _BETWEEN,
     "between_on_grid": _BETWEEN_ON_GRID,
     "held": _HELD,

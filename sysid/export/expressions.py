@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from sysid.language.functions import OPERATORS, Level
+from sysid.language.tables import TABLE_FUNCTIONS
 from sysid.language.tree import (
     Binary,
     Expression,
@@ -37,6 +38,9 @@ class TargetLanguage(Protocol):
     def write_function_call(self, name: str, arguments: list[str]) -> str:
         """Write a call of a function of the model language."""
 
+    def write_table(self, name: str, argument: str, x: list[str], y: list[str]) -> str:
+        """Write a call of a table with its points."""
+
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """Write a power and its level; ``**`` may follow `base`, `whole` is a small exponent."""
 
@@ -60,6 +64,9 @@ class TargetLanguage(Protocol):
 
     def write_delay(self, text: str, *, is_whole: bool) -> str:
         """Write a time lag that is not negative; `is_whole`: rounded to whole steps."""
+
+    def write_limit(self, delay: str) -> str:
+        """Write a time lag that is at most 1e9 steps, so that its whole part is a number."""
 
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
         """Write the first line of a loop over steps from `first`; `to_last` includes the last."""
@@ -126,6 +133,10 @@ def _write_unary(tree: Unary, language: TargetLanguage, scope: ExportScope) -> t
 
 def _write_call(tree: FunctionCall, language: TargetLanguage, scope: ExportScope) -> str:
     arguments = [write_expression(argument, language, scope) for argument in tree.arguments]
+    if tree.function in TABLE_FUNCTIONS:
+        first, *points = arguments
+        half = len(points) // 2
+        return language.write_table(tree.function, first, points[:half], points[half:])
     if tree.function == "where":
         condition, first, second = arguments
         return language.write_choice(condition, first, second)

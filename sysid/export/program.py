@@ -28,6 +28,7 @@ from sysid.kernels.reads import (
     list_stored_histories,
     reads_cubics,
 )
+from sysid.language.delays import has_varying_delay
 from sysid.language.functions import Level
 from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import DerivedInitial, FixedInitial, MeasuredInitial, name_initial_state
@@ -237,12 +238,20 @@ class LoopScope(ExportScope):
 
     def _write_position(self, past: PastValue) -> str:
         offset = f"-{past.offset}" if past.offset else ""
-        delay = f" - {self.program.name_delay(past.delay)}" if past.delay is not None else ""
+        delay = f" - {self._write_delay(past)}" if past.delay is not None else ""
         return (
             ("step + part" if self.stage == "slope" else self.program.loop_variable)
             + offset
             + delay
         )
+
+    def _write_delay(self, past: PastValue) -> str:
+        """Write a time lag in steps: its variable, or what it is now if it changes with inputs."""
+        if past.delay is None:
+            return ""
+        if has_varying_delay(past):
+            return write_delay_steps(self.program, past.delay, self)
+        return self.program.name_delay(past.delay)
 
     # ---- inputs ---------------------------------------------------------------------------
     def _write_input(self, past: PastValue) -> str:
@@ -367,15 +376,19 @@ class StartScope(DelayScope):
         return f"{self.program.input_names[past.name]}[0]"
 
 
-def write_delay_steps(program: GeneratedProgram, delay: Expression) -> str:
-    """Write a time lag in integration steps."""
+def write_delay_steps(
+    program: GeneratedProgram, delay: Expression, scope: ExportScope | None = None
+) -> str:
+    """Write a time lag in integration steps; `scope`: where in the loop, if it changes there."""
+    names = DelayScope(program) if scope is None else scope
     if program.is_recursion:
-        text = write_expression(delay, program.language, DelayScope(program))
+        text = write_expression(delay, program.language, names)
     else:
-        seconds = write_expression(delay, program.language, DelayScope(program), Level.SIGN)
+        seconds = write_expression(delay, program.language, names, Level.SIGN)
         text = f"{seconds}/{program.step_variable}"
     is_whole = program.identified.model.solver.interpolation == "nearest"
-    return program.language.write_delay(text, is_whole=is_whole)
+    written = program.language.write_delay(text, is_whole=is_whole)
+    return written if scope is None else program.language.write_limit(written)
 
 
 # ---- common to both languages ---------------------------------------------------------------
@@ -437,6 +450,8 @@ def list_needed_helpers(
         wanted.add("past")
     if "past" in wanted:
         wanted.add("sample")
+    if "clip" in wanted:
+        wanted |= {"least", "greatest"}
     variants = _find_variants(identified)
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 

@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from sysid.control.linear_form import IdentifiedModel
 from sysid.data.interpolation import MAX_POINTS_PER_STEP
@@ -32,15 +33,20 @@ _RESERVED_WORDS = (
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
     "slope_4 every points ratio ramp half width averaged averaged_on_grid sample_time range zip "
     "map max min int float abs len y before between between_on_grid held past lately sign signal "
-    "array grid print math ValueError"
+    "array grid print math erf pchip pchip_slope slice ValueError"
 )
 _LINE_WIDTH = 96
 
 
+@dataclass(slots=True)
 class PythonLanguage(TargetLanguage):
-    """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error."""
+    """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error.
 
-    logical_operators: Mapping[str, str] = {}
+    `called_functions` collects the functions that are called and that NumPy does not have.
+    """
+
+    called_functions: set[str] = field(default_factory=set)
+    logical_operators: Mapping[str, str] = field(default_factory=dict)
 
     def write_negation(self, condition: str) -> str:
         """Write ``not (…)``, valid anywhere."""
@@ -48,7 +54,15 @@ class PythonLanguage(TargetLanguage):
 
     def write_function_call(self, name: str, arguments: list[str]) -> str:
         """Write a call of a function of the model language."""
+        if name in HELPERS:
+            self.called_functions.add(name)
+            return f"{name}({', '.join(arguments)})"
         return f"np.{FUNCTIONS[name].numpy}({', '.join(arguments)})"
+
+    def write_table(self, name: str, argument: str, x: list[str], y: list[str]) -> str:
+        """Write a call of a table with its points."""
+        points = f"{argument}, [{', '.join(x)}], [{', '.join(y)}]"
+        return self.write_function_call(name, [points])
 
     def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """Write a power and its level."""
@@ -87,6 +101,10 @@ class PythonLanguage(TargetLanguage):
         least = f"max({text}, 0.0)"
         return f"np.floor({least} + 0.5)" if is_whole else least
 
+    def write_limit(self, delay: str) -> str:
+        """Write a time lag that is at most 1e9 steps."""
+        return f"min({delay}, 1e9)"
+
     def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
         """Write the first line of a loop over the steps."""
         ends = f"{first}, " if first else ""
@@ -111,7 +129,8 @@ def write_python_source(identified: IdentifiedModel) -> str:
     """
     names = [output.name for output in identified.model.outputs]
     taken = [word for word in _RESERVED_WORDS.split() if word not in names]
-    program = GeneratedProgram(identified, PythonLanguage(), Identifiers(taken))
+    language = PythonLanguage()
+    program = GeneratedProgram(identified, language, Identifiers(taken))
     loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
     head = [
         *_write_arrays(program),
@@ -119,12 +138,14 @@ def write_python_source(identified: IdentifiedModel) -> str:
         *_write_delays(program),
         *_write_starts(program),
     ]
-    helpers = list_needed_helpers(HELPERS, program.helper_names, identified)
+    helpers = list_needed_helpers(
+        HELPERS, program.helper_names | language.called_functions, identified
+    )
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indent_lines(loop)
     parts = [
         _write_docstring(identified),
-        "import numpy as np\n",
+        ("import math\n\n" if "erf" in language.called_functions else "") + "import numpy as np\n",
         *(f"\n{helper}" for helper in helpers),
     ]
     parts.append("\n" + _write_signature(program))
@@ -427,7 +448,38 @@ _LATELY_BY_SLOPES = '''def lately(array, first, last, before, step, part, there,
         return array[step] + share*(tangent + share*(there - array[step] - tangent))
     return past(array, first, last, before, step, delay - part)
 '''
+_ERF = '''def erf(x):
+    """Error function."""
+    return np.float64(math.erf(x))
+'''
+_PCHIP = '''def pchip_slope(i, x, y):
+    """Slope of a monotone cubic at its point i."""
+    rise = np.diff(y)/np.diff(x)
+    if len(rise) == 1:
+        return rise[0]
+    if 0 < i < len(rise):
+        (a, b), (h, w) = rise[i - 1:i + 1], np.diff(x[i - 1:i + 2])
+        return 3*(h + w)/((2*w + h)/a + (w + 2*h)/b) if a*b > 0 else 0.0
+    ends = slice(0, 2) if i == 0 else slice(-1, -3, -1)
+    (a, b), (h, w) = rise[ends], np.diff(x)[ends]
+    slope = ((2*h + w)*a - h*b)/(h + w)
+    if not slope*a > 0:
+        return 0.0
+    return 3*a if not a*b > 0 and abs(slope) > 3*abs(a) else slope
+
+
+def pchip(place, x, y):
+    """Value of a monotone cubic through points x, y; its end values outside."""
+    if not x[0] < place < x[-1]:
+        return np.interp(place, x, y)
+    i = int(np.searchsorted(x, place, "right")) - 1
+    h, part, mean = x[i + 1] - x[i], place - x[i], (y[i + 1] - y[i])/(x[i + 1] - x[i])
+    over, under = mean - pchip_slope(i, x, y), pchip_slope(i + 1, x, y) - mean
+    return y[i] + part*(mean - over + part*((2*over - under)/h + part*(under - over)/h**2))
+'''
 HELPERS: Mapping[str, str] = {
+    "pchip": _PCHIP,
+    "erf": _ERF,
     "between": _BETWEEN,
     "between_on_grid": _BETWEEN_ON_GRID,
     "held": _HELD,

@@ -263,6 +263,10 @@ class InputReader:
         older = lanes.gather(self._addresses, b.sub(place, lanes.make_integer(1)))
         return lanes.interpolate(newest, self._fraction, older)
 
+    def load_once(self, step: IrValue) -> IrValue:
+        """Load the value at the only place, for a delay that holds there alone."""
+        return self._load_value(step, self._places[0])
+
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
         self._chain = [loop.carry(value) for value in self._initial]

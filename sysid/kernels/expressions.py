@@ -1,9 +1,12 @@
 """Code generation from expression trees to vector instructions."""
 
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
+from sysid.kernels.tables import emit_table
 from sysid.kernels.vectors import IrValue, VectorBuilder
 from sysid.language.functions import FUNCTIONS, OPERATORS, Level
+from sysid.language.tables import TABLE_FUNCTIONS, split_table
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 MAX_POWER = 64
@@ -38,10 +41,7 @@ def emit_expression(lanes: VectorBuilder, expression: Expression, scope: Environ
         case Binary():
             return _emit_binary(lanes, expression, scope)
         case FunctionCall():
-            arguments = [
-                emit_expression(lanes, argument, scope) for argument in expression.arguments
-            ]
-            return _emit_call(lanes, expression.function, arguments)
+            return _emit_call(lanes, expression, scope)
 
 
 def evaluate_constant(expression: Expression) -> float | None:
@@ -97,11 +97,18 @@ def _emit_whole_power(lanes: VectorBuilder, base: IrValue, exponent: int) -> IrV
     return lanes.make_number(1.0) if result is None else result
 
 
-def _emit_call(lanes: VectorBuilder, function: str, arguments: list[IrValue]) -> IrValue:
+def _emit_call(lanes: VectorBuilder, call: FunctionCall, scope: Environment) -> IrValue:
+    function = call.function
+    if function in TABLE_FUNCTIONS:
+        table = split_table(call)
+        place = emit_expression(lanes, table.argument, scope)
+        values = [emit_expression(lanes, value, scope) for value in table.y]
+        return emit_table(lanes, place, table.x, values, is_cubic=function == "pchip")
+    arguments = [emit_expression(lanes, argument, scope) for argument in call.arguments]
     if function == "where":
         return lanes.select(*arguments)
-    if function == "sign":
-        return _emit_sign(lanes, arguments[0])
+    if function in _INSTRUCTIONS:
+        return _INSTRUCTIONS[function](lanes, *arguments)
     return lanes.call_intrinsic(FUNCTIONS[function].llvm, *arguments)
 
 
@@ -110,3 +117,26 @@ def _emit_sign(lanes: VectorBuilder, value: IrValue) -> IrValue:
     zero = lanes.make_number(0.0)
     negative = lanes.select(lanes.compare("<", value, zero), lanes.make_number(-1.0), value)
     return lanes.select(lanes.compare(">", value, zero), lanes.make_number(1.0), negative)
+
+
+def _emit_clip(lanes: VectorBuilder, value: IrValue, lower: IrValue, upper: IrValue) -> IrValue:
+    above = lanes.call_intrinsic("maximum", value, lower)
+    return lanes.call_intrinsic("minimum", above, upper)
+
+
+def _emit_modulo(lanes: VectorBuilder, value: IrValue, divisor: IrValue) -> IrValue:
+    """Emit x - y floor(x/y), corrected where the quotient was rounded to the next whole number."""
+    zero = lanes.make_number(0.0)
+    whole = lanes.call_intrinsic("floor", lanes.div(value, divisor))
+    rest = lanes.sub(value, lanes.mul(whole, divisor))
+    is_outside = lanes.compare("<", lanes.mul(rest, divisor), zero)
+    rest = lanes.select(is_outside, lanes.add(rest, divisor), rest)
+    size, limit = (lanes.call_intrinsic("fabs", number) for number in (rest, divisor))
+    return lanes.select(lanes.compare(">=", size, limit), lanes.sub(rest, divisor), rest)
+
+
+_INSTRUCTIONS: Mapping[str, Callable[..., IrValue]] = {
+    "sign": _emit_sign,
+    "clip": _emit_clip,
+    "mod": _emit_modulo,
+}

@@ -9,6 +9,7 @@ from sysid.kernels.expressions import Environment, emit_expression
 from sysid.kernels.signal_readers import SignalReaders
 from sysid.kernels.signals import ParameterEnvironment, States
 from sysid.kernels.vectors import DOUBLE, IrValue, VectorBuilder
+from sysid.language.delays import has_varying_delay
 from sysid.language.tree import PastValue, Symbol
 from sysid.models.model import Model
 
@@ -73,6 +74,8 @@ class StepEnvironment(Environment):
         halves = self.half_steps - 2 * past.offset
         if past.delay is None:
             return self.signals.load_input(past.name, halves, self.time_step.index)
+        if has_varying_delay(past):
+            return self.signals.read_varying_input(past, halves, self.time_step, self)
         zero = self.lanes.make_number(0.0)
         return self.signals.get_reader(past, halves).read_value(halves, zero, zero)
 

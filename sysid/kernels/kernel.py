@@ -20,6 +20,7 @@ from sysid.kernels.signals import (
     States,
 )
 from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
+from sysid.language.tree import Binary, FunctionCall, walk
 from sysid.models.model import DerivedInitial, EstimatedInitial, MeasuredInitial, Model
 
 KERNEL_NAME = "kernel"
@@ -56,7 +57,29 @@ def emit_kernel(model: Model, variant: KernelVariant) -> str:
         lanes.builder.icmp_signed(">", remaining, lanes.make_integer(0)), emit_narrow_block, []
     )
     lanes.builder.ret_void()
+    if _has_repeated_calls(model):
+        _declare_pure_functions(module)
     return str(module)
+
+
+def _has_repeated_calls(model: Model) -> bool:
+    """Whether a function is called twice with the same arguments, as by intermediate names."""
+    trees = (*model.equations, *(output.expression for output in model.outputs))
+    calls = [
+        node
+        for tree in trees
+        for node in walk(tree)
+        if isinstance(node, FunctionCall) or (isinstance(node, Binary) and node.operator == "**")
+    ]
+    return len(set(calls)) < len(calls)
+
+
+def _declare_pure_functions(module: ir.Module) -> None:
+    """Declare called functions as pure: the compiler computes what occurs twice only once."""
+    for function in module.functions:
+        if not function.blocks and not function.name.startswith("llvm."):
+            for attribute in ("readnone", "nounwind"):
+                function.attributes.add(attribute)
 
 
 def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:

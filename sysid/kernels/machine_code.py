@@ -38,13 +38,18 @@ def describe_machine() -> str:
 
 def compile_assembly(assembly: str) -> bytes:
     """Compile assembly for this machine."""
+    return bytes(_create_target_machine().emit_object(optimize_assembly(assembly)))
+
+
+def optimize_assembly(assembly: str) -> Any:
+    """Optimize assembly for this machine; return LLVM's module."""
     machine = _create_target_machine()
     module = llvm.parse_assembly(assembly)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=_OPTIMIZATION_LEVEL)
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
-    return bytes(machine.emit_object(module))
+    return module
 
 
 def load_object_code(code: bytes, function: str) -> int:

@@ -7,7 +7,7 @@ Runge-Kutta step are at 0, 1 and 2. The sample that a difference equation comput
 from typing import NamedTuple
 
 from sysid.core.memo import cache_by_identity
-from sysid.language.delays import collect_past_values, mentions_time
+from sysid.language.delays import collect_past_values, has_varying_delay, mentions_time
 from sysid.language.tree import Expression, PastValue
 from sysid.models.model import Model
 
@@ -70,6 +70,13 @@ def list_delayed_values(model: Model, kind: str) -> list[PastValue]:
     ]
 
 
+def list_delaying_inputs(model: Model) -> list[str]:
+    """List the inputs that delays of other values read, each once."""
+    delays = [past.delay for past in list_delayed_values(model, "input") if past.delay]
+    values = [value for delay in delays for value in collect_past_values(delay)]
+    return [*dict.fromkeys(value.name for value in values)]
+
+
 def find_averaged_inputs(model: Model) -> frozenset[str]:
     """Find inputs with unknown delays only; if held, they are averaged over a step."""
     inputs = [r.past for r in collect_reads(model) if r.past.kind == "input"]
@@ -114,10 +121,11 @@ def list_stored_histories(model: Model) -> list[StoredHistory]:
 
 
 def group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
-    """Group the places of delayed reads of one kind by signal and delay."""
+    """Group the places of reads of one kind with a constant delay, by signal and delay."""
     places: dict[tuple[str, Expression], set[int]] = {}
     for read in collect_reads(model):
-        if read.past.kind == kind and read.past.delay is not None:
+        is_constant = read.past.delay is not None and not has_varying_delay(read.past)
+        if read.past.kind == kind and read.past.delay is not None and is_constant:
             places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
     return places
 

@@ -9,6 +9,7 @@ from sysid.kernels.delayed_reads import (
     LinearReader,
     TimeStep,
 )
+from sysid.kernels.expressions import Environment
 from sysid.kernels.signals import Delays, ExperimentHead, States
 from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import Expression, PastValue
@@ -28,6 +29,7 @@ class SignalReaders:
         one_step: bool,
     ) -> None:
         self._lanes, self._model, self._experiment = lanes, model, experiment
+        self._delays = delays
         self._inputs = {signal.name: i for i, signal in enumerate(model.inputs)}
         self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
         self._owners: list[tuple[str, DelayedReader]] = []
@@ -80,6 +82,16 @@ class SignalReaders:
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
+
+    def read_varying_input(
+        self, past: PastValue, halves: int, time_step: TimeStep, scope: Environment
+    ) -> IrValue:
+        """Read an input whose delay depends on present inputs, once for this place."""
+        if past.delay is None:
+            raise AssertionError(f"{past.name} is read without delay")
+        steps = self._delays.to_present_steps(past.delay, scope)
+        reader = self._build_input_reader(past.name, steps, [halves])
+        return reader.load_once(time_step.index)
 
     def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
         """Load an input without delay: the same for all individuals."""

@@ -124,14 +124,18 @@ class Delays:
     def to_steps(self, delay: Expression) -> IrValue:
         """Convert a delay to steps, rounded if the model interpolates by ``nearest``."""
         if delay not in self._steps:
-            lanes = self._lanes
-            value = lanes.splat(emit_expression(lanes, delay, self._scope))
-            if not reads.is_difference(self._model):
-                value = lanes.div(value, self._step)
-            if self._model.solver.interpolation == "nearest":
-                value = lanes.call_intrinsic("floor", lanes.add(value, lanes.make_number(0.5)))
-            self._steps[delay] = value
+            self._steps[delay] = self.to_present_steps(delay, self._scope)
         return self._steps[delay]
+
+    def to_present_steps(self, delay: Expression, scope: Environment) -> IrValue:
+        """Convert a delay to steps, with the names as they are at one point of the simulation."""
+        lanes = self._lanes
+        value = lanes.splat(emit_expression(lanes, delay, scope))
+        if not reads.is_difference(self._model):
+            value = lanes.div(value, self._step)
+        if self._model.solver.interpolation == "nearest":
+            value = lanes.call_intrinsic("floor", lanes.add(value, lanes.make_number(0.5)))
+        return value
 
 
 class FinishedStep(NamedTuple):

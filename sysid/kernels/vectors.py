@@ -51,6 +51,9 @@ def load_vector_functions() -> VectorFunctions:
     return VectorFunctions(lanes, {n: s for n, s in names.items() if hasattr(library, s)})
 
 
+LIBRARY_FUNCTIONS = ("erf",)
+"""Functions of the C library for which LLVM has no intrinsic."""
+
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 _INT32 = ir.IntType(32)
 
@@ -176,6 +179,8 @@ class VectorBuilder:
         library = load_vector_functions()
         if name in library.symbols and isinstance(kind, ir.VectorType):
             return self._call_vector_function(library.symbols[name], library.lanes, values)
+        if name in LIBRARY_FUNCTIONS:
+            return self._call_library_function(name, values)
         suffix = f"v{self.width}f64" if isinstance(kind, ir.VectorType) else "f64"
         signature = ir.FunctionType(kind, [v.type for v in values])
         return self.builder.call(self._declare_function(f"llvm.{name}.{suffix}", signature), values)
@@ -191,6 +196,19 @@ class VectorBuilder:
             pieces = [self.builder.shuffle_vector(value, nothing, chosen) for value in values]
             parts.append(self.builder.call(function, pieces))
         return self._join_vectors(parts)
+
+    def _call_library_function(self, name: str, values: list[IrValue]) -> IrValue:
+        """Call a function of the C library, for each lane of vectors."""
+        kind = values[0].type
+        function = self._declare_function(name, ir.FunctionType(DOUBLE, [DOUBLE] * len(values)))
+        if not isinstance(kind, ir.VectorType):
+            return self.builder.call(function, values)
+        result = ir.Constant(kind, ir.Undefined)
+        for number in range(self.width):
+            lane = ir.Constant(_INT32, number)
+            parts = [self.builder.extract_element(value, lane) for value in values]
+            result = self.builder.insert_element(result, self.builder.call(function, parts), lane)
+        return result
 
     def _join_vectors(self, parts: list[IrValue]) -> IrValue:
         """Join vectors; neighbours join until one is left."""

@@ -47,6 +47,13 @@ def split_index(index: Expression, scope: Scope) -> PastIndex | str:
         return f"the index counts seconds; {_describe_form(scope)}"
     if abs(slope - 1.0) > 1e-9 or mentions_time(rest):
         return f"the delay changes with time; {_describe_form(scope)} with a constant delay"
+    if collect_past_values(rest):  # its limits follow from the record
+        return PastIndex(0, rest)
+    return _split_bounded(back, rest, scope)
+
+
+def _split_bounded(back: LaurentPolynomial, rest: Expression, scope: Scope) -> PastIndex | str:
+    """Split a delay that the bounds of its parameters must limit."""
     if (low := bound_expression(rest, scope.parameters)[0]) < 0:
         return _describe_negative(back, low, scope)
     if not back:
@@ -67,6 +74,11 @@ def mentions_time(expression: Expression, *kinds: str) -> bool:
 def collect_past_values(expression: Expression) -> tuple[PastValue, ...]:
     """Collect every signal value in an expression, in the order of the text."""
     return tuple(node for node in walk(expression) if isinstance(node, PastValue))
+
+
+def has_varying_delay(past: PastValue) -> bool:
+    """Whether the delay of a past value changes with inputs, as ``u(t - V/q(t))``."""
+    return past.delay is not None and bool(collect_past_values(past.delay))
 
 
 def _split_offset(back: LaurentPolynomial, low: float, scope: Scope) -> PastIndex:

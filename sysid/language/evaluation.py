@@ -11,6 +11,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.language.functions import FUNCTIONS, OPERATORS
+from sysid.language.tables import TABLE_FUNCTIONS, evaluate_table
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, Symbol, Unary
 
 
@@ -36,6 +37,12 @@ def evaluate_signal(expression: Expression, times: FloatArray) -> FloatArray:
         )
 
 
+def _load_special() -> Any:
+    from scipy import special  # slow to load, rarely needed
+
+    return special
+
+
 def _evaluate_node(expression: Expression, named: Mapping[str, Any]) -> Any:
     match expression:
         case Number(number):
@@ -49,8 +56,10 @@ def _evaluate_node(expression: Expression, named: Mapping[str, Any]) -> Any:
             operands = (_evaluate_node(left, named), _evaluate_node(right, named))
             return getattr(np, OPERATORS[operator].numpy)(*operands)
         case FunctionCall(function, arguments):
-            return getattr(np, FUNCTIONS[function].numpy)(
-                *(_evaluate_node(argument, named) for argument in arguments)
-            )
+            values = [_evaluate_node(argument, named) for argument in arguments]
+            if function in TABLE_FUNCTIONS:
+                return evaluate_table(function, *values)
+            name = FUNCTIONS[function].numpy
+            return getattr(np if hasattr(np, name) else _load_special(), name)(*values)
         case _:
             return np.float64(nan)

@@ -1,13 +1,14 @@
 """Operators and functions of the language, in one table for all layers.
 
 To add a function, add its entry here. If LLVM has no intrinsic for it, write its instructions in
-`sysid.kernels.expressions`. If C99 has no function for it, write one in `sysid.export.c`.
+`sysid.kernels.expressions`, or name it in `sysid.kernels.vectors.LIBRARY_FUNCTIONS`. If C99 or
+NumPy has no function for it, write one in `sysid.export`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from math import atan, exp, inf, log, pi, sqrt, tan, tanh
+from math import atan, cosh, erf, exp, floor, inf, isinf, log, log10, pi, sinh, sqrt, tan, tanh
 from typing import TypeAlias
 
 Interval: TypeAlias = tuple[float, float]
@@ -138,6 +139,18 @@ def _log(x: float) -> float:
     return -inf if x <= 0 else log(x)
 
 
+def _log10(x: float) -> float:
+    return -inf if x <= 0 else log10(x)
+
+
+def _sinh(x: float) -> float:
+    return sinh(x) if abs(x) < 710.0 else inf * x
+
+
+def _floor(x: float) -> float:
+    return x if isinf(x) else float(floor(x))
+
+
 def _sqrt(x: float) -> float:
     return sqrt(max(x, 0.0))
 
@@ -149,6 +162,19 @@ def _sign(x: float) -> float:
 def _absolute(a: Interval) -> Interval:
     low = 0.0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))
     return (low, max(abs(a[0]), abs(a[1])))
+
+
+def _bound_hyperbolic_cosine(a: Interval) -> Interval:
+    low, high = _absolute(a)
+    return (cosh(min(low, 710.0)), inf if high > 710.0 else cosh(high))
+
+
+def _bound_remainder(_: Interval, b: Interval) -> Interval:
+    return (min(b[0], 0.0), max(b[1], 0.0))
+
+
+def _bound_angle(_: Interval, b: Interval) -> Interval:
+    return (-pi / 2, pi / 2) if b[0] > 0 else (-pi, pi)
 
 
 def _bound_wave(_: Interval) -> Interval:
@@ -169,6 +195,16 @@ def _join_branches(_: Interval, a: Interval, b: Interval) -> Interval:
 
 def _maximum(a: Interval, b: Interval) -> Interval:
     return (max(a[0], b[0]), max(a[1], b[1]))
+
+
+def _join_points(_: Interval, *points: Interval) -> Interval:
+    """Interval of a table, linear or monotone: that of its y, behind as many x."""
+    y = points[len(points) // 2 :]
+    return (min(low for low, _ in y), max(high for _, high in y))
+
+
+def _clip(a: Interval, lower: Interval, upper: Interval) -> Interval:
+    return _minimum(_maximum(a, lower), upper)
 
 
 OPERATORS: Mapping[str, Operator] = {
@@ -200,9 +236,20 @@ FUNCTIONS: Mapping[str, Function] = {
         Function("sign", _map_monotone(_sign)),
         Function("tanh", _map_monotone(tanh)),
         Function("atan", _map_monotone(atan), numpy="arctan"),
+        Function("atan2", _bound_angle, 2, 2, numpy="arctan2"),
+        Function("sinh", _map_monotone(_sinh)),
+        Function("cosh", _bound_hyperbolic_cosine),
+        Function("log10", _map_monotone(_log10)),
+        Function("erf", _map_monotone(erf)),
+        Function("floor", _map_monotone(_floor)),
+        # The remainder has the sign of the divisor, as in MATLAB and NumPy; fmod has not.
+        Function("mod", _bound_remainder, 2, 2, c="modulo"),
+        Function("clip", _clip, 3, 3),
         # Unlike a comparison, minimum and maximum pass nan on, so that divergence is not hidden.
         Function("min", _minimum, 2, None, numpy="minimum", llvm="minimum", c="least"),
         Function("max", _maximum, 2, None, numpy="maximum", llvm="maximum", c="greatest"),
         Function("where", _join_branches, 3, 3),
+        Function("table", _join_points, 3, 3, numpy="interp"),
+        Function("pchip", _join_points, 3, 3),
     )
 }

@@ -20,6 +20,7 @@ def bound_expression(
     ----------
     expression : Expression
     parameters : mapping of str to (lower, upper)
+        Also of inputs whose range is known; other signals may have any value.
     period : float or None
         Sampling period h in s; None: any positive value.
     """
@@ -28,6 +29,8 @@ def bound_expression(
             return (value, value)
         case Symbol():
             return _bound_symbol(expression, parameters, period)
+        case PastValue(name, "input", 0, None):
+            return parameters.get(name, REAL_LINE)
         case PastValue():
             return REAL_LINE
         case Unary("-", operand):

@@ -12,6 +12,7 @@ from math import isinf
 from typing import Literal, NamedTuple, TypeAlias
 
 from sysid.language.functions import OPERATORS, Level
+from sysid.language.hints import SIGNS, find_advice
 
 MAX_EXPRESSION_LENGTH = 4000
 """Most characters of one equation."""
@@ -87,7 +88,15 @@ class Apply:
     column: int
 
 
-SyntaxNode: TypeAlias = NumberLiteral | Name | Prefix | Infix | Apply
+@dataclass(frozen=True, slots=True)
+class Points:
+    """``[a, b, …]``: the x or y of a table."""
+
+    items: "tuple[SyntaxNode, ...]"
+    column: int
+
+
+SyntaxNode: TypeAlias = NumberLiteral | Name | Prefix | Infix | Apply | Points
 
 TokenKind = Literal["number", "name", "operator", "end"]
 
@@ -96,25 +105,14 @@ _TOKEN = re.compile(
       (?P<space>\s+)
     | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
     | (?P<name>[^\W\d]\w*)
-    | (?P<operator>\*\*|<=|>=|==|!=|[-+*/<>(),])
+    | (?P<operator>\*\*|<=|>=|==|!=|[-+*/<>(),\[\]])
+    | (?P<prime>(?<=[\w)])['’]+)
     | (?P<string>"[^"]*"?|'[^']*'?)
     | (?P<attribute>\.\s*[^\W\d]\w*)
     | (?P<other>.)
     """,
     re.VERBOSE | re.DOTALL,
 )
-
-_HINTS = {
-    "^": "write ** for a power",
-    "=": "write == to compare, inside where(…)",
-    "−": "write the ASCII minus sign -",
-    "·": "write * for a product",
-    "×": "write * for a product",
-    "[": "write a past value with parentheses, such as x(k-1)",
-    "&": "write 'and' inside where(…)",
-    "|": "write 'or' inside where(…)",
-    "!": "write 'not' inside where(…)",
-}
 
 
 class Token(NamedTuple):
@@ -152,10 +150,16 @@ def _describe_foreign(kind: str | None, word: str) -> str:
         return "strings are not part of the language; it has numbers, names and operators"
     if kind == "attribute":
         return f"{word!r}: attributes are not part of the language"
-    hint = f"; {_HINTS[word]}" if word in _HINTS else ""
+    if kind == "prime":
+        return (
+            f"{word} marks a derivative, which is no name here: the equation of a state is its "
+            "derivative; write that expression, or name it in let"
+        )
+    hint = f"; {SIGNS[word]}" if word in SIGNS else ""
     return f"{word!r} is not part of the language{hint}"
 
 
+_CLOSING = {"(": ")", "[": "]"}
 _OPPOSITE = {"+": "-", "-": "+", "*": "/", "/": "*"}
 
 _MIN_FOLDED_LINKS = 8
@@ -231,6 +235,8 @@ class _ExpressionParser:
             inner = self._parse_operators(Level.OR)
             self._expect_closing(word)
             return inner
+        if word.text == "[":
+            return Points(self._parse_list(word), word.column)
         if word.kind == "name" and word.text not in OPERATORS:
             return self._parse_name(word)
         raise SyntaxFault(word.column, _describe_missing_operand(word))
@@ -238,23 +244,30 @@ class _ExpressionParser:
     def _parse_name(self, word: Token) -> SyntaxNode:
         if self._peek().text != "(":
             return Name(word.text, word.column)
-        opening = self._advance()
-        arguments: list[SyntaxNode] = []
-        if self._peek().text != ")":
-            arguments.append(self._parse_operators(Level.OR))
+        return Apply(word.text, self._parse_list(self._advance()), word.column)
+
+    def _parse_list(self, opening: Token) -> tuple[SyntaxNode, ...]:
+        """Parse what is separated by commas, up to the closing parenthesis or bracket."""
+        items: list[SyntaxNode] = []
+        if self._peek().text != _CLOSING[opening.text]:
+            items.append(self._parse_operators(Level.OR))
             while self._peek().text == ",":
                 self._advance()
-                arguments.append(self._parse_operators(Level.OR))
+                items.append(self._parse_operators(Level.OR))
         self._expect_closing(opening)
-        return Apply(word.text, tuple(arguments), word.column)
+        return tuple(items)
 
     def _expect_closing(self, opening: Token) -> None:
         word = self._peek()
-        if word.text == ")":
+        if word.text == _CLOSING[opening.text]:
             self._advance()
-        elif word.kind == "end":
-            detail = f"the parenthesis opened at column {opening.column} is not closed"
+        elif word.kind == "end" or word.text in _CLOSING.values():
+            kind = "parenthesis" if opening.text == "(" else "bracket"
+            detail = f"the {kind} opened at column {opening.column} is not closed"
             raise SyntaxFault(opening.column, detail)
+        elif opening.text == "[" and word.kind in ("number", "name"):
+            detail = f"a comma is missing before {word.text!r}, as in [0, 1, 2]"
+            raise SyntaxFault(word.column, detail)
         else:
             raise SyntaxFault(word.column, _describe_unexpected(word))
 
@@ -293,9 +306,15 @@ def _fold_chain(first: SyntaxNode, links: Sequence[tuple[Token, SyntaxNode]]) ->
 def _describe_unexpected(word: Token) -> str:
     if word.text == ")":
         return "')' closes a parenthesis that was never opened"
+    if word.text in ("[", "]"):
+        return (
+            f"{word.text!r} belongs to the lists of table(u, [0, 1], [0, 5]) only; "
+            "write a past value with parentheses, such as x(k-1)"
+        )
     if word.text == ",":
-        return "',' only separates the arguments of a function"
-    return f"unexpected {word.text!r}; an operator such as * is missing before it"
+        return "',' only separates the arguments of a function; 0.5 is written with a point"
+    advice = find_advice(word.text, is_called=False)
+    return f"unexpected {word.text!r}; {advice or 'an operator such as * is missing before it'}"
 
 
 def _describe_missing_operand(word: Token) -> str:

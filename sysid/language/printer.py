@@ -2,6 +2,7 @@
 
 from sysid.language.functions import OPERATORS, Level
 from sysid.language.monomials import CONSTANT, add_polynomials, collect_terms, to_expression
+from sysid.language.tables import TABLE_FUNCTIONS
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 
@@ -36,9 +37,18 @@ def _format_with_level(expression: Expression, clock: str) -> tuple[str, int]:
             return f"not {_format_nested(operand, clock, Level.COMPARISON)}", Level.NOT
         case Binary(operator, left, right):
             return _format_infix(operator, left, right, clock), OPERATORS[operator].level
-        case FunctionCall(function, arguments):
-            inside = ", ".join(_format_nested(argument, clock, 0) for argument in arguments)
-            return f"{function}({inside})", Level.ATOM
+        case FunctionCall():
+            return _format_call(expression, clock), Level.ATOM
+
+
+def _format_call(call: FunctionCall, clock: str) -> str:
+    texts = [_format_nested(argument, clock, 0) for argument in call.arguments]
+    if call.function in TABLE_FUNCTIONS:
+        argument, *points = texts
+        half = len(points) // 2
+        lists = (", ".join(values) for values in (points[:half], points[half:]))
+        return f"{call.function}({argument}, [{'], ['.join(lists)}])"
+    return f"{call.function}({', '.join(texts)})"
 
 
 def _format_infix(operator: str, left: Expression, right: Expression, clock: str) -> str:

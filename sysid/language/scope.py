@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sysid.language.functions import FUNCTIONS
+from sysid.language.tree import Expression
 
 OPERATOR_WORDS = ("and", "or", "not")
 
@@ -28,6 +29,8 @@ class Scope:
     states, inputs : tuple of str
     parameters : mapping of str to (lower, upper)
     constants : mapping of str to float
+    intermediates : mapping of str to Expression
+        Trees of the intermediate names; they replace the names.
     """
 
     form: EquationForm
@@ -35,6 +38,7 @@ class Scope:
     inputs: tuple[str, ...] = ()
     parameters: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
+    intermediates: Mapping[str, Expression] = field(default_factory=dict)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -50,4 +54,5 @@ class Scope:
     def names(self) -> tuple[str, ...]:
         """Every name that is not a function."""
         clock_names = ("k", "h") if self.form == "difference" else ()
-        return (*self.signals, *self.parameters, *self.constants, "t", "pi", *clock_names)
+        declared = (*self.signals, *self.parameters, *self.constants, *self.intermediates)
+        return (*declared, "t", "pi", *clock_names)

@@ -42,7 +42,8 @@ class PastValue:
     delay : Expression or None
         Delay in addition to `offset`: in samples in the difference form (``L/h``), in seconds in
         the differential form. It contains only parameters, numbers and ``h``, and is never
-        negative inside the bounds. None: no unknown delay.
+        negative inside the bounds. The delay of an input may also contain present inputs; then
+        the record bounds it. None: no unknown delay.
     """
 
     name: str
@@ -102,6 +103,11 @@ def walk(tree: Expression) -> Iterator[Expression]:
     yield tree
     for child in find_children(tree):
         yield from walk(child)
+
+
+def measure_depth(tree: Expression) -> int:
+    """Measure the depth of a tree; a leaf has depth 1."""
+    return 1 + max(map(measure_depth, find_children(tree)), default=0)
 
 
 def match_plain_state(tree: Expression) -> str | None:

@@ -23,6 +23,7 @@ _FLOAT = re.compile(
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
 _INTEGER = re.compile(r"^[-+]?[0-9]{1,300}$")
+_FOREIGN_START = re.compile(r"character '(.)' that cannot start any token")
 _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
 
 
@@ -106,8 +107,10 @@ def _describe_yaml_error(error: yaml.YAMLError) -> str:
         problem = f"{getattr(error, 'context', '')}, {problem}"
     if "'\\t' that cannot start" in problem:
         problem += "; indent with spaces, not tabs"
-    elif "that cannot start any token" in problem:
-        problem += "; put a text that begins with it in quotes, such as '%'"
+    elif "expected ',' or '" in problem:
+        problem += "; put an expression with commas or brackets in quotes"
+    elif match := _FOREIGN_START.search(problem):
+        problem = f"a text cannot begin with {match[1]}; put it in quotes, such as '{match[1]}'"
     place = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
     return f"the YAML cannot be read: {place}{' '.join(problem.split())}"
 
@@ -187,6 +190,13 @@ class DocumentReader:
                 meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
                 self.add_fault(
                     place, f"the key {quote_value(key)} is not a text; put it in quotes{meant}"
+                )
+            elif item is None and key.count(")") > key.count("("):
+                # YAML reads {x: max(a, b)} as x: max(a and a key b) without a value
+                self.add_fault(
+                    place,
+                    f"the comma before {quote_value(key)} ends a value in braces; "
+                    "put the expression in quotes, such as {x: 'max(a, b)'}",
                 )
             elif names is not None and key not in names:
                 self.add_fault(

@@ -1,10 +1,11 @@
 """Equations and outputs of a document: their trees, order of computation and memory."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from sysid.core.errors import join_pointer, suggest_name
-from sysid.language.checker import CheckedExpression, check_expression
+from sysid.language.checker import MAX_NODES, CheckedExpression, check_expression
 from sysid.language.delays import collect_past_values
 from sysid.language.intervals import bound_expression
 from sysid.language.scope import Scope
@@ -13,10 +14,8 @@ from sysid.models.documents import DocumentReader
 from sysid.models.model import ModelSignal, Output
 from sysid.models.sections import MAX_EQUATIONS
 
-MAX_NODES = 10_000
-"""Numbers, names, operators and functions of a model; compiling takes milliseconds for each."""
-
 _ZERO = Number(0.0)
+_DERIVATIVE = re.compile(r"d(\w+?)(?:/dt)?|der\((\w+)\)|(\w+?)(?:['’]+|_dot|\([tk]\))")
 
 
 class OutputText(NamedTuple):
@@ -34,6 +33,9 @@ def read_equations(
     for name in fields:
         if name not in scope.states:
             detail = f"there is no such state{suggest_name(name, scope.states)}"
+            if (state := _find_derived_state(name)) in scope.states:
+                detail = f"an equation has the name of its state: write {state}: …, which is "
+                detail += "x(k)" if scope.form == "difference" else f"d{state}/dt"
             reader.add_fault(join_pointer("equations", name), detail)
     texts, trees = {}, []
     for state in scope.states:
@@ -49,6 +51,12 @@ def read_equations(
         _check_own_present(reader, checked, state, scope)
         trees.append(checked.tree or _ZERO)
     return texts, tuple(trees)
+
+
+def _find_derived_state(name: str) -> str | None:
+    """Find the state whose derivative or present value a name of an equation means."""
+    match = _DERIVATIVE.fullmatch(name)
+    return next(filter(None, match.groups()), None) if match else None
 
 
 def add_faults(reader: DocumentReader, checked: CheckedExpression, place: str) -> None:

@@ -40,6 +40,7 @@ def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
     declared = fields.get("parameters") or {}
     return {
         **head,
+        **_write_intermediates(fields.get("let")),
         **body,
         "parameters": {
             p.name: _write_parameter(p, declared) for p in model.parameters if p.name in declared
@@ -51,6 +52,12 @@ def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
         },
         "solver": _write_solver(model),
     }
+
+
+def _write_intermediates(declared: Mapping[str, Any] | None) -> dict[str, Any]:
+    if not declared:
+        return {}  # so that the normal form of other models has no such field
+    return {"let": {name: _write_text(text) for name, text in declared.items()}}
 
 
 def _write_equations(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:

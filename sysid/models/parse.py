@@ -10,6 +10,7 @@ from sysid.language.scope import EquationForm, Scope
 from sysid.language.tree import Expression, Number, PastValue, match_plain_state
 from sysid.models import equations
 from sysid.models.documents import DocumentReader, quote_value
+from sysid.models.intermediates import read_intermediates
 from sysid.models.model import (
     DerivedInitial,
     EstimatedInitial,
@@ -48,6 +49,7 @@ _COMMON_FIELDS = (
     "inputs",
     "parameters",
     "constants",
+    "let",
     "initial",
     "solver",
 )
@@ -163,8 +165,11 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
             "inputs": scope.inputs,
             "parameters": tuple(scope.parameters),
             "constants": tuple(constants),
+            "let": _list_names(fields.get("let")),
         },
     )
+    intermediates = read_intermediates(reader, fields.get("let"), scope)
+    scope = replace(scope, intermediates=intermediates)
     _, trees = equations.read_equations(reader, fields.get("equations"), scope)
     _, outputs = equations.read_outputs(reader, fields.get("outputs"), scope, states)
     _check_output_names(reader, outputs, scope)
@@ -242,6 +247,12 @@ def _build_scope(
     return Scope(form, named[0], named[1], intervals, constants)
 
 
+def _list_names(declared: object) -> tuple[str, ...]:
+    if not isinstance(declared, Mapping):
+        return ()
+    return tuple(n for n, text in declared.items() if isinstance(n, str) and text is not None)
+
+
 def _check_output_names(reader: DocumentReader, outputs: tuple[Output, ...], scope: Scope) -> None:
     for output in outputs:
         if output.name in scope.inputs:
@@ -286,8 +297,11 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
             "inputs": scope.inputs,
             "parameters": tuple(scope.parameters),
             "constants": tuple(constants),
+            "let": _list_names(fields.get("let")),
         },
     )
+    intermediates = read_intermediates(reader, fields.get("let"), scope)
+    scope = replace(scope, intermediates=intermediates)
     equation = expand_polynomial(reader, fields, scope)
     initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
     solver = read_solver(reader, fields.get("solver"), "polynomial")

@@ -5,6 +5,7 @@ monomial occurs once, i ≤ j ≤ …: C(s + m, m) - 1 coefficients for s past v
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 from itertools import combinations_with_replacement
 from math import comb
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple, cast, get_args
 
 from sysid.core.errors import InvalidBounds, InvalidSettings, join_pointer, suggest_name
 from sysid.language.checker import check_expression
-from sysid.language.delays import split_index
+from sysid.language.delays import has_varying_delay, split_index
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, Number, PastValue, Symbol
@@ -216,9 +217,12 @@ def _read_regressor(
     reader: DocumentReader, name: str, entry: object, place: str, scope: Scope
 ) -> PastValue | None:
     faults_before = reader.count_faults()
-    parameter_scope = Scope("difference", parameters=scope.parameters, constants=scope.constants)
+    parameter_scope = replace(scope, states=(), inputs=())
     checked = check_expression(reader.read_expression(entry, place), parameter_scope)
     add_faults(reader, checked, place)
+    for value, column in checked.uses:  # of an intermediate name
+        detail = f"the lag depends on {value.name!r}; it consists of parameters and constants only"
+        reader.add_fault(place, detail, column)
     if reader.count_faults() > faults_before or checked.tree is None:
         return None
     index = split_index(Binary("-", Symbol("k", "index"), checked.tree), scope)
@@ -230,6 +234,9 @@ def _read_regressor(
 
 
 def _reject_present(reader: DocumentReader, value: PastValue, place: str) -> PastValue | None:
+    if has_varying_delay(value):
+        reader.add_fault(place, "the lags of a polynomial do not change with inputs")
+        return None
     if value.kind == "state" and value.offset == 0:
         detail = (
             f"{format_expression(value)} may reach the present {value.name}(k); "

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, cast, get_args
 
 from sysid.core.errors import InvalidBounds, join_pointer, suggest_name
-from sysid.language.checker import check_expression
+from sysid.language.checker import SignalUse, check_expression
 from sysid.language.scope import EquationForm, Scope, list_reserved_names
 from sysid.language.transform import substitute
 from sysid.language.tree import Expression, Number, PastValue, Symbol, walk
@@ -200,10 +200,7 @@ def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> 
     checked = check_expression(text, replace(scope, states=(), inputs=inputs))
     for column, detail in checked.faults:
         reader.add_fault(place, detail, column)
-    for value, column in checked.uses:
-        if value.offset or value.delay is not None:
-            detail = f"a start has no past; write {value.name.removesuffix('0')}0, its first value"
-            reader.add_fault(place, detail, column)
+    _check_start_uses(reader, checked.uses, place)
     tree = checked.tree or Number(0.0)
     for node in walk(tree):
         if isinstance(node, Symbol) and node.kind in ("time", "index"):
@@ -214,6 +211,17 @@ def _read_start(reader: DocumentReader, text: str, place: str, scope: Scope) -> 
         return PastValue(first_values[node.name], "input") if is_first else None  # type: ignore[union-attr]
 
     return substitute(tree, find_input)
+
+
+def _check_start_uses(reader: DocumentReader, uses: Sequence[SignalUse], place: str) -> None:
+    """Check that a start reads first values of inputs only; intermediate names may read others."""
+    for value, column in uses:
+        if value.kind == "state":
+            detail = f"a start does not depend on a state such as {value.name!r}"
+            reader.add_fault(place, detail, column)
+        elif value.offset or value.delay is not None:
+            detail = f"a start has no past; write {value.name.removesuffix('0')}0, its first value"
+            reader.add_fault(place, detail, column)
 
 
 def read_solver(reader: DocumentReader, value: object, form: ModelForm) -> Solver:

@@ -177,12 +177,13 @@ def name_inputs(
 ) -> tuple[Channel, ...]:
     """Name channels as the inputs of a model: as given, else by name, else as usual.
 
-    A single channel may have any name if the model has one input. Other channels follow.
+    A single channel may have any name if the model has one input, but that of an output. Other
+    channels follow.
 
     Parameters
     ----------
     given, usual : mapping of str to str, optional
-        Model's name → channel's name. Outputs in them are ignored.
+        Model's name → channel's name. Channels of outputs are no inputs.
 
     Raises
     ------
@@ -197,7 +198,8 @@ def name_inputs(
     missing = [name for name in signals if name not in {*names, *chosen}]
     chosen |= {key: name for key, name in (usual or {}).items() if key in missing and name in names}
     assigned, left, free = match_names(signals, names, chosen)
-    if len(signals) == len(left) == len(free) == 1:
+    measured = {name for key, name in (usual or {}).items() if key in outputs}
+    if len(signals) == len(left) == len(free) == 1 and free[0] not in measured:
         assigned = {left[0]: free[0]}
     named = [
         replace(channel, name=signal)

@@ -78,6 +78,29 @@ def test_a_differential_model_equals_its_twin(
     assert_equal(Problem.build(model, [record(24, irregular=irregular, hold=hold)]))
 
 
+@pytest.mark.parametrize(
+    ("method", "interpolation", "hold"),
+    [("rk4", "cubic", "first"), ("rk4", "linear", "zero"), ("euler", "nearest", "first")],
+)
+def test_a_lag_that_changes_with_an_input_equals_its_twin(
+    method: str, interpolation: str, hold: Any
+) -> None:
+    equations = {
+        "x": "u(t - L*(1 + 0.5*tanh(u))) - b*x(t - L)",
+        "v": "table(x, [-1, 0, 2], [c, 0, 1])",
+    }
+    solver = {"method": method, "interpolation": interpolation, "substeps": 2}
+    model = differential(
+        equations, "x + pchip(u(t - 0.3/(2 + u)), [-1, 0, 1], [0, c, b])", solver=solver
+    )
+    assert_equal(Problem.build(model, [record(24, hold=hold)]))
+    if method != "euler":
+        return
+    recursion = {"x": "0.5*x(k-1) + u(k-1 - L/h*(1 + 0.5*tanh(u))) + mod(u(k - abs(u)), 3)"}
+    model = difference(recursion, "x", solver={"interpolation": "linear"})
+    assert_equal(Problem.build(model, [record(24, hold=hold)]))
+
+
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_one_step_prediction_equals_its_twin(interpolation: str) -> None:
     model = difference(RECURSION, "x", solver={"interpolation": interpolation})

@@ -32,6 +32,14 @@ pasts = st.sampled_from(
 ).map(lambda written: check_expression(written, SCOPE).tree)
 
 
+def _table(name: str, argument: Expression, count: int) -> Expression:
+    x = (Number(-1.5), Number(0.0), Number(0.25), Number(1e3))[:count]
+    y = (Number(2.0), Symbol("μ", "parameter"), Unary("-", Number(7.5)), Symbol("L", "parameter"))[
+        -count:
+    ]
+    return FunctionCall(name, (argument, *x, *y))
+
+
 def _grown(inner: st.SearchStrategy[Expression]) -> st.SearchStrategy[Expression]:
     comparison = st.builds(
         Binary, st.sampled_from(["<", "<=", ">", ">=", "==", "!="]), inner, inner
@@ -47,8 +55,13 @@ def _grown(inner: st.SearchStrategy[Expression]) -> st.SearchStrategy[Expression
         inner.map(lambda one: Unary("-", one)),
         st.builds(lambda f, a: FunctionCall(f, (a,)), st.sampled_from(single), inner),
         st.builds(
-            lambda f, a, b: FunctionCall(f, (a, b)), st.sampled_from(["min", "max"]), inner, inner
+            lambda f, a, b: FunctionCall(f, (a, b)),
+            st.sampled_from(["min", "max", "mod", "atan2"]),
+            inner,
+            inner,
         ),
+        st.builds(lambda *inside: FunctionCall("clip", inside), inner, inner, inner),
+        st.builds(_table, st.sampled_from(["table", "pchip"]), inner, st.integers(2, 4)),
         st.builds(lambda c, a, b: FunctionCall("where", (c, a, b)), condition, inner, inner),
     )
 

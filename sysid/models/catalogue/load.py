@@ -124,12 +124,15 @@ def read_document(path: Path) -> Any:
             raise InvalidModel(
                 [Fault("", f"{path} is larger than {4 * MAX_DOCUMENT_CHARACTERS} bytes")]
             )
-        return parse_yaml(path.read_text(encoding="utf-8"))
+        document = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InvalidModel([Fault("", f"{path} cannot be read: {error.strerror}")]) from None
     except UnicodeDecodeError as error:
         detail = f"{path} is not UTF-8 text: byte {error.start} does not fit"
         raise InvalidModel([Fault("", detail)]) from None
+    if document is None:
+        raise InvalidModel([Fault("", f"{path} is empty; need the document of a model")])
+    return document
 
 
 @cache

@@ -70,6 +70,11 @@ def test_min_and_max_of_several_are_taken_two_by_two() -> None:
     assert tree("min(x, y, q)") == FunctionCall("min", (FunctionCall("min", (X, Y)), Q))
 
 
+def test_a_table_has_its_argument_all_x_and_all_y() -> None:
+    points = (Number(-1.0), Number(0.0), Number(2.5), C, Number(1.0), Binary("*", Number(2.0), C))
+    assert tree("pchip(x, [-1, 0, m], [c, 1, 2*c])") == FunctionCall("pchip", (X, *points))
+
+
 def test_a_sum_of_a_thousand_terms_makes_a_shallow_tree() -> None:
     found = check_expression("+".join(["x"] * 1000), SCOPE)
     assert found.faults == ()
@@ -91,6 +96,7 @@ def test_words_of_the_difference_form_are_free_in_the_differential_form() -> Non
         "(x**y)**2",
         "-(x + y)",
         "where(x < 1, -x, x(k-1 - c/h))",
+        "table(x - y, [-1, 2.5, 4], [c, -2, 3*c])",
     ],
 )
 def test_the_printer_keeps_the_parentheses_that_matter(written: str) -> None:

@@ -1,6 +1,6 @@
 """Intervals of expressions, exact where every parameter occurs once; and long chains."""
 
-from math import exp, inf, log, sqrt, tan
+from math import cosh, erf, exp, inf, log, log10, pi, sinh, sqrt, tan
 
 import pytest
 
@@ -60,6 +60,21 @@ def parse(text: str) -> Expression:
         ("sin(b)", (-1, 1)),
         ("min(a, b)", (-2, 3)),
         ("max(a, b)", (1, 4)),
+        ("pchip(x, [0, 1, 5], [a, n, 2])", (-4, 3)),
+        ("clip(a, n, z)", (-2, 2)),
+        ("floor(a/2)", (-1, 1)),
+        ("floor(b/z)", (0, inf)),
+        ("mod(a, b)", (0, 4)),
+        ("mod(b, n)", (-4, 0)),
+        ("sinh(a)", (sinh(-2), sinh(3))),
+        ("sinh(1000*a)", (-inf, inf)),
+        ("cosh(a)", (1, cosh(3))),
+        ("cosh(n)", (cosh(1), cosh(4))),
+        ("cosh(1000*b)", (cosh(710), inf)),
+        ("log10(z)", (-inf, log10(2))),
+        ("atan2(a, b)", (-pi / 2, pi / 2)),
+        ("atan2(b, a)", (-pi, pi)),
+        ("erf(a)", (erf(-2), erf(3))),
         ("where(a > 0, b, n)", (-4, 4)),
         ("h", (0, inf)),
         ("x + a", (-inf, inf)),

@@ -25,6 +25,7 @@ BUILT_IN = (
     "duffing-eq16",
     "emps",
     "exponential",
+    "foipdt",
     "fopdt",
     "ipdt",
     "mackey-glass",
@@ -32,6 +33,7 @@ BUILT_IN = (
     "silverbox",
     "silverbox-9",
     "sopdt",
+    "topdt",
     "tube",
     "tube-second-order",
 )
@@ -76,8 +78,15 @@ def test_a_yaml_file_and_a_json_file_load_alike(tmp_path: Path) -> None:
 
 def test_files_that_cannot_be_read_are_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"name: \xff\xfe")
+    (tmp_path / "empty.yaml").write_text("# nothing yet")
     (tmp_path / "large.yaml").write_text("#" * (4 * MAX_DOCUMENT_CHARACTERS + 1))
-    for name, part in (("absent", "No such file"), ("binary", "not UTF-8"), ("large", "larger")):
+    parts = {
+        "absent": "No such file",
+        "binary": "not UTF-8",
+        "empty": "is empty; need the document of a model",
+        "large": "larger",
+    }
+    for name, part in parts.items():
         with pytest.raises(InvalidModel, match=part) as caught:
             load_model(tmp_path / f"{name}.yaml")
         assert "\n" not in str(caught.value)

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from sysid.core.errors import InvalidModel
+from sysid.language.checker import MAX_NODES
 from sysid.language.tree import PastValue
 from sysid.models.documents import MAX_EXPRESSION_CHARACTERS, parse_yaml
-from sysid.models.equations import MAX_NODES
 from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, ModelSignal, Solver
 from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.parse import parse_model
@@ -315,11 +315,6 @@ def test_a_tab_that_indents_is_called_that() -> None:
         parse_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")
 
 
-def test_a_unit_of_percent_without_quotes_is_told_to_need_them() -> None:
-    with pytest.raises(InvalidModel, match="put a text that begins with it in quotes"):
-        parse_yaml("inputs: {u: %}\n")
-
-
 @pytest.mark.parametrize("part", ["equations", "outputs", "initial"])
 def test_all_expressions_of_a_model_count_together(part: str) -> None:
     """Each is within the limits of one expression, but all are compiled into one kernel."""
@@ -358,3 +353,31 @@ def test_the_texts_of_all_expressions_are_bounded_before_they_are_parsed() -> No
     assert list(told) == [f"/equations/x{MAX_EXPRESSION_CHARACTERS // 3001}"]
     (detail,) = told.values()
     assert f"more than {MAX_EXPRESSION_CHARACTERS} characters together" in detail
+
+
+@pytest.mark.parametrize("sign", ["%", "@"])
+def test_a_text_that_needs_quotes_is_told_so(sign: str) -> None:
+    part = f"cannot begin with {sign}; put it in quotes, such as '{sign}'"
+    for text in (f"inputs: {{u: {sign}}}", f"inputs:\n  u: {sign}/s"):
+        with pytest.raises(InvalidModel, match=part):
+            parse_yaml(text)
+    assert parse_yaml(f"inputs: {{u: '{sign}'}}") == {"inputs": {"u": sign}}
+
+
+@pytest.mark.parametrize("name", ["x'", "dx", "dx/dt", "der(x)", "x_dot", "x(t)"])
+def test_an_equation_with_the_name_of_a_derivative_is_told_its_state(name: str) -> None:
+    found = faults(CONTINUOUS, equations={name: "v", "v": "-x"})
+    assert "write x: …, which is dx/dt" in next(iter(found.values()))
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("equations: {x: max(v, 1), v: 0}", "the comma before '1\\)' ends a value in braces"),
+        ("let: {a: min(x, v)}", "/let: the comma before 'v\\)' .* in quotes"),
+        ("equations: {x: table(v, [0, 1], [0, 1])}", "commas or brackets in quotes"),
+    ],
+)
+def test_an_expression_in_braces_is_told_to_need_quotes(text: str, part: str) -> None:
+    with pytest.raises(InvalidModel, match=part):
+        parse_model(CONTINUOUS | parse_yaml(text))

@@ -21,6 +21,7 @@ FIELDS = (
     "states",
     "parameters",
     "constants",
+    "let",
     "equations",
     "outputs",
     "initial",
@@ -28,8 +29,18 @@ FIELDS = (
 
 
 def test_the_example_of_the_page_is_a_model() -> None:
-    [text] = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
-    assert parse_model(parse_yaml(text)).name == "valve-and-oven"
+    whole, *part = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
+    assert parse_model(parse_yaml(whole)).name == "valve-and-oven"
+    names = ("k", "E", "V", "F", "tau", "H")
+    rest = {
+        "name": "reactor",
+        "form": "differential",
+        "inputs": {"c_in": "1", "T_in": "K"},
+        "states": {"c": "1", "T": "K"},
+        "parameters": {name: {"lower": 1, "upper": 2} for name in names},
+        "outputs": {"y": "T"},
+    }
+    assert parse_model(rest | parse_yaml("".join(part))).name == "reactor"
 
 
 @pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])
