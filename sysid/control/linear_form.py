@@ -12,6 +12,7 @@ from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Hold
 from sysid.kernels.reads import is_difference
+from sysid.language.delays import has_varying_delay
 from sysid.language.evaluation import evaluate_expression
 from sysid.language.printer import format_expression
 from sysid.language.transform import substitute
@@ -187,6 +188,11 @@ class _AffineReader:
         if not self._has_signals(tree):
             return AffineForm({}, self._evaluate_constant(tree))
         match tree:
+            case PastValue(name) if has_varying_delay(tree):
+                raise NotLinear(
+                    f"{self.description} reads {name} with a lag that changes with an input, so it "
+                    "has no transfer function"
+                )
             case PastValue(name, kind, offset, unknown_delay):
                 delay = offset + (
                     0.0

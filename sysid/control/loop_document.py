@@ -11,11 +11,12 @@ from typing import Any
 from sysid.control.control_law import build_control_law
 from sysid.control.controllers import PidControl, Transport
 from sysid.core.errors import InvalidSettings, suggest_name
-from sysid.language.delays import collect_past_values
+from sysid.language.delays import collect_past_values, has_varying_delay
 from sysid.language.intervals import bound_expression
 from sysid.language.printer import format_expression
 from sysid.language.transform import add_delays, shift_expression, substitute
 from sysid.language.tree import Binary, Expression, Number, PastValue, Symbol
+from sysid.models.delays import list_past_values
 from sysid.models.model import DerivedInitial, EstimatedInitial, FixedInitial, InitialState, Model
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
@@ -32,6 +33,10 @@ class LoopDocumentBuilder:
     """Builds the document of a closed loop from a model and its controller."""
 
     def __init__(self, model: Model, control: PidControl, period: float | None) -> None:
+        if any(map(has_varying_delay, list_past_values(model))):
+            raise InvalidSettings(
+                "/model", "a loop cannot be closed around a lag that changes with an input"
+            )
         self.model, self.control, self.period = model, control, period
         self.transport = control.transport or Transport()
         self.clock = "t" if model.form == "differential" else "k"

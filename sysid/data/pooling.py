@@ -137,6 +137,7 @@ def _collect_samples(
     channel: Channel, segments: tuple[Segment, ...], start: float, stop: float
 ) -> Channel | None:
     times = compute_segment_times(channel, segments)
+    repeats = np.searchsorted([one.start for one in segments], channel.times, side="right")
     rows = np.flatnonzero((times >= start) & (times < stop) & np.isfinite(channel.values))
     if rows.size == 0:
         return None
@@ -147,6 +148,7 @@ def _collect_samples(
         values=channel.values[ordered],
         history=None,
         started_at=None,  # repeats have no common clock
+        repeats=repeats[ordered].astype(np.float64) if segments else None,
     )
 
 
@@ -179,7 +181,7 @@ def _compute_bin_medians(
     counts = np.diff(firsts, append=bins.size)
     # Not the bin's middle: with few or uneven samples it would shift the curve in time.
     means = np.asarray(np.round(np.add.reduceat(samples.times, firsts) / counts, 9))
-    return replace(channel, times=means, values=medians)
+    return replace(channel, times=means, values=medians, repeats=None)
 
 
 def _assign_bins(times: FloatArray, start: float, width: float) -> IntArray:

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.core.errors import InvalidRecord, suggest_name
+from sysid.core.text import append_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import HOLDS as HOLDS
 from sysid.data.holds import Hold as Hold
 from sysid.data.holds import HoldChoice, choose_hold
 from sysid.data.holds import HoldSetting as HoldSetting
+from sysid.data.table_rules import TimeAxis, tell_notes
 from sysid.data.tables import (
     Column,
     Labelled,
@@ -25,7 +27,9 @@ from sysid.data.tables import (
     read_numbers,
     read_times,
     split_series,
+    to_frame,
 )
+from sysid.data.value_checks import describe_missing_values, find_infinite_value
 
 REGULARITY_TOLERANCE = 1e-2
 """Largest deviation of regular times from a uniform grid, as a part of the period.
@@ -97,6 +101,8 @@ class Channel:
         Samples recorded before the first one. Only delayed inputs read it: simulation and
         comparison begin at the first sample. None: not recorded; the first value is assumed for
         all earlier times.
+    repeats : FloatArray or None, shape (N,)
+        Number of the repeat that each sample was pooled from. None: there are no repeats.
     started_at : datetime or None
         Moment of time 0 s; the first date if the times were dates. A `Record` or a `Recording`
         keeps the distance of channels that have one.
@@ -120,6 +126,7 @@ class Channel:
     hold: HoldSetting = "auto"
     history: History | None = None
     started_at: datetime | None = None
+    repeats: FloatArray | None = None
     _choice: HoldChoice | None = field(default=None, init=False, repr=False)
 
     if TYPE_CHECKING:
@@ -133,6 +140,7 @@ class Channel:
             hold: HoldSetting = "auto",
             history: History | None = None,
             started_at: datetime | None = None,
+            repeats: FloatArray | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -142,10 +150,14 @@ class Channel:
                 f"channel {self.name!r} has times of shape {self.times.shape} and values of shape "
                 f"{self.values.shape}; need one-dimensional arrays of equal length, not empty"
             )
-        if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
-            raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
+        self._check_times()
         if self.history is not None:
             self._check_history(self.history)
+        if self.repeats is not None and self.repeats.shape != self.times.shape:
+            raise InvalidRecord(
+                f"channel {self.name!r} has repeats of shape {self.repeats.shape} for times of "
+                f"shape {self.times.shape}; need one number for each sample, or None"
+            )
 
     def __repr__(self) -> str:
         unit = "" if self.unit == "1" else f" [{self.unit}]"
@@ -175,6 +187,20 @@ class Channel:
                 read_numbers(earlier, f"the history of {owner}"),
             )
             object.__setattr__(self, "history", history)
+
+    def _check_times(self) -> None:
+        times, owner = self.times, f"the times of channel {self.name!r}"
+        infinite = np.flatnonzero(~np.isfinite(times))
+        if infinite.size:
+            place = infinite[0]
+            raise InvalidRecord(f"{owner} are not finite: sample {place + 1} is at {times[place]}")
+        backward = np.flatnonzero(np.diff(times) < 0)
+        if backward.size:
+            place = backward[0]
+            raise InvalidRecord(
+                f"{owner} decrease: sample {place + 1} is at {times[place]:g} s, the next at "
+                f"{times[place + 1]:g} s. Sort the samples by time"
+            )
 
     def _check_history(self, history: History) -> None:
         before, values = history
@@ -213,7 +239,7 @@ class Channel:
             np.concatenate(pair)
             for pair in zip(self.history, (self.times, self.values), strict=True)
         )
-        return replace(self, times=times, values=values, history=None)
+        return replace(self, times=times, values=values, history=None, repeats=None)
 
     @property
     def sampling(self) -> Sampling:
@@ -239,9 +265,12 @@ class Channel:
                 f"channel {self.name!r} has no sample from {start:g} to {stop:g} s; "
                 f"its samples are from {self.times[0]:g} to {self.times[-1]:g} s"
             )
-        history = self.history if first == 0 else None
         return replace(
-            self, times=self.times[first:last], values=self.values[first:last], history=history
+            self,
+            times=self.times[first:last],
+            values=self.values[first:last],
+            history=self.history if first == 0 else None,
+            repeats=None if self.repeats is None else self.repeats[first:last],
         )
 
     def slice_with_history(self, start: float, stop: float) -> "Channel":
@@ -316,9 +345,24 @@ def _iterate_channels(group: Any, owner: str) -> Iterator[Channel]:
 
 
 def to_channel(column: Column, otherwise: str = "") -> Channel:
-    """Read a column of a table as a channel; `otherwise` is its name if it has none."""
+    """Read a column of a table as a channel; `otherwise` is its name if it has none.
+
+    What is refused or told of a file is so of a table: infinite and missing values, and times that
+    repeat.
+    """
     name, (times, start) = column.name or otherwise, column.axis
-    return Channel(name, times, column.values, column.unit, started_at=start)
+    channel = Channel(name, times, column.values, column.unit, started_at=start)
+    repeated = np.flatnonzero(np.diff(channel.times) == 0)
+    if repeated.size:
+        raise InvalidRecord(
+            f"the times of channel {name!r} repeat: samples {repeated[0] + 1} and "
+            f"{repeated[0] + 2} are both at {channel.times[repeated[0]]:g} s; times must increase "
+            "from row to row"
+        )
+    if fault := find_infinite_value([channel]):
+        raise InvalidRecord(fault)
+    tell_notes(describe_missing_values([channel]))
+    return channel
 
 
 def _count_from(channel: Channel, origin: datetime) -> Channel:
@@ -433,20 +477,42 @@ class Recording:
             return head
         return "\n".join([f"{head}, {_describe_span(self)}", *_list_channels("", self.channels)])
 
+    def __getitem__(self, name: str) -> Channel:
+        """Return the channel of a name; see `channel`."""
+        return self.channel(name)
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the channels, so that ``"P1" in recording`` holds."""
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        """Return the number of channels."""
+        return len(self.channels)
+
     def channel(self, name: str) -> Channel:
         """Return the channel of a name.
 
         Raises
         ------
         InvalidRecord
-            If there is none; the message suggests the nearest.
+            If there is none; the message suggests the nearest, or lists all.
         """
-        for channel in self.channels:
-            if channel.name == name:
-                return channel
-        raise InvalidRecord(
-            f"the recording has no channel {name!r}{suggest_name(name, self.names)}"
-        )
+        return _find_channel(self.channels, name, "the recording")
+
+    def to_pandas(self) -> Any:
+        """Return the channels as a table of pandas, from which `Recording` reads them again.
+
+        Columns are called ``P1 [bar]``. The index has dates if `started_at` is known, else seconds.
+        Histories and segments are left out. Channels on other times have gaps (``nan``).
+
+        Raises
+        ------
+        MissingLibrary
+            If pandas is not installed.
+        InvalidRecord
+            If times repeat, and not all channels have the same.
+        """
+        return _to_frame(self.channels)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -488,13 +554,7 @@ class Recording:
         """
         for name in holds:
             self.channel(name)
-        return replace(
-            self,
-            channels=tuple(
-                replace(channel, hold=holds.get(channel.name, channel.hold))
-                for channel in self.channels
-            ),
-        )
+        return replace(self, channels=_replace_holds(self.channels, holds))
 
     def to_record(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
@@ -656,6 +716,32 @@ class Record:
         span = f", {_describe_span(self)}" if sides else ", without channels"
         return "\n".join([title + span, *sides])
 
+    def __getitem__(self, name: str) -> Channel:
+        """Return the input or output of a name.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is none; the message suggests the nearest, or lists all.
+        """
+        return _find_channel((*self.inputs, *self.outputs), name, "the record")
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of inputs and outputs, so that ``"u" in record`` holds."""
+        return (channel.name for channel in (*self.inputs, *self.outputs))
+
+    def __len__(self) -> int:
+        """Return the number of inputs and outputs."""
+        return len(self.inputs) + len(self.outputs)
+
+    def to_pandas(self) -> Any:
+        """Return inputs and outputs as a table of pandas, as `Recording.to_pandas` does."""
+        return _to_frame((*self.inputs, *self.outputs))
+
+    def replace_holds(self, holds: Mapping[str, HoldSetting]) -> "Record":
+        """Return the record with other intersample behaviour of some inputs."""
+        return replace(self, inputs=_replace_holds(self.inputs, holds)) if holds else self
+
     @property
     def history_duration(self) -> float:
         """Time (s) before the start for which all inputs have a history; 0 without one."""
@@ -679,6 +765,37 @@ class Record:
     def duration(self) -> float:
         """Seconds from the first to the last sample of any channel."""
         return self.stop - self.start
+
+
+def _find_channel(channels: Sequence[Channel], name: str, owner: str) -> Channel:
+    for channel in channels:
+        if channel.name == name:
+            return channel
+    names = [channel.name for channel in channels]
+    raise InvalidRecord(f"{owner} has no channel {name!r}{suggest_name(str(name), names)}")
+
+
+def _to_frame(channels: Sequence[Channel]) -> Any:
+    return to_frame(
+        [
+            Column(
+                append_unit(channel.name, channel.unit),
+                channel.name,
+                channel.unit,
+                TimeAxis(channel.times, channel.started_at),
+                channel.values,
+            )
+            for channel in channels
+        ]
+    )
+
+
+def _replace_holds(
+    channels: Sequence[Channel], holds: Mapping[str, HoldSetting]
+) -> tuple[Channel, ...]:
+    return tuple(
+        replace(channel, hold=holds.get(channel.name, channel.hold)) for channel in channels
+    )
 
 
 def find_common_sample_time(records: Sequence[Record]) -> float | None:

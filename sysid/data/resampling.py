@@ -78,7 +78,7 @@ def _resample_channel(
     times = np.concatenate([grid[0] - period * np.arange(back, 0, -1), grid])
     values = read(whole, times, period)
     history = History(times[:back], values[:back]) if back else None
-    return replace(channel, times=grid, values=values[back:], history=history)
+    return replace(channel, times=grid, values=values[back:], history=history, repeats=None)
 
 
 def _build_grid(channels: list[Channel], period: float) -> FloatArray:

@@ -38,8 +38,11 @@ _TIME_WORDS: Final = frozenset(
     )
 )
 NO_NAMES: Final = ("", "unnamed: 0", "__index_level_0__")
-INDEX_NAMES: Final = (*NO_NAMES, "index", "no", "no.", "nr", "nr.", "#")
-"""Names of a column that is left out if it counts rows, in small letters."""
+_COUNTED: Final = ("sample", "row", "record", "scan")
+_COUNTS: Final = ("index", "no", "nr", "number", "#")
+_INDEX_WORDS: Final = frozenset(
+    (*_COUNTED, *_COUNTS, "idx", *(f"{what} {count}" for what in _COUNTED for count in _COUNTS))
+)
 _SECOND_NAMES: Final = ("", "s", "sec", "secs", "second", "seconds")
 _LONG_UNITS: Final = {
     **dict.fromkeys(("minute", "minutes", "mins"), "min"),
@@ -151,6 +154,15 @@ def is_nameless(heading: Heading) -> bool:
     return heading.kind == "count" or heading.name.lower() in NO_NAMES
 
 
+def is_index_name(name: str) -> bool:
+    """Whether a column of this name is left out if it counts rows: ``No.``, ``Sample #``, none."""
+    return name.lower() in NO_NAMES or _simplify_name(name).removesuffix(".") in _INDEX_WORDS
+
+
+def _simplify_name(name: str) -> str:
+    return " ".join(re.sub(r"[_-]", " ", name.lower()).split())
+
+
 def counts_rows(texts: Sequence[str]) -> bool:
     """Whether cells count rows from 0 or from 1."""
     first = texts[0].strip() if texts else ""
@@ -210,7 +222,7 @@ def is_time_name(name: str) -> bool:
 
 def find_time_word(name: str) -> str | None:
     """Return the usual name of time that a name is, without a unit at its end."""
-    text = " ".join(re.sub(r"[_-]", " ", name.lower()).split())
+    text = _simplify_name(name)
     if text in _TIME_WORDS:
         return text
     word, _, unit = text.rpartition(" ")

@@ -7,6 +7,7 @@ by the rules of `sysid.data.table_rules`. Of xarray and pandas the attribute ``u
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
+from os import PathLike
 from typing import Any, NamedTuple, TypeAlias
 from zoneinfo import ZoneInfo
 
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.core.errors import InvalidRecord, suggest_name
+from sysid.core.lazy_names import load_library
 from sysid.core.types import FloatArray
 from sysid.data.table_rules import (
-    INDEX_NAMES,
     NO_NAMES,
     CellKind,
     Heading,
@@ -25,6 +26,7 @@ from sysid.data.table_rules import (
     find_time_column,
     find_time_unit,
     find_unit_seconds,
+    is_index_name,
     is_time_name,
     read_number_times,
     read_spans,
@@ -37,6 +39,7 @@ Labelled: TypeAlias = Any
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MIXED_ZONES = "some dates have a time zone and others have none; give all of them one"
+_MAX_VALUE = 60  # characters of a value that a message shows
 _NEED_TIMES = "need seconds, dates or time spans"
 
 
@@ -74,7 +77,8 @@ def _convert_numbers(source: ArrayLike, owner: str) -> FloatArray:
     kind = _find_kind(source)
     if kind in "mMUSTcV":
         what = {"m": "time spans", "M": "dates", "c": "complex numbers", "V": "records"}
-        raise InvalidRecord(f"{owner} has {what.get(kind, 'text')}; need numbers")
+        found = what.get(kind) or _describe_first_text(source)
+        raise InvalidRecord(f"{owner} has {found}; need numbers")
     if isinstance(source, np.ma.MaskedArray):
         return np.asarray(np.ma.filled(source.astype(np.float64), np.nan))
     try:
@@ -82,8 +86,21 @@ def _convert_numbers(source: ArrayLike, owner: str) -> FloatArray:
     except (TypeError, ValueError) as error:
         numbers = _read_missing_as_nan(source)
         if numbers is None:
+            if text := _describe_first_text(source):
+                raise InvalidRecord(f"{owner} has {text}; need numbers") from None
             raise InvalidRecord(f"{owner} cannot be read as numbers: {error}") from None
         return numbers
+
+
+def _describe_first_text(source: Any) -> str:
+    """Describe the first text among values, and where it is; empty if there is none."""
+    items = enumerate(np.asarray(source, dtype=object).flat, 1)
+    texts = (
+        f"text: {str(item)[:40]!r} at sample {number}"
+        for number, item in items
+        if isinstance(item, str | bytes)
+    )
+    return next(texts, "")
 
 
 def _read_missing_as_nan(source: Any) -> FloatArray | None:
@@ -207,6 +224,8 @@ def read_columns(source: Labelled, owner: str, names: Sequence[str] | None = Non
     if reader is None:
         raise InvalidRecord(f"{owner}: {describe_object(source)} has no names of channels")
     columns = reader(source, owner)
+    if columns and not columns[0].axis.seconds.size:
+        raise InvalidRecord(f"{owner} has no rows; need one or more")
     by_name = {column.name: column for column in columns}
     if len(by_name) < len(columns):
         twice = next(c.name for c in columns if sum(d.name == c.name for d in columns) > 1)
@@ -219,13 +238,50 @@ def read_columns(source: Labelled, owner: str, names: Sequence[str] | None = Non
     return [by_name[name] for name in names]
 
 
+def to_frame(columns: Sequence[Column]) -> Any:
+    """Return columns as a table of pandas, as `read_columns` reads it: ``P1 [bar]`` over ``t``.
+
+    The index has dates if the moment of time 0 s is known, else seconds. A column without a sample
+    at some time of another has a gap there.
+
+    Raises
+    ------
+    MissingLibrary
+        If pandas is not installed.
+    InvalidRecord
+        If times repeat, and not all columns have the same.
+    """
+    pandas = load_library("pandas", "to_pandas()")
+    series = []
+    for column in columns:
+        seconds, start = column.axis
+        index = pandas.Index(seconds, name="t")
+        if start is not None:
+            spans = pandas.to_timedelta(np.round(seconds * 1e9).astype(np.int64))
+            index = pandas.DatetimeIndex(pandas.Timestamp(start) + spans, name="time")
+        series.append(pandas.Series(column.values, index, name=column.label))
+    is_shared = all(one.index.equals(series[0].index) for one in series)
+    if not is_shared and not all(one.index.is_unique for one in series):
+        raise InvalidRecord("times repeat, and differ between channels; make a table of each alone")
+    if not series:
+        return pandas.DataFrame()
+    return pandas.concat(series, axis=1, sort=not is_shared)
+
+
 def describe_object(source: Any) -> str:
     """Describe a wrong object in a few words, such as ``the text 'a.csv'``."""
-    if isinstance(source, str):
-        return f"the text {source if len(source) < 60 else source[:57] + '…'!r}"
+    if isinstance(source, str | PathLike):
+        text, kind = str(source), "text" if isinstance(source, str) else "path"
+        return f"the {kind} {text if len(text) < 60 else text[:57] + '…'!r}"
     shape = getattr(source, "shape", None)
     size = f" of shape {tuple(shape)}" if isinstance(shape, tuple) else ""
     return f"an object of type {type(source).__name__}{size}"
+
+
+def describe_value(value: object) -> str:
+    """Describe a wrong value: as it is written if that is short, else by its kind."""
+    text = repr(value) if getattr(value, "shape", None) is None else ""
+    return text if 0 < len(text) <= _MAX_VALUE and "\n" not in text else describe_object(value)
 
 
 def _find_reader(source: Any) -> Callable[[Any, str], list[Column]] | None:
@@ -298,7 +354,7 @@ def _read_mapping(
                 [f"column {str(label) or 'no name'} of {owner} counts rows and was left out"]
             )
             continue
-        if heading.name.lower() in INDEX_NAMES and heading.name.lower() not in NO_NAMES:
+        if is_index_name(heading.name) and heading.name.lower() not in NO_NAMES:
             tell_notes([f"column {heading.name!r} does not count the rows, so it is a signal"])
         unit = heading.unit or _find_unit_attribute(table[label])
         columns.append(Column(str(label), heading.name, unit, axis, table[label]))
@@ -310,7 +366,7 @@ def _classify_column(name: str, values: Any) -> CellKind:
     kind = _find_kind(values)
     if kind == "M":
         return "stamp"
-    if name.lower() in INDEX_NAMES and kind in "iuf" and _counts_rows(np.asarray(values).ravel()):
+    if is_index_name(name) and kind in "iuf" and _counts_rows(np.asarray(values).ravel()):
         return "count"
     return "number"
 

@@ -72,11 +72,20 @@ class SignalTrace:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BandTraces:
+    """Lower and upper ends (N, 2) of the 95 % bands of an output and of its measurement."""
+
+    confidence: Floats
+    prediction: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class OutputTraces:
     """A measured output, and the output of the identified model at the same times."""
 
     measured: SignalTrace
     identified: Floats
+    bands: BandTraces | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

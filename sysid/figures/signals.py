@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.core.text import bracket_unit
+from sysid.core.text import bracket_unit, plain_unit
 from sysid.figures import theme
 from sysid.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTrace
 from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
@@ -30,6 +30,7 @@ def plot_response(
     figure = stack_plots(_response_heights(len(experiment.outputs), len(experiment.inputs)))
     for number, output in enumerate(experiment.outputs):
         span = window_slice(output.measured.times, start, stop)
+        figure["data"] += _band_traces(output, span, f"y{2 * number + 1}", number == 0)
         figure["data"] += _output_traces(output, span, f"y{2 * number + 1}", number == 0)
         figure["data"].append(_residual_trace(output, span, f"y{2 * number + 2}", number == 0))
         unit = bracket_unit(output.measured.unit)
@@ -45,6 +46,64 @@ def plot_response(
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
     figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
     return figure
+
+
+def plot_comparison(
+    compared: Sequence[tuple[str, ExperimentTraces]],
+    start: float | None = None,
+    stop: float | None = None,
+) -> Figure:
+    """Draw identified outputs of several results over the same measured ones.
+
+    Parameters
+    ----------
+    compared : sequence of (name, experiment)
+        Results on the same record. Outputs with other samples than those of the first are left
+        out.
+    start, stop : float, optional
+        Draw only this range (s).
+    """
+    first = compared[0][1]
+    figure = stack_plots(_response_heights(len(first.outputs), len(first.inputs)))
+    for number, output in enumerate(first.outputs):
+        span = window_slice(output.measured.times, start, stop)
+        unit = output.measured.unit
+        upper, lower = f"y{2 * number + 1}", f"y{2 * number + 2}"
+        figure["data"].append(_output_traces(output, span, upper, number == 0)[0])
+        for place, (name, experiment) in enumerate(compared):
+            same = _find_same_output(experiment, output)
+            if same is not None:
+                look = {"legendgroup": name, "line": theme.series_style(place)}
+                identified = _output_traces(same, span, upper, number == 0)[-1]
+                hover = f"%{{y:.6~g}}{plain_unit(unit)}<extra>{name}</extra>"
+                figure["data"] += [
+                    {**identified, **look, "name": name, "hovertemplate": hover},
+                    {
+                        **_residual_trace(same, span, lower, False),
+                        **look,
+                        "name": name,
+                        "hovertemplate": hover.replace("</extra>", ", residual</extra>"),
+                    },
+                ]
+        name_axis(figure, 2 * number + 1, f"{output.measured.name}{bracket_unit(unit)}")
+        name_axis(figure, 2 * number + 2, f"residual<br>{bracket_unit(unit)}")
+    for number, signal in enumerate(first.inputs, 2 * len(first.outputs) + 1):
+        span = window_slice(signal.times, start, stop)
+        figure["data"].append(signal_line(signal, span, f"y{number}", theme.GREY, legend=False))
+        name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
+    figure["layout"].update(_validation_shading(first))
+    figure["layout"]["meta"] = {"thinned": _is_thinned([one.measured for one in first.outputs])}
+    return figure
+
+
+def _find_same_output(experiment: ExperimentTraces, output: OutputTraces) -> OutputTraces | None:
+    """Find the output of another result that was compared with the same samples."""
+    same = (
+        other
+        for other in experiment.outputs
+        if np.array_equal(other.measured.values, output.measured.values, equal_nan=True)
+    )
+    return next(same, None)
 
 
 def response_height(n_outputs: int, n_inputs: int) -> int:
@@ -90,8 +149,18 @@ def stack_plots(heights: Sequence[int]) -> Figure:
     total = sum(heights) + _GAP_PX * max(len(heights) - 1, 0)
     shared: dict[str, Any] = base_layout(
         _stack_height(heights),
-        xaxis={"title": {"text": "time [s]"}, "anchor": f"y{max(len(heights), 1)}"},
-        hovermode="x",
+        xaxis={
+            "title": {"text": "time [s]"},
+            "anchor": f"y{max(len(heights), 1)}",
+            "showspikes": True,
+            "spikemode": "across",
+            "spikesnap": "cursor",
+            "spikethickness": 1,
+            "spikedash": "dot",
+            "unifiedhovertitle": {"text": "%{x:.6~g} s"},
+        },
+        hovermode="x unified",
+        hoversubplots="axis",  # one cursor and one box for all plots
     )
     top = total
     for number, height in enumerate(heights, 1):
@@ -99,7 +168,7 @@ def stack_plots(heights: Sequence[int]) -> Figure:
         shared[f"yaxis{number if number > 1 else ''}"] = {
             "domain": domain,
             "anchor": "x",
-            "nticks": 3 if height < _OUTPUT_PX else 7,
+            "nticks": 5 if height < _OUTPUT_PX else 7,
         }
         top -= height + _GAP_PX
     return {"data": [], "layout": shared}
@@ -124,7 +193,7 @@ def _output_traces(
 ) -> list[dict[str, Any]]:
     times, values = output.measured.times[span], output.measured.values[span]
     shown = thin_indices(values, MAX_POINTS)
-    identified = output.identified[span]
+    identified, unit = output.identified[span], plain_unit(output.measured.unit)
     also = thin_indices(identified, MAX_POINTS)
     shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
     return [
@@ -134,7 +203,7 @@ def _output_traces(
             "x": to_json_numbers(times[shown]),
             "y": to_json_numbers(values[shown]),
             **_choose_measured_style(times, shown.size),
-            "hovertemplate": "%{y:.6g}<extra>measured</extra>",
+            "hovertemplate": f"%{{y:.6~g}}{unit}<extra>measured</extra>",
         },
         {
             **shared,
@@ -143,9 +212,33 @@ def _output_traces(
             "x": to_json_numbers(times[also]),
             "y": to_json_numbers(identified[also]),
             "line": {"color": theme.BLUE, "width": 1.6},
-            "hovertemplate": "%{y:.6g}<extra>identified</extra>",
+            "hovertemplate": f"%{{y:.6~g}}{unit}<extra>identified</extra>",
         },
     ]
+
+
+def _band_traces(
+    output: OutputTraces, span: slice, axis: str, in_legend: bool
+) -> list[dict[str, Any]]:
+    """Draw the bands below the lines, the wider one first."""
+    if output.bands is None:
+        return []
+    shown = thin_indices(output.identified[span], MAX_POINTS)
+    shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
+    x = to_json_numbers(output.measured.times[span][shown])
+    traces = []
+    for name, ends, opacity in (
+        ("95 % prediction band", output.bands.prediction, 0.14),
+        ("95 % confidence band", output.bands.confidence, 0.4),
+    ):
+        low, high = (to_json_numbers(end) for end in ends[span][shown].T)
+        edge = {**shared, "mode": "lines", "x": x, "line": {"width": 0}, "hoverinfo": "skip"}
+        area = {"fill": "tonexty", "fillcolor": theme.fade(theme.BLUE, opacity)}
+        traces += [
+            {**edge, "name": f"{name}, lower end", "y": low, "showlegend": False},
+            {**edge, "name": name, "y": high, **area},
+        ]
+    return traces
 
 
 def _choose_measured_style(times: Floats, drawn: int) -> dict[str, Any]:
@@ -171,7 +264,7 @@ def _residual_trace(
         "x": to_json_numbers(times[shown]),
         "y": to_json_numbers(values[shown]),
         "line": {"color": theme.VERMILLION, "width": 1},
-        "hovertemplate": "%{y:.4g}<extra>residual</extra>",
+        "hovertemplate": f"%{{y:.4~g}}{plain_unit(output.measured.unit)}<extra>residual</extra>",
     }
 
 
@@ -190,7 +283,7 @@ def signal_line(
         "x": to_json_numbers(times[shown]),
         "y": to_json_numbers(values[shown]),
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
-        "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
+        "hovertemplate": f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{signal.name}</extra>",
     }
 
 
@@ -218,7 +311,7 @@ def _history_traces(
     )
     label = f"{history.name}, before the record"
     look = {**drawn["line"], "dash": "dot"}
-    hover_text = f"%{{y:.6g}}<extra>{label}</extra>"
+    hover_text = f"%{{y:.6~g}}{plain_unit(history.unit)}<extra>{label}</extra>"
     return [{**drawn, "name": label, "line": look, "hovertemplate": hover_text}]
 
 

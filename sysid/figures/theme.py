@@ -15,6 +15,7 @@ from sysid.figures.data import Floats
 from sysid.figures.decimate import find_extremes
 
 Theme = Literal["light", "dark"]
+Indices = NDArray[np.intp]
 
 BLUE, VERMILLION, GREEN = "#2a83c4", "#d55e00", "#00916a"
 PURPLE, OCHRE, GREY = "#b9619b", "#b5830f", "#8a929b"
@@ -83,7 +84,7 @@ def plotly_template(theme: Theme) -> dict[str, Any]:
 MAX_POINTS = 1000
 
 
-def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> Indices:
     """Choose at most `max_points` indices: the ends, and each bin's minimum and maximum.
 
     A spike of one sample therefore stays visible at any zoom. Several arrays may share the indices.
@@ -101,7 +102,7 @@ def window_slice(times: Floats, start: float | None, stop: float | None) -> slic
     return slice(max(first, 0), min(last, times.size))
 
 
-def stride_indices(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+def stride_indices(count: int, max_points: int = MAX_POINTS) -> Indices:
     """Choose at most `max_points` of `count` indices, including the first and the last."""
     if count <= max_points:
         return np.arange(count)

@@ -24,6 +24,7 @@ _ZERO_TOLERANCE = 1e-9  # of the range: a limit nearer to 0 is 0
 def find_widest_bounds(problem: Problem, parameter: Parameter) -> Interval:
     """Find the lowest and highest value that a parameter's bounds may have; infinite: no limit."""
     spans = {item.name: get_interval(item) for item in problem.all_parameters}
+    spans |= problem.delaying_ranges
     present, width = spans[parameter.name], parameter.upper - parameter.lower
     lowest = 0.0 if parameter.scale == "log" else -inf
     signed = [
@@ -90,8 +91,10 @@ def _iterate_divisors(tree: Expression) -> Iterator[Expression]:
                     yield divisor.left  # its square passes 0 without a change of sign
             case Binary("**", base, exponent) if not _is_whole_power(exponent):
                 yield base
-            case FunctionCall("sqrt" | "log", (argument,)):
+            case FunctionCall("sqrt" | "log" | "log10", (argument,)):
                 yield argument
+            case FunctionCall("mod", (_, divisor)):
+                yield divisor
 
 
 def _is_whole_power(exponent: Expression) -> bool:

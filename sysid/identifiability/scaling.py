@@ -13,7 +13,7 @@ weights satisfy linear equations with rational coefficients, which are solved ex
 
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, reduce
 from math import isfinite, nan
 from operator import add, mul, sub, truediv
 
@@ -202,8 +202,16 @@ class _WeightEquations:
                 return {}
             case "sqrt":
                 return None if weights[0] is None else _scale_weight(weights[0], Fraction(1, 2))
-            case "min" | "max" | "where":
+            case "min" | "max" | "where" | "mod":
                 return self.require_equal(weights[-2], weights[-1])
+            case "clip":
+                return self.require_equal(weights[0], self.require_equal(*weights[1:]))
+            case "table" | "pchip":  # scaled as its y, which follow as many x
+                self._require_zero(weights[0])
+                return reduce(self.require_equal, weights[1 + len(weights) // 2 :])
+            case "atan2":
+                self.require_equal(*weights)
+                return {}
         return self._require_zero(weights[0])
 
     def _require_zero(self, argument: ScalingWeight | None) -> ScalingWeight:

@@ -3,13 +3,22 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import isfinite
 from numbers import Integral, Real
+from os import PathLike
 from typing import Any, NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.data.holds import HOLDS, HoldSetting
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record, Recording, to_channel
-from sysid.data.tables import Labelled, describe_object, is_labelled, read_columns
+from sysid.data.tables import (
+    Labelled,
+    describe_object,
+    describe_value,
+    is_labelled,
+    read_columns,
+)
+from sysid.data.value_checks import find_infinite_value
 from sysid.models.model import Model
 from sysid.models.signals import Assignment, assign_channels, assign_record, assign_recording
 from sysid.residuals.onset_delay import find_unprompted_output
@@ -29,9 +38,12 @@ class ReadRecords(NamedTuple):
 
 
 def read_records(
-    model: Model, data: Data | Sequence[Data], channels: Mapping[str, str] | None
+    model: Model,
+    data: Data | Sequence[Data],
+    channels: Mapping[str, str] | None,
+    hold: Mapping[str, HoldSetting] | None = None,
 ) -> ReadRecords:
-    """Read recordings as records of a model.
+    """Read recordings as records of a model, with the given holds of its inputs.
 
     A recording of several segments gives one record for each.
 
@@ -40,16 +52,45 @@ def read_records(
     InvalidRecord
         If an object is no recording, or a signal has no channel.
     InvalidSettings
-        If `channels` names a signal or channel that does not exist.
+        If `channels` names a signal or channel that does not exist, or `hold` an input or a hold.
     """
-    check_kinds({"channels": channels})
+    check_kinds({"channels": channels, "hold": hold})
+    holds = dict(hold or {})
+    _check_holds(model, holds)
     each = data if isinstance(data, list | tuple) else [data]
     parts = [part for one in each for part in _read_one(model, one, channels)]
-    records = tuple(record for record, _ in parts)
+    records = tuple(record.replace_holds(holds) for record, _ in parts)
+    for record in records:
+        if fault := find_infinite_value((*record.inputs, *record.outputs)):
+            raise InvalidRecord(fault)
     assignments = {assigned.note: assigned for _, assigned in parts if assigned.note}
     notes = tuple(describe_assignment(one, records) for one in assignments.values())
     by_signal = parts[0][1].by_signal if parts else {}
     return ReadRecords(records, notes, by_signal)
+
+
+def _check_holds(model: Model, holds: Mapping[str, object]) -> None:
+    inputs = [signal.name for signal in model.inputs]
+    for name, hold in holds.items():
+        pointer = join_pointer("hold", str(name))
+        if name not in inputs:
+            hint = suggest_name(str(name), inputs)
+            raise InvalidSettings(pointer, f"model {model.name!r} has no input {name!r}{hint}")
+        if not isinstance(hold, str) or hold not in HOLDS:
+            raise InvalidSettings(pointer, f"found {hold!r}; need one of {', '.join(HOLDS)}")
+
+
+def write_setting(field: str, name: str, value: str) -> str:
+    """Write a setting of a job as the argument of `identify` that gives it.
+
+    Examples
+    --------
+    >>> write_setting("hold", "u", "first")
+    "hold={'u': 'first'}"
+    >>> write_setting("loss", "noise_model", "ar1")
+    "loss=Loss(noise_model='ar1')"
+    """
+    return f"loss=Loss({name}={value!r})" if field == "loss" else f"{field}={{{name!r}: {value!r}}}"
 
 
 def describe_assignment(assigned: Assignment, records: Sequence[Record]) -> str:
@@ -79,6 +120,12 @@ def _read_one(
         recording = data
     elif is_labelled(data):
         columns = read_columns(data, "the table")
+        signals = len(model.inputs) + len(model.outputs)
+        if len(columns) == 1 < signals:
+            raise InvalidRecord(
+                f"found {describe_object(data)}, one signal; model {model.name!r} has {signals}. "
+                "Join series in a record: Record(inputs, outputs)"
+            )
         by_label = {column.label: column.name for column in columns}
         plain = {key: by_label.get(str(name), name) for key, name in (channels or {}).items()}
         assigned = assign_channels(model, [column.name for column in columns], plain)
@@ -94,7 +141,7 @@ def _read_one(
 
 def _describe_wrong_data(data: object) -> str:
     found = f"found {describe_object(data)}; need a record, a recording or a table"
-    if isinstance(data, str):
+    if isinstance(data, str | PathLike):
         return f"{found}. Read a file first, with read_recording"
     if isinstance(data, Channel):
         return f"{found}. Join channels in a record: Record(inputs, outputs)"
@@ -114,38 +161,36 @@ def check_kinds(values: Mapping[str, object]) -> None:
         is_left_out = value is None and name not in _NEEDED
         is_flag = isinstance(value, bool) and bool not in kinds
         if not is_left_out and (is_flag or not isinstance(value, kinds)):
-            found = f"found {_describe_value(value)}; need {need}"
+            found = f"found {describe_value(value)}; need {need}"
             if name == "settings" and _is_signal(value):
                 found += ". To identify from two series, join them: Record(inputs, outputs)"
             raise InvalidSettings(f"/{name}", found)
-
-
-def _describe_value(value: object) -> str:
-    """Describe a wrong value: as it is written if that is short, else by its kind."""
-    text = repr(value) if getattr(value, "shape", None) is None else ""
-    return text if 0 < len(text) <= _MAX_VALUE and "\n" not in text else describe_object(value)
 
 
 def _is_signal(value: object) -> bool:
     return isinstance(value, Channel | list | tuple) or hasattr(value, "shape")
 
 
-_MAX_VALUE = 60
 _KINDS: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "channels": ((Mapping,), "a mapping of signals to channels, such as {'u': 'P1'}"),
+    "hold": ((Mapping,), "a mapping of inputs to holds, such as {'u': 'zero'}"),
     "parameters": ((Mapping,), "a mapping of parameters to changes, such as {'L': (0, 2)}"),
     "settings": ((GeneticAlgorithm,), "GeneticAlgorithm(…), or None for its defaults"),
     "loss": ((Loss,), "Loss(…), such as Loss('soft-l1', scale=0.5)"),
     "noise": ((Noise,), "Noise(…), such as Noise(sigma=0.1)"),
     "seed": ((Integral,), "a whole number"),
     "skip": ((Integral,), "a number of samples"),
-    "weights": ((Mapping,), "a mapping of outputs to numbers"),
+    "weights": (
+        (Mapping,),
+        "a mapping of outputs to numbers or lists of them",
+    ),
     "warm": ((Mapping,), "a mapping of parameters to values"),
     "validation_fraction": ((Real,), "a number between 0 and 1"),
     "posterior": ((bool,), "True or False"),
+    "compare_orders": ((bool,), "True or False"),
     "progress": ((Callable,), "a function of the run's state"),
 }
-_NEEDED = ("seed", "skip", "posterior")
+_NEEDED = ("seed", "skip", "posterior", "compare_orders")
 """Arguments that None does not leave out."""
 
 

@@ -49,9 +49,14 @@ from sysid.identification.minima import (
     scan_by_projection,
     scan_parameters,
 )
-from sysid.identification.noise_model_choice import confirm_noise_model, is_ar1_indicated
+from sysid.identification.noise_model_choice import (
+    PredictionErrors,
+    compare_on_blocks,
+    may_be_ar1,
+)
 from sysid.identification.search_evidence import is_explained
 from sysid.identification.unrecorded_input import RecordedComparison, compare_where_recorded
+from sysid.identification.validation import simulate_validation
 from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts
@@ -61,9 +66,11 @@ from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.search.state import SAME_OPTIMUM
-from sysid.simulation.problem import Problem
+from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import keep_in_bounds
+from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
 _ENOUGH_SHARE = 1 / 3  # of the random starts: if more agree, nothing is in doubt
@@ -138,8 +145,11 @@ def find_best_estimate(
     state: RunState,
     budget: Budget,
     deadline: Deadline,
+    validation: Problem | None = None,
 ) -> BestEstimate:
     """Find the best estimate of a search that has ended, and analyse it.
+
+    Validation data decide on the noise model, if that is asked for.
 
     The integration step is halved until the estimates and their errors stand still, or until a
     limit is reached. Then those that still change are not identified, or have the change in their
@@ -161,10 +171,10 @@ def find_best_estimate(
         first = first or estimates
     changes = {} if half is None else half.changes
     recorded = search.compare_where_recorded()  # a noise model would hide a contradiction
-    noise = search.apply_noise_model(is_settled=not changes)
+    noise = search.apply_noise_model(validation, is_settled=not changes)
     minima = search.collect_minima(recorded)
     marked = mark_changing(search.analysis.estimates, half, limit)
-    analysis = replace(search.analysis, estimates=marked)
+    analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
 
 
@@ -214,8 +224,9 @@ class _EstimateSearch:
 
     def analyse_best(self) -> None:
         """Scan from the best of the ends, analyse the result, and search for minima near it."""
-        self._best = min(range(len(self.ends)), key=lambda i: self.ends[i].rms)
+        self._choose_best()
         if self._refines:
+            self._reweight()
             self._fits = self._find_minima()
         best = self.ends[self._best]
         groups, spent = find_exchanges(
@@ -231,6 +242,28 @@ class _EstimateSearch:
         self._analyse(self.theta, exchanges=groups)
         if self._refines:
             self._search_local_minima()
+
+    def _choose_best(self) -> None:
+        self._best = min(range(len(self.ends)), key=lambda i: self.ends[i].rms)
+
+    def _reweight(self) -> None:
+        """Weigh residuals by the noise of their series, if it is unequal; fit all ends again."""
+        most, is_late = self._budget.count_left(self._reserved), self._deadline.is_past_grace
+        fit = fit_unequal_noise(self.problem, self.theta, most, is_late)
+        if fit is None:
+            return
+        self.problem = fit.problem
+        self._budget.spend(fit.evaluations)
+        self._move_best(IslandEnd(fit.theta, fit.rms, True), fit.evaluations)
+        places = [end.theta for end in self.ends]
+        values = self.problem.evaluate_fitness(np.array(places))
+        most = self._budget.count_left(self._reserved)
+        found = refine_candidates(self.problem, places, most, is_late)
+        self.ends = [
+            self._continue_end(replace(end, rms=rms), candidate)
+            for end, rms, candidate in zip(self.ends, values.tolist(), found, strict=True)
+        ]
+        self._choose_best()
 
     def compare_half_step(self) -> HalfStep | None:
         """Compare the estimate with that of half the integration step."""
@@ -276,39 +309,77 @@ class _EstimateSearch:
         self._work -= self.problem.n_steps * (fitted + spent)
         return ""
 
-    def apply_noise_model(self, *, is_settled: bool) -> GeneralisedEstimate:
+    def apply_noise_model(
+        self, validation: Problem | None, *, is_settled: bool
+    ) -> GeneralisedEstimate:
         """Estimate and analyse under the noise model that was requested or selected.
 
         Estimates of the paper's methods stay unchanged. So do all if the residuals are consistent
         with white noise, or if the integration step is too long for them (not `is_settled`).
         """
-        problem, theta, state = self.problem, self.theta, self._state
-        requested = problem.loss.noise_model
+        requested, squares = self.problem.loss.noise_model, GeneralisedEstimate(self.theta, {}, 0)
         if requested == "white" or not self._refines:
-            return GeneralisedEstimate(theta, {}, 0, requested != "ar1")
-        in_time = self._deadline.count_simulations_left(
-            state.seconds, state.evaluations, problem.n_steps
+            return squares._replace(is_complete=requested != "ar1")
+        if requested == "ar1":
+            return self._use_noise_model()
+        if not (is_settled and may_be_ar1(self.problem, self.analysis)):
+            return squares
+        return self._choose_noise_model(validation) or squares
+
+    def _choose_noise_model(self, validation: Problem | None) -> GeneralisedEstimate | None:
+        """Estimate under first-order noise if that predicts better; else None, as it was."""
+        before, theta, errors = self.analysis, self.theta, None
+        if validation is None:
+            most = self._count_noise_simulations()
+            errors = compare_on_blocks(self.problem, theta, most)
+            self._budget.spend(0 if errors is None else errors.evaluations)
+            if errors is None or not errors.speak_for_ar1:
+                return None
+        estimate = self._use_noise_model()
+        if validation is not None:
+            errors = self._compare_on_validation(validation, before)
+        if errors is None or not (errors.speak_for_ar1 and estimate.is_complete):
+            self.analysis = before
+            return None
+        return estimate._replace(
+            least_squares_theta=theta, least_squares_error=errors.white, error=errors.ar1
         )
-        is_indicated = is_settled and is_ar1_indicated(problem, theta, self.analysis, in_time)
-        if requested == "auto" and not is_indicated:
-            return GeneralisedEstimate(theta, {}, 0, True)
-        left = self._budget.count_left(self._reserved)
-        most = min((limit for limit in (left, in_time) if limit is not None), default=None)
-        uncertainty = self.analysis.uncertainty
+
+    def _use_noise_model(self) -> GeneralisedEstimate:
+        """Estimate under first-order noise, and analyse, if the residuals are not white."""
+        problem, theta, before = self.problem, self.theta, self.analysis
+        uncertainty, most = before.uncertainty, self._count_noise_simulations()
         nothing = np.zeros((theta.size, theta.size))
         covariance = nothing if uncertainty is None else uncertainty.covariance
-        estimate = fit_generalised_least_squares(problem, theta, covariance, state.seed, most)
+        estimate = fit_generalised_least_squares(problem, theta, covariance, self._state.seed, most)
         self._budget.spend(estimate.evaluations)
-        if requested == "auto":
-            estimate = confirm_noise_model(problem, theta, estimate)
         if any(estimate.correlation_times.values()):
             white = make_whitening(problem, estimate.correlation_times)
-            groups, is_cut = self.analysis.exchanges, self.analysis.is_cut_short
-            estimate = estimate._replace(theta=order_exchangeable(problem, estimate.theta, groups))
-            self._analyse(estimate.theta, white, exchanges=groups)
-            self.analysis = replace(self.analysis, is_cut_short=is_cut)
+            theta = order_exchangeable(problem, estimate.theta, before.exchanges)
+            estimate = estimate._replace(theta=theta)
+            self._analyse(theta, white, exchanges=before.exchanges)
+            self.analysis = replace(self.analysis, is_cut_short=before.is_cut_short)
             self._widen_intervals(LocalMinima(None, estimate.minima, estimate.rms, 0))
         return estimate
+
+    def _count_noise_simulations(self) -> int | None:
+        """Count the simulations that a noise model may take, by budget and time."""
+        state, left = self._state, self._budget.count_left(self._reserved)
+        in_time = self._deadline.count_simulations_left(
+            state.seconds, state.evaluations, self.problem.n_steps
+        )
+        return min((limit for limit in (left, in_time) if limit is not None), default=None)
+
+    def _compare_on_validation(self, validation: Problem, before: Analysis) -> PredictionErrors:
+        """Compare least squares, analysed `before`, with the present estimate."""
+        white, ar1 = (
+            compute_metrics(run.problem, run.simulated).rms
+            for run in (
+                simulate_validation(validation, self.problem, analysis.estimates)
+                for analysis in (before, self.analysis)
+            )
+        )
+        return PredictionErrors(white, ar1, 0)
 
     def compare_where_recorded(self) -> RecordedComparison:
         """Compare minima where the input is recorded, if the data contradict what is assumed."""

@@ -24,8 +24,10 @@ from sysid.identification.input_hold import (
 from sysid.identification.integration_step import explain_finer_step
 from sysid.identification.minima import mark_ambiguous
 from sysid.identification.noise_model_choice import explain_noise_model_choice, resolve_noise_model
+from sysid.identification.process_order import compare_orders, warn_other_order
 from sysid.identification.result import Identification
 from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
+from sysid.identification.unstable_run import warn_unstable_run
 from sysid.identification.validation import (
     mark_refuted,
     split_outputs,
@@ -33,7 +35,12 @@ from sysid.identification.validation import (
     warn_refuted,
     warn_still_validation,
 )
-from sysid.identification.warnings import collect_warnings, warn_noise_model, warn_time_limit
+from sysid.identification.warnings import (
+    collect_warnings,
+    find_delay_parameters,
+    warn_noise_model,
+    warn_time_limit,
+)
 from sysid.islands.state import RunState
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
@@ -42,6 +49,7 @@ from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.posterior import describe_posterior, sample_posterior
+from sysid.uncertainty.unequal_noise import describe_unequal_noise
 
 
 def conclude_run(
@@ -52,6 +60,7 @@ def conclude_run(
     clock: Clock = read_clock,
     *,
     posterior: bool = False,
+    orders: bool = False,
 ) -> Identification:
     """Conclude a run: refine, analyse and validate its estimate.
 
@@ -59,7 +68,8 @@ def conclude_run(
     the paper's two methods are reported unchanged, so that a comparison is one of the methods. If
     the time of the run is limited, refinement ends near the limit and warnings list what was left
     out. Standard errors, tests and validation are always computed. `clock` returns seconds. With
-    `posterior` samples of the posterior are taken, as far as budget and time are left.
+    `posterior` samples of the posterior are taken, as far as budget and time are left. With
+    `orders` a process with dead time is compared with one order more and one less.
 
     Raises
     ------
@@ -73,7 +83,13 @@ def conclude_run(
     with use_one_thread():  # so that the last bit does not depend on the number of cores
         deadline = Deadline(algorithm.stop.seconds, state.seconds, clock)
         return _build_identification(
-            problem, algorithm, state, validation, deadline, has_posterior=posterior
+            problem,
+            algorithm,
+            state,
+            validation,
+            deadline,
+            has_posterior=posterior,
+            compares_orders=orders,
         )
 
 
@@ -85,9 +101,10 @@ def _build_identification(
     deadline: Deadline,
     *,
     has_posterior: bool,
+    compares_orders: bool,
 ) -> Identification:
     budget = Budget(algorithm.stop.evaluations, state.evaluations)
-    best = find_best_estimate(problem, algorithm, state, budget, deadline)
+    best = find_best_estimate(problem, algorithm, state, budget, deadline, validation)
     asked, noise, found, analysis = problem, best.noise, best.minima, best.analysis
     problem, theta = resolve_noise_model(best.problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
@@ -114,12 +131,23 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         holds, spent = refit_other_holds(problem, holds, theta, best.lowest_end.theta, left, late)
         budget.spend(spent)
+    orders = None
+    if compares_orders and is_refining(algorithm, len(best.ends)):
+        left, late = budget.count_left(), deadline.is_past_grace
+        orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
+        budget.spend(spent)
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in found.minima if minimum.is_compatible]
         left, late = budget.count_left(), deadline.is_past_grace
         posterior = sample_posterior(problem, theta, analysis, others, state.seed, left, late)
         budget.spend(posterior.evaluations)
+    feedback = _check_feedback(problem, simulated, analysis)
+    left, late = budget.count_left(), deadline.is_past_grace
+    unstable, spent = warn_unstable_run(
+        problem, theta, analysis, left, late, has_feedback=bool(feedback)
+    )
+    budget.spend(spent)
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -139,6 +167,7 @@ def _build_identification(
         agreement_validation=() if validated is None else validated.metrics.channels,
         warnings=(
             *warn_refuted(metrics, validated),
+            *warn_other_order(orders, problem.model.name),
             *warn_fixed_starts(problem, theta, analysis, deadline.is_past_grace),
             *collect_warnings(
                 problem,
@@ -149,6 +178,7 @@ def _build_identification(
                 tests,
                 is_contradicted=found.is_contradicted,
             ),
+            *describe_unequal_noise(problem, metrics.channels),
             *warn_unsettled(evidence),
             *describe_input_holds(problem, holds, analysis.estimates, best.lowest_end.rms),
             *describe_exchanges(
@@ -159,7 +189,8 @@ def _build_identification(
             *warn_hard_switching(problem, theta, _list_final_rms(best.ends)),
             *warn_still_validation(problem, metrics, validated),
             *warn_time_limit(any(end.is_cut_short for end in best.ends)),
-            *_check_feedback(problem, simulated, analysis),
+            *feedback,
+            *unstable,
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
             *explain_noise_model_choice(problem, noise),
@@ -178,6 +209,11 @@ def _build_identification(
         known_before=_compute_input_history(problem),
         known_before_validation=() if validation is None else _compute_input_history(validation),
         posterior=posterior,
+        order_comparison=orders,
+        delays=tuple(sorted(find_delay_parameters(problem))),
+        noise_deviations=None
+        if problem.settings.weights is not None
+        else problem.settings.deviations,
     )
 
 

@@ -3,16 +3,18 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import inf
-from typing import Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from sysid.core.errors import InvalidSettings, MissingLibrary, suggest_name
+from sysid.core.errors import InvalidSettings, suggest_name
+from sysid.core.lazy_names import load_library
 from sysid.core.settings import LossKind
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.figures import plotly
 from sysid.figures.data import (
+    BandTraces,
     CornerParameter,
     CorrelationTrace,
     ExperimentTraces,
@@ -32,6 +34,9 @@ from sysid.identification.result import Identification
 from sysid.identification.summary import find_output_unit
 from sysid.residuals.residual_tests import CorrelationFunction
 from sysid.uncertainty.estimates import Estimate
+
+if TYPE_CHECKING:
+    from sysid.uncertainty.output_bands import OutputBands
 
 FigureName = Literal[
     "history", "convergence", "response", "residuals", "correlation", "waterfall", "posterior"
@@ -70,10 +75,7 @@ def plot_result(
     titled = draw_figures(found, wanted or _USUAL, experiment)
     if not titled:
         raise InvalidSettings("/names", "the result has no signals to draw")
-    try:
-        import plotly.graph_objects as go
-    except ImportError:
-        raise MissingLibrary("plot()", "plotly") from None
+    go = load_library("plotly.graph_objects", "plot()")
     figure = titled[0][1] if len(titled) == 1 else stack_figures(titled)
     layout = {key: value for key, value in figure["layout"].items() if key != "meta"}
     return go.Figure(apply_theme({"data": figure["data"], "layout": layout}, theme))
@@ -116,7 +118,7 @@ def draw_figures(
     draw: dict[FigureName, Callable[[], tuple[str, Figure]]] = {
         "history": lambda: ("Progress of every island", plotly.plot_history(data)),
         "convergence": lambda: ("Convergence of the parameters", plotly.plot_convergence(data)),
-        "response": lambda: _draw_response(experiments, experiment),
+        "response": lambda: _draw_response(found, experiments, experiment),
         "residuals": lambda: _draw_residuals(found, experiments, experiment),
         "correlation": lambda: ("Correlation of the estimates", plotly.plot_correlation(data)),
         "waterfall": lambda: ("What each island found", plotly.plot_waterfall(data)),
@@ -126,13 +128,17 @@ def draw_figures(
     return [(title, figure) for title, figure in drawn if has_points(figure)]
 
 
-def _draw_response(experiments: Sequence[ExperimentTraces], number: int) -> tuple[str, Figure]:
+def _draw_response(
+    found: Identification, experiments: Sequence[ExperimentTraces], number: int
+) -> tuple[str, Figure]:
+    from sysid.identification.bands import compute_record_bands  # it imports the compiler
+
     if not experiments:
         return "Measured against identified", empty_figure()
     title = "Measured against identified"
     if len(experiments) > 1:
         title += f": {experiments[number].name}"
-    return title, plot_response(experiments[number])
+    return title, plot_response(add_bands(experiments, compute_record_bands(found))[number])
 
 
 def _draw_residuals(
@@ -209,7 +215,7 @@ def _to_free_parameter(found: Identification, estimate: Estimate) -> FreeParamet
         estimate.upper,
         scales.get(estimate.name, "linear"),
         estimate.value,
-        estimate.stderr,
+        None if estimate.status == "not settled" else estimate.stderr,
     )
 
 
@@ -223,6 +229,23 @@ def list_experiments(found: Identification) -> list[ExperimentTraces]:
         list(_pair(data.validation, found.simulated_validation)),
         is_part=data.is_part,
     )
+
+
+def add_bands(
+    experiments: Sequence[ExperimentTraces], bands: Sequence[Sequence["OutputBands"]]
+) -> list[ExperimentTraces]:
+    """Add the bands of the records that were fitted; they are the first experiments."""
+    drawn = [
+        replace(
+            experiment,
+            outputs=tuple(
+                replace(output, bands=BandTraces(band.confidence, band.prediction))
+                for output, band in zip(experiment.outputs, banded, strict=True)
+            ),
+        )
+        for experiment, banded in zip(experiments, bands, strict=False)
+    ]
+    return [*drawn, *experiments[len(drawn) :]]
 
 
 def arrange_experiments(

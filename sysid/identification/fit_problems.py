@@ -95,6 +95,7 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
     return problem, problem.rebuild(
         records=records.validation_runs,
         weights=problem.output_weights,
+        deviations=None,
         scored_from=records.scored_from,
     )
 

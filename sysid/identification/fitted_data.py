@@ -43,6 +43,12 @@ def collect_fitted_data(
         records.scored_from is not None,
         tuple(correlations),
         problem.loss.kind,
+        problem.prediction,
+        {
+            name: fields["tied"]
+            for name, fields in problem.settings.parameters.items()
+            if fields.get("tied") is not None
+        },
     )
 
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
 
+from sysid.core.distributions import chi_square_limit
 from sysid.core.errors import InvalidModel
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
@@ -34,6 +34,7 @@ from sysid.models.model import (
 from sysid.models.parse import parse_model
 from sysid.models.sections import STEADY
 from sysid.search.refine import refine_candidates
+from sysid.simulation.metrics import compute_mean
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
@@ -93,6 +94,11 @@ def warn_fixed_starts(
     return [_describe_starts(problem, wrong, moves)] if wrong else []
 
 
+def list_fixed_starts(problem: Problem) -> list[str]:
+    """List the states that start at a number or at a measured value."""
+    return list(_list_states(problem, FixedInitial, MeasuredInitial))
+
+
 def _list_states(problem: Problem, *kinds: type[InitialState]) -> dict[str, int]:
     """List the states with such initial values, and their numbers."""
     pairs = zip(problem.model.states, problem.model.initial, strict=True)
@@ -102,12 +108,12 @@ def _list_states(problem: Problem, *kinds: type[InitialState]) -> dict[str, int]
 def _get_assumed_starts(problem: Problem) -> dict[str, FloatArray]:
     """Get the starts (E,) of states that start at a number or, not in a recursion, measured."""
     kinds = (FixedInitial,) if is_difference(problem.model) else (FixedInitial, MeasuredInitial)
-    return {
-        state: np.array(
-            [experiment.starts[i].first_values[0] for experiment in problem.experiments]
-        )
-        for state, i in _list_states(problem, *kinds).items()
-    }
+    return {state: _get_starts(problem, i) for state, i in _list_states(problem, *kinds).items()}
+
+
+def _get_starts(problem: Problem, number: int) -> FloatArray:
+    """Get the starts (E,) of a state that is not estimated."""
+    return np.array([one.starts[number].first_values[0] for one in problem.experiments])
 
 
 def _predict_starts(
@@ -128,7 +134,7 @@ def _predict_starts(
     loss = float(rest @ rest)
     predicted: dict[str, FloatArray] = {}
     for state in _get_assumed_starts(problem):
-        slopes = _compute_start_slopes(problem, theta, state, np.sqrt(loss / error.size))
+        slopes = compute_start_slopes(problem, theta, state, np.sqrt(loss / error.size))
         others = slopes - basis @ (basis.T @ slopes)
         moves = np.asarray(
             -np.linalg.lstsq(others, rest, rcond=RANK_TOLERANCE)[0], dtype=np.float64
@@ -143,10 +149,10 @@ def _is_significant(n: int, before: float, after: float, starts: int) -> bool:
     """Whether the loss falls by far more than chance when so many starts are free."""
     if not 0.0 < after < before:
         return before > after == 0.0
-    return bool(n * np.log(before / after) > chdtri(starts, _SIGNIFICANCE))
+    return bool(n * np.log(before / after) > chi_square_limit(starts, _SIGNIFICANCE))
 
 
-def _compute_start_slopes(
+def compute_start_slopes(
     problem: Problem, theta: FloatArray, state: str, noise: float
 ) -> FloatArray:
     """Compute the slopes (n, E) of the weighted outputs in a state's start; 0 if undefined.
@@ -154,7 +160,7 @@ def _compute_start_slopes(
     The step is the one that moves the outputs by about the noise, in whatever unit the state has.
     """
     weight, rows = problem.evaluator.weight[problem.scored_rows], problem.scored_rows
-    starts = _get_assumed_starts(problem)[state]
+    starts = _get_starts(problem, [one.name for one in problem.model.states].index(state))
 
     def free_start() -> Problem:
         return _free_starts(problem, {state: starts}, {state: 1.0})
@@ -174,7 +180,7 @@ def _compute_start_slopes(
     with np.errstate(all="ignore"):
         output, above, below = simulate(0.0, step, -step)
         for _ in range(_MAX_TRIALS):
-            move = float(np.sqrt(np.mean((above - output) ** 2)))
+            move = float(np.sqrt(compute_mean((above - output) ** 2)))
             if not move < _NOTABLE_STEP * noise:
                 break
             step *= noise / max(move, noise / _MAX_GROWTH)

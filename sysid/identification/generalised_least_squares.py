@@ -23,7 +23,6 @@ Repeated, noise with a white part drifted away, and its offset with it.
 """
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -74,18 +73,19 @@ class GeneralisedEstimate(NamedTuple):
     least_squares_theta : FloatArray, shape (D,), or None
         Estimates of least squares, if the noise model was selected by ``auto``
         (`sysid.identification.noise_model_choice`).
-    unresolved_times : mapping of str to float
-        Correlation times (s) for which the record is too short, so least squares is used.
+    least_squares_error, error : float
+        Prediction error by which ``auto`` selected, of both estimates.
     """
 
     theta: FloatArray
     correlation_times: Mapping[str, float]
     evaluations: int
-    is_complete: bool
+    is_complete: bool = True
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
     least_squares_theta: FloatArray | None = None
-    unresolved_times: Mapping[str, float] = MappingProxyType({})
+    least_squares_error: float = 0.0
+    error: float = 0.0
 
 
 def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
@@ -119,16 +119,16 @@ def fit_generalised_least_squares(
     seed : int
         Seed of the points drawn along it.
     """
-    search = _WhitenedLeastSquares(problem, 2**62 if max_simulations is None else max_simulations)
+    search = WhitenedLeastSquares(problem, 2**62 if max_simulations is None else max_simulations)
     if search.simulations_left < 1:
         return GeneralisedEstimate(theta, {}, 0, False)
     place = to_unit(problem.evaluator, theta[None])[0]
     error = search.compute_residuals(place[None])[0]
-    coloured = _select_coloured_outputs(problem, error)
+    coloured = select_coloured_outputs(problem, error)
     times: Mapping[str, float] = {}
     random = make_move_generator(seed)
     for i in range(_MAX_ROUNDS if coloured else 0):
-        new_times = _estimate_correlation_times(problem, coloured, error, None)
+        new_times = estimate_correlation_times(problem, coloured, error, None)
         is_last = i == _MAX_ROUNDS - 1 or _have_converged(new_times, times)
         if search.simulations_left < search.round_simulations:
             return _to_estimate(problem, theta, place, times, search, False)
@@ -136,7 +136,7 @@ def fit_generalised_least_squares(
             spread = _factor_output_covariance(
                 search.compute_slopes(place, error), error, make_whitening(problem, times)
             )
-            new_times = _estimate_correlation_times(problem, coloured, error, spread)
+            new_times = estimate_correlation_times(problem, coloured, error, spread)
         times, whitening = new_times, make_whitening(problem, new_times)
         starts = (
             _draw_starts(search, place, whitening, covariance, random) if i == 0 or is_last else []
@@ -148,15 +148,8 @@ def fit_generalised_least_squares(
     return _to_estimate(problem, theta, place, times, search, not search.is_cut)
 
 
-def find_coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
-    """Find outputs whose residuals at theta (D,) are clearly not white."""
-    place = to_unit(problem.evaluator, theta[None])
-    return _select_coloured_outputs(
-        problem, _WhitenedLeastSquares(problem, 1).compute_residuals(place)[0]
-    )
-
-
-def _select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
+def select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
+    """Select the outputs whose weighted residuals (n,) are clearly not white."""
     return {part.output for part in iterate_parts(problem) if is_coloured(part, error[part.rows])}
 
 
@@ -165,7 +158,7 @@ def _to_estimate(
     theta: FloatArray,
     place: FloatArray,
     times: Mapping[str, float],
-    search: "_WhitenedLeastSquares",
+    search: "WhitenedLeastSquares",
     is_complete: bool,
 ) -> GeneralisedEstimate:
     """Make the estimate at a point; without any correlation, that of least squares."""
@@ -176,7 +169,7 @@ def _to_estimate(
 
 
 def _draw_starts(
-    search: "_WhitenedLeastSquares",
+    search: "WhitenedLeastSquares",
     place: FloatArray,
     whitening: Whitening,
     covariance: FloatArray,
@@ -211,7 +204,7 @@ def _factor_output_covariance(
     return np.asarray(deviation * columns @ (rows[retained].T / singular[retained]))
 
 
-def _estimate_correlation_times(
+def estimate_correlation_times(
     problem: Problem, coloured: set[str], error: FloatArray, spread: FloatArray | None
 ) -> dict[str, float]:
     """Estimate each output's correlation time in s: the mean over its series, by samples."""
@@ -265,7 +258,7 @@ def _find_decay_lag(correlation: FloatArray) -> float:
     return k - 1 + float((before - _DECAY_LEVEL) / (before - after))
 
 
-class _WhitenedLeastSquares:
+class WhitenedLeastSquares:
     """Least squares of whitened residuals over unit coordinates, counting simulations."""
 
     def __init__(self, problem: Problem, budget: int) -> None:

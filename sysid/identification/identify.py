@@ -5,8 +5,12 @@ from __future__ import annotations  # the help of `identify` shows `Data`, not a
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
+from sysid.core.distributions import load_in_background
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
+from sysid.core.text import rewrite_settings
+from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
+from sysid.data.records import Record
 from sysid.identification.arguments import (
     Change,
     Data,
@@ -14,15 +18,18 @@ from sysid.identification.arguments import (
     check_warm,
     read_changes,
     read_records,
+    write_setting,
 )
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
 from sysid.identification.result import Identification
 from sysid.identification.run import advance_run, begin_run, is_finished
+from sysid.identification.warnings import warn_constant_outputs
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.delays import check_unused_settings
+from sysid.models.model import Model
 from sysid.models.units import check_signal_units
 from sysid.simulation.problem import Problem
 
@@ -35,17 +42,19 @@ def identify(
     settings: GeneticAlgorithm | None = None,
     *,
     channels: Mapping[str, str] | None = None,
+    hold: Mapping[str, HoldSetting] | None = None,
     seed: int = 1,
     parameters: Mapping[str, Change] | None = None,
     prediction: PredictionKind = "simulation",
     loss: Loss | None = None,
-    weights: Mapping[str, float] | None = None,
+    weights: Weights | None = None,
     skip: int = 0,
     validation: Data | Sequence[Data] | None = None,
     validation_fraction: float | None = None,
     noise: Noise | None = None,
     warm: Mapping[str, float] | None = None,
     posterior: bool = False,
+    compare_orders: bool = True,
     progress: Callable[[RunState], None] | None = None,
 ) -> Identification:
     """Estimate the free parameters of a model, including its unknown time lags.
@@ -67,6 +76,9 @@ def identify(
         channel of its name, then one of a usual name such as ``output`` or ``PV``. If as many
         channels are left as signals, their order decides, inputs first. A warning of the result
         says so.
+    hold : mapping of str to {"auto", "zero", "first", "band-limited"}
+        How an input is read between its samples: ``{"u": "first"}`` as straight lines, ``"zero"``
+        held. Default: as its channel says, else by its values. It holds for `validation` too.
     seed : int
         The same seed gives the same result, bit for bit.
     parameters : mapping
@@ -77,8 +89,9 @@ def identify(
         predictions one sample ahead.
     loss : Loss
         Squares by default. ``Loss("soft-l1")`` for data with outliers; also the noise model.
-    weights : mapping of str to float
-        Weight of each output. Default: 1 for one output, else 1 / its standard deviation.
+    weights : mapping of str to float or list of float
+        Weight of each output, or one for each experiment: ``{"y": [1, 0.1]}``. By default each
+        residual counts by the variance that the noise has in its output and its experiment.
     skip : int
         Number of first samples of each output that are not compared.
     validation : Record, Recording, table, or sequence of them
@@ -91,6 +104,9 @@ def identify(
         Values that a part of the population starts from.
     posterior : bool
         Whether to sample the posterior of the free parameters.
+    compare_orders : bool
+        Whether to fit a process with dead time with one order more and one less, too. It takes
+        milliseconds; `Identification.order_comparison` has the answer.
     progress : callable
         Receives the run's state several times a second.
 
@@ -134,33 +150,77 @@ def identify(
             "warm": warm,
             "validation_fraction": validation_fraction,
             "posterior": posterior,
+            "compare_orders": compare_orders,
             "progress": progress,
         }
     )
     algorithm = settings or GeneticAlgorithm()
     model = resolve_model(model)
-    read = read_records(model, records, channels)
-    whole = read.records
-    validation_records = (
-        None if validation is None else read_records(model, validation, channels).records
+    read = read_records(model, records, channels, hold)
+    found = identify_records(
+        model,
+        read.records,
+        algorithm,
+        FitSettings(read_changes(parameters), prediction, loss or Loss(), weights, skip),
+        seed=seed,
+        validation=(
+            None if validation is None else read_records(model, validation, channels, hold).records
+        ),
+        validation_fraction=validation_fraction,
+        noise=noise,
+        warm=warm,
+        posterior=posterior,
+        compare_orders=compare_orders,
+        progress=progress,
     )
-    changes = read_changes(parameters)
-    check_unused_settings(model, len(whole), changes, weights)
-    check_signal_units(model, (*whole, *(validation_records or ())))
-    fit = FitSettings(changes, prediction, loss or Loss(), weights, skip)
-    prepared = prepare_records(whole, validation_records, validation_fraction, noise)
+    assert found.data is not None
+    notes = (rewrite_settings(note, write_setting) for note in found.warnings)
+    data = replace(found.data, channels=read.channels)
+    return replace(found, warnings=(*read.notes, *notes), data=data)
+
+
+def identify_records(
+    model: Model,
+    records: Sequence[Record],
+    algorithm: GeneticAlgorithm,
+    fit: FitSettings,
+    *,
+    seed: int,
+    validation: Sequence[Record] | None = None,
+    validation_fraction: float | None = None,
+    noise: Noise | None = None,
+    warm: Mapping[str, float] | None = None,
+    posterior: bool = False,
+    compare_orders: bool = True,
+    progress: Callable[[RunState], None] | None = None,
+    tell: Callable[[Sequence[str]], None] | None = None,
+) -> Identification:
+    """Estimate the parameters of a model from its records; see `identify`.
+
+    Warnings name settings as a job does: ``hold: {u: first}``.
+
+    Parameters
+    ----------
+    tell : callable
+        Receives, before the search, those warnings of the result that do not depend on it.
+    """
+    check_unused_settings(model, len(records), fit.parameters, fit.weights)
+    check_signal_units(model, (*records, *(validation or ())))
+    prepared = prepare_records(records, validation, validation_fraction, noise)
     problem, validation_problem = problems = build_problems(model, prepared, fit)
     check_warm(warm, [parameter.name for parameter in problem.all_parameters])
+    if tell is not None:
+        tell(warn_constant_outputs(problem))
+    load_in_background()  # the conclusion needs them
     found = conclude_run(
         problem,
         algorithm,
         _run_search(problem, algorithm, seed, warm, progress),
         validation_problem,
         posterior=posterior,
+        orders=compare_orders,
     )
-    data = collect_fitted_data(model, prepared, problems, found)
-    data = replace(data, channels=read.channels)
-    return replace(found, warnings=(*read.notes, *found.warnings), data=data)
+    return replace(found, data=collect_fitted_data(model, prepared, problems, found))
 
 
 def _run_search(

@@ -192,7 +192,7 @@ def continue_from_archive(
         nearest = int(np.argmin(distances))
         same = _SAME_VALLEY if rms <= best * (1.0 + SAME_OPTIMUM) else SAME_PLACE
         if distances[nearest] < same:
-            fits.append(replace(known[nearest], count=count, independent=count))
+            fits.append(Fit(known[nearest].theta, known[nearest].rms, count, count))
             continue
         if continued == _MOST_CONTINUED or (is_late is not None and is_late()):
             break
@@ -255,7 +255,9 @@ def _insert_centre(
 ) -> _Series:
     at = int(np.searchsorted(unit, middle))
     return _Series(
-        np.insert(places, at, centre.theta, axis=0), np.insert(values, at, centre.rms), at
+        np.concatenate([places[:at], centre.theta[None], places[at:]]),
+        np.concatenate([values[:at], [centre.rms], values[at:]]),
+        at,
     )
 
 
@@ -266,7 +268,8 @@ def _find_dips(scanned: Sequence[_Series], limit: float) -> list[tuple[FloatArra
     """
     dips = []
     for places, values, centre in scanned:
-        framed = np.pad(np.where(np.isfinite(values), values, np.inf), 1, constant_values=np.inf)
+        framed = np.full(values.size + 2, np.inf)
+        np.copyto(framed[1:-1], values, where=np.isfinite(values))
         is_dip = (framed[1:-1] < framed[:-2]) & (framed[1:-1] <= framed[2:]) & (values < limit)
         is_dip[centre] = False
         dips += [(places[i], float(values[i])) for i in np.flatnonzero(is_dip)]
@@ -284,26 +287,38 @@ def collect_minima(
     Least squares ends anywhere in a flat valley. So an end that the data do not rule out belongs to
     the lowest one if the linear model at the estimate says so too.
     """
-    kept: list[Minimum] = []
-    kept_units: list[FloatArray] = []
     n = problem.n_scored * _get_variance_ratio(linear)
     ordered = sorted(fits, key=lambda fit: fit.rms)
     units = to_unit(problem.evaluator, np.array([fit.theta for fit in ordered]))
-    for fit, unit in zip(ordered, units, strict=True):
-        rms, count, independent = fit.rms, fit.count, fit.independent
-        least = kept[0].rms if kept else rms
-        ratio = 0.0 if rms <= least else np.inf if least == 0 else 2.0 * n * np.log(rms / least)
-        is_near = _compute_distances(np.array(kept_units), unit) < SAME_PLACE if kept else ()
-        near = next((i for i, is_same in enumerate(is_near) if is_same), None)
-        if near is None and kept and linear is not None and ratio <= CHI_SQUARE_95:
-            near = 0 if _is_in_valley(problem, linear, n, fit.theta, kept[0].values) else None
-        if near is None:
-            kept.append(Minimum(fit.theta, rms, count, independent, float(ratio), recorded_from))
-            kept_units.append(unit)
+    are_close = (_compute_distances(units[:, None], units) < SAME_PLACE).tolist()
+    groups: list[list[int]] = []
+    ratios: list[float] = []
+    for i, fit in enumerate(ordered):
+        best = ordered[0]
+        if fit.rms <= best.rms:
+            ratio = 0.0
         else:
-            count, independent = kept[near].count + count, kept[near].independent + independent
-            kept[near] = replace(kept[near], count=count, independent=independent)
-    return tuple(kept[:_MOST_MINIMA])
+            ratio = np.inf if best.rms == 0 else 2.0 * n * float(np.log(fit.rms / best.rms))
+        near = next((group for group in groups if are_close[group[0]][i]), None)
+        if near is None and groups and linear is not None and ratio <= CHI_SQUARE_95:
+            is_inside = _is_in_valley(problem, linear, n, fit.theta, best.theta)
+            near = groups[0] if is_inside else None
+        if near is None:
+            groups.append([i])
+            ratios.append(ratio)
+        else:
+            near.append(i)
+    return tuple(
+        Minimum(
+            ordered[group[0]].theta,
+            ordered[group[0]].rms,
+            sum(ordered[i].count for i in group),
+            sum(ordered[i].independent for i in group),
+            ratio,
+            recorded_from,
+        )
+        for group, ratio in zip(groups[:_MOST_MINIMA], ratios, strict=False)
+    )
 
 
 def _get_variance_ratio(linear: LinearOutputModel | None) -> float:
@@ -345,8 +360,8 @@ def find_nearest(problem: Problem, minima: Sequence[Minimum], theta: FloatArray)
 
 
 def _compute_distances(units: FloatArray, unit: FloatArray) -> FloatArray:
-    """Compute the largest difference (P,) of places (P, D) in [0, 1] from one of them (D,)."""
-    return np.asarray(np.max(np.abs(units - unit), axis=1, initial=0.0))
+    """Compute the largest difference (…) of places (…, D) in [0, 1] from another one (D,)."""
+    return np.asarray(np.abs(units - unit).max(axis=-1, initial=0.0))
 
 
 def mark_ambiguous(

@@ -1,172 +1,116 @@
 """Choose the noise model for ``auto``: least squares, or generalised least squares (ar1).
 
-Coloured residuals are noise or missing dynamics, and the residuals alone do not show which. The
-choice depends on whether the model integrates, that is, whether initial errors persist.
+Coloured residuals are noise or missing dynamics, and the residuals alone do not show which. Slow
+noise makes estimates of least squares vague; missing dynamics make those of whitened residuals
+wrong. Both show in the same way: the free run predicts data badly that were not used.
 
-The outputs of a first-order lag or a damped oscillator do not depend on states of long ago. Those
-of an integrator do for ever: a drive's position, a tank's level, any system with a pole at 0. A
-short disturbance stays in all later outputs, so the residuals of a free run drift even if the
-dynamics are right. Least squares weighs this drift, so generalised least squares is better there.
-In a model that does not integrate, least squares is the better criterion for a free run: whitened
-residuals shift missing dynamics to low frequencies. Simulated plants of 17 kinds confirm this
-(decision 26, as amended).
-
-The test perturbs the start of one state after the other and simulates again. An output integrates
-if more than a twentieth of the largest change is left throughout the last quarter of the record,
-with one sign. A first-order lag passes too if its time constant exceeds a third of the record. All
-experiments must agree, because one of them may be too short to forget a lag of seconds. The phase
-of a self-sustained oscillation, and chaos, persist as well, but that is no drift.
-
-The correlation time must be resolved as well. Where a record is not five times as long,
-generalised least squares was no better than least squares.
+So the estimates that predict such data better are taken: validation data if there are any, else
+blocks of the record (Shao 1993). Each fifth and each tenth but the first is left out in turn. The
+first holds the initial states, of which later samples say little. From the estimates of all
+samples, least squares of either kind continues on the other blocks, with the correlation time of
+all residuals.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.core.settings import NoiseModel
-from sysid.core.types import FloatArray
+from sysid.core.types import FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
-    find_coloured_outputs,
+    WhitenedLeastSquares,
+    estimate_correlation_times,
+    make_whitening,
+    select_coloured_outputs,
 )
-from sysid.kernels.layout import ExperimentLayout
-from sysid.residuals.autocorrelation import ROUNDING_SHARE
 from sysid.residuals.coloured import iterate_parts
-from sysid.simulation.evaluator import predict_population
 from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.analysis import Analysis
 
-_CHANGE_SIZE = 1e-3  # of the outputs' size: change that a perturbation should cause
-_CHANGE_TOLERANCE = 3.0  # factor by which it may differ
-MAX_TRIES = 8
-"""Most simulations for each state."""
-_MOVE_FACTOR = 1e4  # growth of a perturbation without effect: states have different units
-_LASTING_SHARE = 0.05  # of the largest change
-_LATE_PART = 0.75  # of a record: the change is measured after it
+_DIVISIONS = (5, 10)  # numbers of blocks: long ones show slow faults, short ones leave more data
+_CLEAR_SHARE = 0.97  # of the error of least squares: a smaller gain may be chance
 
 
-def find_integrating_outputs(problem: Problem, theta: FloatArray) -> set[str]:
-    """Find outputs in which a shifted start of some state persists to the end of the record.
+class PredictionErrors(NamedTuple):
+    """RMS errors of the free run on blocks that were left out, and the simulations spent."""
 
-    Parameters
-    ----------
-    theta : FloatArray, shape (D,)
-    """
-    names: set[str] = set()
-    before = problem.predict(theta[None])[0]
-    for state in range(len(problem.model.states)):
-        change = _perturb_state(problem, theta, before, state)
-        if change is not None:
-            names |= _find_lasting_changes(problem, change)
-    return names
+    white: float
+    ar1: float
+    evaluations: int
+
+    @property
+    def speak_for_ar1(self) -> bool:
+        """Whether the error under ar1 is clearly smaller."""
+        return self.ar1 < _CLEAR_SHARE * self.white
 
 
-def _perturb_state(
-    problem: Problem, theta: FloatArray, before: FloatArray, state: int
-) -> FloatArray | None:
-    """Change of the weighted outputs (M,) by a shifted start of a state; None: no change."""
-    size = problem.output_scale
-    move, weight = _CHANGE_SIZE * size, problem.evaluator.weight
-    for _ in range(MAX_TRIES):
-        with np.errstate(all="ignore"):  # a shifted start may diverge
-            change = weight * (_simulate_shifted_start(problem, theta, state, move) - before)
-            largest = float(np.max(np.abs(change)))
-        if not np.isfinite(largest):
-            move /= _MOVE_FACTOR
-        elif largest <= ROUNDING_SHARE * size:
-            move *= _MOVE_FACTOR
-        elif (
-            size * _CHANGE_SIZE / _CHANGE_TOLERANCE
-            <= largest
-            <= size * _CHANGE_SIZE * _CHANGE_TOLERANCE
-        ):
-            return np.asarray(change)
-        else:
-            move *= size * _CHANGE_SIZE / largest
-    return np.asarray(change) if np.isfinite(largest) and largest > ROUNDING_SHARE * size else None
-
-
-def _simulate_shifted_start(
-    problem: Problem, theta: FloatArray, state: int, move: float
-) -> FloatArray:
-    """Simulate outputs (M,) with the start of a state shifted in every experiment."""
-    evaluator, layout = problem.evaluator, ExperimentLayout.from_model(problem.model)
-    floats, template, values = evaluator.floats.copy(), evaluator.template.copy(), theta.copy()
-    for experiment, (ints, first, _) in zip(
-        problem.experiments, evaluator.offsets.tolist(), strict=True
-    ):
-        start = experiment.starts[state]
-        if start.row >= 0:
-            template[start.row] += move
-            values[evaluator.free_rows == start.row] += move
-        else:
-            floats[first + layout.locate_initial(state)] += move
-            first_value = first + int(evaluator.ints[ints + layout.locate_state(state, "given")])
-            floats[first_value : first_value + start.first_values.size] += move
-    elsewhere = evaluator._replace(floats=floats, template=template)
-    return np.asarray(predict_population(elsewhere, values[None])[0])
-
-
-def _find_lasting_changes(problem: Problem, change: FloatArray) -> set[str]:
-    """Find outputs with one sign of change at the end of every experiment."""
-    lasts: dict[str, bool] = {}
-    weights = problem.split_by_output(problem.evaluator.weight)
-    for changes, weight in zip(problem.split_by_output(change), weights, strict=True):
-        scored = {name: values[weight[name] > 0] for name, values in changes.items()}
-        largest = max(float(np.max(np.abs(values), initial=0.0)) for values in scored.values())
-        for name, values in scored.items():
-            late = values[int(_LATE_PART * values.size) :]
-            if late.size:
-                is_left = max(np.min(late), np.min(-late)) > _LASTING_SHARE * largest
-                lasts[name] = lasts.get(name, True) and bool(is_left)
-    return {name for name, is_left in lasts.items() if is_left}
-
-
-_MIN_RECORD_TIMES = 5.0  # least length of a record, in correlation times
-
-
-def is_ar1_indicated(
-    problem: Problem,
-    theta: FloatArray,
-    analysis: Analysis,
-    max_simulations: int | None = None,
-) -> bool:
-    """Whether least-squares residuals at theta (D,) are coloured and the model integrates.
-
-    The analysis of the estimates gives the colour; white residuals end the test. If the test may
-    need more than `max_simulations`, the answer is no.
-    """
+def may_be_ar1(problem: Problem, analysis: Analysis) -> bool:
+    """Whether the residuals of a free run by squares are coloured: else there is no choice."""
     uncertainty = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
-    if not is_free or uncertainty is None or uncertainty.noise_colour == "white":
-        return False
-    if max_simulations is not None and max_simulations < 2 + MAX_TRIES * len(problem.model.states):
-        return False
-    coloured = find_coloured_outputs(problem, theta)
-    return bool(coloured) and coloured <= find_integrating_outputs(problem, theta)
+    return is_free and uncertainty is not None and uncertainty.noise_colour in _COLOURED
 
 
-def confirm_noise_model(
-    problem: Problem, theta: FloatArray, estimate: GeneralisedEstimate
-) -> GeneralisedEstimate:
-    """Return the estimate under first-order noise, or least squares if it is not resolved."""
-    longest: dict[str, float] = {}
+_COLOURED = ("coloured", "drifting")
+
+
+def compare_on_blocks(
+    problem: Problem, theta: FloatArray, max_simulations: int | None = None
+) -> PredictionErrors | None:
+    """Compare both noise models on blocks left out, from estimates of least squares (D,).
+
+    None: too few simulations are left, or no residual is coloured.
+    """
+    most = 2**62 if max_simulations is None else max_simulations
+    whole = WhitenedLeastSquares(problem, most)
+    if most < 2 * sum(_DIVISIONS) * whole.round_simulations:
+        return None
+    place = to_unit(problem.evaluator, theta[None])[0]
+    error = whole.compute_residuals(place[None])[0]
+    coloured = select_coloured_outputs(problem, error)
+    times = estimate_correlation_times(problem, coloured, error, None)
+    if not any(times.values()):
+        return None
+    generalised = whole.find_lowest_minimum([place], make_whitening(problem, times))
+    left, squares, count = most - whole.evaluations, np.zeros(2), 0
+    for division in _DIVISIONS:
+        blocks = _number_blocks(problem, division)
+        count += int(np.count_nonzero(blocks))
+        for block in range(1, division):
+            rows = blocks == block
+            part = _leave_out(problem, rows)
+            for i, start in enumerate((place, generalised)):
+                search = WhitenedLeastSquares(part, left)
+                if left < search.round_simulations:
+                    return None
+                whitening = make_whitening(part, times if i else {})
+                end = search.find_lowest_minimum([start], whitening)
+                predicted = whole.compute_residuals(end[None])[0][rows]
+                squares[i] += float(predicted @ predicted)
+                left -= search.evaluations + 1
+    white, ar1 = np.sqrt(squares / max(count, 1)).tolist()
+    return PredictionErrors(white, ar1, most - left)
+
+
+def _number_blocks(problem: Problem, division: int) -> IntArray:
+    """Number the blocks (n,) of time in which the scored samples of each experiment lie."""
+    numbers = np.zeros(problem.n_scored, dtype=np.int64)
     for part in iterate_parts(problem):
-        span = float(part.times[-1] - part.times[0])
-        longest[part.output] = max(span, longest.get(part.output, 0.0))
-    times = estimate.correlation_times
-    squares = GeneralisedEstimate(theta, {}, estimate.evaluations, True)
-    if not estimate.is_complete or not any(times.values()):
-        return squares
-    slow = {name: time for name, time in times.items() if _MIN_RECORD_TIMES * time > longest[name]}
-    return (
-        squares._replace(unresolved_times=slow)
-        if slow
-        else estimate._replace(least_squares_theta=theta)
-    )
+        first, span = part.times[0], float(np.ptp(part.times))
+        share = (part.times - first) / span if span > 0 else np.zeros(part.times.size)
+        numbers[part.rows] = np.minimum((division * share).astype(np.int64), division - 1)
+    return numbers
+
+
+def _leave_out(problem: Problem, rows: FloatArray) -> Problem:
+    """Leave scored samples out of the residuals of least squares."""
+    weight = problem.evaluator.weight.copy()
+    weight[problem.scored_rows[rows]] = 0.0
+    return replace(problem, evaluator=problem.evaluator._replace(weight=weight))
 
 
 def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem:
@@ -179,14 +123,7 @@ def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem
 
 
 def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> tuple[str, ...]:
-    """Explain why ``auto`` selected a noise model and what least squares gave; or why not."""
-    if noise.unresolved_times:
-        times = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
-        return (
-            "noise_model auto keeps least squares, although the residuals drift and the model "
-            f"integrates. With ar1 the noise would have a correlation time of {times}. "
-            f"The record is not {_MIN_RECORD_TIMES:g} times as long.",
-        )
+    """Explain why ``auto`` selected ar1, and what least squares gave."""
     if noise.least_squares_theta is None:
         return ()
     squares = ", ".join(
@@ -195,11 +132,9 @@ def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> 
             problem.free_parameters, noise.least_squares_theta.tolist(), strict=True
         )
     )
-    metrics = problem.evaluate_metrics(np.asarray(noise.least_squares_theta))
-    unit = format_unit(metrics.unit)
+    unit = format_unit(problem.unit)
     return (
-        "noise_model auto selected ar1: the least-squares residuals are autocorrelated and the "
-        "model integrates, as a drive or a tank does. Plain least squares gave "
-        f"{squares}, RMS {metrics.rms:.4g}{unit}. "
-        "To get these, use loss: {noise_model: white}",
+        "noise_model auto selected ar1: its free run predicts data that were not used better, with "
+        f"an RMS error of {noise.error:.4g}{unit} and not {noise.least_squares_error:.4g}{unit}. "
+        f"Plain least squares gave {squares}. To get these, use loss: {{noise_model: white}}",
     )

@@ -6,7 +6,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
 from sysid.core.errors import UnknownParameter
-from sysid.core.settings import LossKind
+from sysid.core.settings import LossKind, PredictionKind
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Record
@@ -18,11 +18,18 @@ from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Posterior, Uncertainty
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from sysid.data.records import Channels, Recording
     from sysid.figures.theme import Theme
     from sysid.identification.figures import FigureName
+    from sysid.identification.verdict import Verdict
+    from sysid.uncertainty.output_bands import OutputBands
 
 CHI_SQUARE_95 = 3.841
 """Quantile of χ² with one degree of freedom."""
+STRONG_EVIDENCE = 6.0
+"""Difference of BIC: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +116,89 @@ class InputHold:
     rms_other: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class OrderFit:
+    """A process of one order, fitted to the samples of an identification.
+
+    Attributes
+    ----------
+    model : str
+        Its name in the catalogue.
+    order : int
+        Number of poles.
+    delay, delay_stderr : float, float or None
+        Dead time (s) and its standard error.
+    values : mapping of str to float
+        All parameters of that model.
+    rms : float
+        RMS error, as that of the identification.
+    bic : float
+        Schwarz's criterion, smaller is better; with the noise model of the comparison.
+    """
+
+    model: str
+    order: int
+    delay: float
+    delay_stderr: float | None
+    values: Mapping[str, float]
+    rms: float
+    bic: float
+
+
+@dataclass(frozen=True, slots=True)
+class OrderComparison:
+    """The model's order, one order less and one more, fitted to the same samples.
+
+    Attributes
+    ----------
+    model : str
+        The catalogue's name of the model's own order.
+    delay, unit : str
+        The model's parameter that is the dead time, and its unit.
+    noise_model : {"white", "ar1"}
+        Noise model of the criteria.
+    fits : tuple of OrderFit
+        The lowest order first.
+
+    Examples
+    --------
+    >>> first = OrderFit("fopdt", 1, 1.57, 0.01, {"L": 1.57}, 0.027, -1264.0)
+    >>> second = OrderFit("sopdt", 2, 1.33, 0.01, {"L": 1.33}, 0.019, -1474.0)
+    >>> comparison = OrderComparison("fopdt", "L", "s", "white", (first, second))
+    >>> comparison.preferred_model, comparison.delay_range
+    ('sopdt', (1.33, 1.33))
+    """
+
+    model: str
+    delay: str
+    unit: str
+    noise_model: Literal["white", "ar1"]
+    fits: tuple[OrderFit, ...]
+
+    @property
+    def own_fit(self) -> OrderFit:
+        """The fit of the model's own order."""
+        return next(fit for fit in self.fits if fit.model == self.model)
+
+    @property
+    def open_fits(self) -> tuple[OrderFit, ...]:
+        """The orders that the data do not rule out: BIC within 6 of the lowest."""
+        limit = min(fit.bic for fit in self.fits) + STRONG_EVIDENCE
+        return tuple(fit for fit in self.fits if fit.bic <= limit)
+
+    @property
+    def preferred_model(self) -> str | None:
+        """The one order that is not ruled out; None if there are several."""
+        fits = self.open_fits
+        return fits[0].model if len(fits) == 1 else None
+
+    @property
+    def delay_range(self) -> tuple[float, float]:
+        """Smallest and largest dead time (s) of the orders that are not ruled out."""
+        delays = [fit.delay for fit in self.open_fits]
+        return min(delays), max(delays)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedData:
     """What an identification was made from, for its figures and to simulate it again.
@@ -125,6 +215,9 @@ class FittedData:
     correlations : tuple of CorrelationFunction
         Correlation functions of the residuals that were tested.
     loss : {"squares", "soft-l1"}
+    prediction : {"simulation", "one-step"}
+    ties : mapping of str to str
+        Expressions of parameters that were tied besides those of the model.
     channels : mapping of str to str
         Channel of each signal in the first recording: model's name → channel's name.
     """
@@ -135,6 +228,8 @@ class FittedData:
     is_part: bool
     correlations: tuple[CorrelationFunction, ...]
     loss: LossKind = "squares"
+    prediction: PredictionKind = "simulation"
+    ties: Mapping[str, str] = field(default_factory=dict)
     channels: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -161,6 +256,9 @@ class Identification:
         Selected terms, if the model requests a selection.
     correlation_times : mapping of str to float
         Correlation time (s) of each output's noise, where the noise model has one.
+    noise_deviations : tuple of tuple of float, or None
+        Estimated relative deviation of the noise by experiment and output, by which residuals were
+        divided. None: all count alike, or the weights were given.
     input_holds : tuple of InputHold
         How each input is read between its samples, and the estimates if it were read otherwise.
     data_bounds : tuple of str
@@ -176,8 +274,13 @@ class Identification:
         that, the first value is assumed.
     posterior : Posterior or None
         None if it was not requested.
+    order_comparison : OrderComparison or None
+        The model with one order less and one more, if it is a process with dead time. None if it is
+        not, or if the comparison was not requested.
     data : FittedData or None
         Model and records, from `identify`; None in a result of the service's workers.
+    delays : tuple of str
+        Free parameters that time lags depend on.
 
     Examples
     --------
@@ -221,7 +324,10 @@ class Identification:
     known_before: tuple[float, ...]
     known_before_validation: tuple[float, ...]
     posterior: Posterior | None = None
+    order_comparison: OrderComparison | None = None
     data: FittedData | None = None
+    delays: tuple[str, ...] = ()
+    noise_deviations: tuple[tuple[float, ...], ...] | None = None
 
     def __getitem__(self, name: str) -> Estimate:
         """Return the estimate of a parameter.
@@ -263,6 +369,17 @@ class Identification:
     def _by_name(self) -> dict[str, Estimate]:
         return {estimate.name: estimate for estimate in self.estimates}
 
+    def __eq__(self, other: object) -> bool:
+        """Test whether every number, name and record is the same; ``nan`` is equal to ``nan``."""
+        if not isinstance(other, Identification):
+            return NotImplemented
+        from sysid.identification.saved_result import have_same_content
+
+        return self is other or have_same_content(self, other)
+
+    def __hash__(self) -> int:
+        return hash((self.evaluations, self.generations, tuple(self)))
+
     def __repr__(self) -> str:
         from sysid.identification.summary import summarise_result
 
@@ -277,6 +394,24 @@ class Identification:
     def parameter_values(self) -> dict[str, float]:
         """Values of all parameters by name, as `simulate` takes them."""
         return {estimate.name: estimate.value for estimate in self.estimates}
+
+    @property
+    def verdict(self) -> "Verdict":
+        """Whether the estimates can be relied on, in words, with the reasons."""
+        from sysid.identification.verdict import Evidence, judge_result
+
+        return judge_result(
+            Evidence(
+                estimates=self.estimates,
+                valid=self.valid,
+                fit_percent=self.fit_percent,
+                fit_percent_validation=self.fit_percent_validation,
+                search=self.search,
+                tests=() if self.residual_tests is None else self.residual_tests.tests,
+                delays=self.delays,
+                orders=self.order_comparison,
+            )
+        )
 
     def plot(
         self,
@@ -309,6 +444,56 @@ class Identification:
 
         return plot_result(self, names, experiment, theme)
 
+    def compute_bands(
+        self,
+        inputs: "Channels | Record | Recording | None" = None,
+        *,
+        channels: Mapping[str, str] | None = None,
+        times: "ArrayLike | None" = None,
+        experiment: int = 0,
+    ) -> "tuple[OutputBands, ...]":
+        """Compute 95 % bands of each output, on a record of the fit or on new inputs.
+
+        The confidence band holds the output without noise, the prediction band a new measurement.
+        Both come from the covariance of the estimates, or from the posterior where it was sampled.
+
+        Parameters
+        ----------
+        inputs : Channel, sequence of Channel, table, Record or Recording, optional
+            New inputs, as `simulate` takes them. Default: the record that was fitted.
+        channels : mapping of str to str, optional
+            Model's input → channel's name.
+        times : array of shape (N,), optional
+            Seconds. Default: the times of the first input.
+        experiment : int
+            Which record of the fit, from 0, if there are several.
+
+        Returns
+        -------
+        tuple of OutputBands
+            In the units of the outputs, (N, 2) each.
+
+        Raises
+        ------
+        InvalidSettings
+            If the result has no standard errors, or there is no such record.
+        InvalidRecord, RecordTooShort
+            If new inputs cannot be simulated.
+
+        Examples
+        --------
+        >>> t = [0.1 * k for k in range(100)]
+        >>> u = [1.0 if time >= 1 else 0.0 for time in t]
+        >>> y = [3 * (1 - 2.718281828 ** -(time - 1.5)) if time > 1.5 else 0.0 for time in t]
+        >>> found = identify("fopdt", {"t": t, "u": u, "y": y})
+        >>> [bands] = found.compute_bands()
+        >>> bands.output, bands.confidence.shape, bands.source
+        ('y', (100, 2), 'covariance')
+        """
+        from sysid.identification.bands import compute_bands
+
+        return compute_bands(self, inputs, channels=channels, times=times, experiment=experiment)
+
     def to_pandas(self) -> Any:
         """Return the estimates as a table of pandas, one row for each parameter.
 
@@ -335,7 +520,7 @@ class Identification:
 
     @staticmethod
     def load(path: str | PathLike[str]) -> "Identification":
-        """Read a result that `save` wrote; every number is the same.
+        """Read a result that `save` wrote; it is equal to the one that was saved.
 
         Raises
         ------

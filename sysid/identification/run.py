@@ -39,7 +39,7 @@ __all__ = [
 CALL_SECONDS = 0.1
 """Target duration of one compiled call, so that a cancel takes effect in time."""
 
-FIRST_CALL_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
+FIRST_CALL_STEPS = 4_000_000  # steps of integration or recursion in a first call: some 30 ms
 
 
 def begin_run(

@@ -71,6 +71,11 @@ def read_result(path: str | PathLike[str]) -> Identification:
     return found
 
 
+def have_same_content(first: Identification, second: Identification) -> bool:
+    """Test whether two results would be saved as the same document."""
+    return bool(_encode(first) == _encode(second))
+
+
 def read_json(path: str | PathLike[str]) -> Any:
     """Read a JSON file.
 

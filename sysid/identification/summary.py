@@ -5,9 +5,16 @@ from html import escape
 from math import isfinite
 from typing import Any
 
-from sysid.core.errors import MissingLibrary
-from sysid.core.text import DASH, format_interval, join_estimate, plain_estimate, plain_unit
-from sysid.identification.result import Identification, SearchEvidence
+from sysid.core.lazy_names import load_library
+from sysid.core.text import (
+    DASH,
+    find_rms_unit,
+    format_interval,
+    join_estimate,
+    plain_estimate,
+    plain_unit,
+)
+from sysid.identification.result import Identification, OrderComparison, SearchEvidence
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.uncertainty.estimates import Estimate
 
@@ -22,11 +29,11 @@ _BECAUSE = {
 
 def summarise_result(found: Identification) -> str:
     """Summarise a result in a few lines: estimates, fit, verdicts, the first warnings."""
-    lines = [", ".join(_list_facts(found))]
+    lines = [", ".join(_list_facts(found)), f"verdict: {found.verdict.text}"]
     rows = [
         (
             estimate.name,
-            plain_estimate(estimate.value, estimate.stderr, is_bound=estimate.status == "at bound"),
+            plain_estimate(estimate.value, estimate.stderr, status=estimate.status),
             "" if estimate.unit == "1" else estimate.unit,
             estimate.status,
         )
@@ -50,7 +57,12 @@ def to_html(found: Identification) -> str:
     )
     rows = "".join(f"<tr>{_write_cells(estimate)}</tr>" for estimate in found.estimates)
     facts = "<br>".join(
-        escape(text) for text in [", ".join(_list_facts(found)), *_list_verdicts(found)]
+        escape(text)
+        for text in [
+            ", ".join(_list_facts(found)),
+            f"verdict: {found.verdict.text}",
+            *_list_verdicts(found),
+        ]
     )
     warnings = "".join(f"<li>{escape(warning)}</li>" for warning in found.warnings)
     notes = f"<details open><summary>Warnings</summary><ul>{warnings}</ul></details>"
@@ -68,10 +80,7 @@ def to_frame(found: Identification) -> Any:
     MissingLibrary
         If pandas is not installed.
     """
-    try:
-        import pandas as pd
-    except ImportError:
-        raise MissingLibrary("to_pandas()", "pandas") from None
+    pandas = load_library("pandas", "to_pandas()")
     unknown = float("nan")
     rows = [
         {
@@ -88,21 +97,15 @@ def to_frame(found: Identification) -> Any:
         for estimate in found.estimates
     ]
     names = [estimate.name for estimate in found.estimates]
-    return pd.DataFrame(rows, index=pd.Index(names, name="parameter"))
+    return pandas.DataFrame(rows, index=pandas.Index(names, name="parameter"))
 
 
 def find_output_unit(found: Identification) -> str:
-    """Find the unit of the RMS: that of the output, or standard deviations of several.
-
-    If the model has no unit for its output, it is the unit of the record.
-    """
-    units = dict.fromkeys((metrics.output, metrics.unit) for metrics in found.agreement)
-    if len(units) > 1:
-        return "standard deviations"
-    unit = next((unit for _, unit in units), "1")
-    if unit == "1" and found.data is not None:
-        return found.data.records[0].outputs[0].unit
-    return unit
+    """Find the unit of the RMS of a result: that of its output, or σ for several together."""
+    return find_rms_unit(
+        {metrics.output: metrics.unit for metrics in found.agreement},
+        lambda _: "1" if found.data is None else found.data.records[0].outputs[0].unit,
+    )
 
 
 def describe_residuals(tests: ResidualTests) -> str:
@@ -129,6 +132,23 @@ def describe_search(evidence: SearchEvidence) -> str:
     )
 
 
+def describe_order(comparison: OrderComparison) -> str:
+    """Say which order the data prefer, and the dead time with those that matter.
+
+    These are the model's own and all that are not ruled out.
+    """
+    unit, open_fits = plain_unit(comparison.unit), comparison.open_fits
+    listed = [fit for fit in comparison.fits if fit.model == comparison.model or fit in open_fits]
+    delays = ", ".join(
+        f"{plain_estimate(fit.delay, fit.delay_stderr)}{unit} with {fit.model}" for fit in listed
+    )
+    preferred = comparison.preferred_model
+    fits = open_fits if preferred is None else comparison.fits
+    others = " and ".join(fit.model for fit in fits if fit.model != preferred)
+    verdict = "do not tell {} apart" if preferred is None else f"prefer {preferred} to {{}}"
+    return f"order: the data {verdict.format(others)}; {comparison.delay} is {delays}"
+
+
 def _list_facts(found: Identification) -> Iterator[str]:
     if found.data is not None:
         yield f"Identification of {found.data.model.name!r}"
@@ -150,6 +170,8 @@ def _list_verdicts(found: Identification) -> list[str]:
     verdicts = [] if found.valid else ["the model is invalid: its RMS is above the safe limit"]
     if found.residual_tests is not None and found.residual_tests.passed is not None:
         verdicts.append(describe_residuals(found.residual_tests))
+    if found.order_comparison is not None:
+        verdicts.append(describe_order(found.order_comparison))
     return [*verdicts, describe_search(found.search)]
 
 
@@ -164,12 +186,11 @@ def _shorten(text: str) -> str:
 
 
 def _write_cells(estimate: Estimate) -> str:
-    interval = format_interval(estimate.interval95, estimate.stderr) or DASH
-    is_bound = estimate.status == "at bound"
+    interval = format_interval(estimate.interval95, estimate.stderr, status=estimate.status) or DASH
     why = f" <small>{escape(estimate.reason)}</small>" if estimate.reason else ""
     cells = (
         f"<b>{escape(estimate.name)}</b>",
-        escape(join_estimate(estimate.value, estimate.stderr, is_bound=is_bound)),
+        escape(join_estimate(estimate.value, estimate.stderr, status=estimate.status)),
         "" if estimate.unit == "1" else escape(estimate.unit),
         escape(interval),
         f"{escape(estimate.status)}{why}",

@@ -19,8 +19,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc
 
+from sysid.core.distributions import f_tail
 from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
@@ -128,7 +128,7 @@ def _compute_longest_input_delay(problem: Problem, spans: Mapping[str, Interval]
         return 0.0
     step = problem.experiments[0].grid.integration_step
     return max(
-        compute_longest_delay(problem.model, past, spans, step)
+        compute_longest_delay(problem.model, past, {**spans, **problem.delaying_ranges}, step)
         for past in list_past_values(problem.model)
         if past.kind == "input"
     )
@@ -306,7 +306,7 @@ def _is_contradicted(
     if variance <= 0:
         return bool(np.any(error[rows][assumed] != 0))
     ratio = float(np.mean(error[rows][assumed] ** 2)) / variance
-    return bool(fdtrc(count, degrees, ratio) < _UNLIKELY)
+    return bool(f_tail(count, degrees, ratio) < _UNLIKELY)
 
 
 def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:

@@ -8,6 +8,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.identification.suspects import DYNAMICS, describe_suspects, find_suspects
 from sysid.identification.unrecorded_input import warn_unrecorded_input
 from sysid.kernels.reads import list_delayed_values
 from sysid.models.ties import collect_parameter_names
@@ -20,6 +21,7 @@ from sysid.residuals.onset_delay import find_unprompted_output
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.residual_tests import ResidualTests
 from sysid.search.island import get_island_settings
+from sysid.simulation.metrics import compute_mean
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
@@ -42,6 +44,8 @@ _STDERR_MEANINGS: Mapping[NoiseColour, str] = {
     "first-order": "The standard errors are those of the noise model.",
     "coloured": "The standard errors allow for the colour of the residuals, not for missing "
     "dynamics.",
+    "clustered": "The standard errors allow for what the samples of a repeat have in common, not "
+    "for missing dynamics.",
     "drifting": "The residuals drift over the whole record, so the standard errors are too small.",
 }
 
@@ -74,7 +78,7 @@ def collect_warnings(
     messages += about_units
     messages += _warn_active_bounds(analysis)
     messages += _warn_no_prediction(problem)
-    messages += _warn_constant_outputs(problem)
+    messages += warn_constant_outputs(problem)
     messages += _warn_worse_than_line(problem, simulated)
     messages += _warn_constant_inputs(problem, analysis.estimates)
     messages += _warn_early_response(problem) or warn_unrecorded_input(
@@ -106,9 +110,10 @@ def collect_warnings(
     elif tests is not None and not is_of_the_solver:
         loss = problem.loss
         is_plain = loss.kind == "squares" and loss.noise_model != "ar1"
-        messages += _warn_coloured_residuals(
+        coloured = _warn_coloured_residuals(
             tests, delay_names, analysis.uncertainty, may_be_noise=is_plain
         )
+        messages += _name_suspects(problem, analysis, tests, are_white=not coloured) or coloured
     return (*messages, *about_unread_units)
 
 
@@ -159,7 +164,7 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
     ]
 
 
-def _warn_constant_outputs(problem: Problem) -> list[str]:
+def warn_constant_outputs(problem: Problem) -> list[str]:
     """Warn about outputs whose scored samples are all equal, in every experiment."""
     measured = problem.split_by_output(problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
@@ -171,8 +176,9 @@ def _warn_constant_outputs(problem: Problem) -> list[str]:
         if np.ptp(values) == 0.0:
             unit = format_unit(output.unit)
             messages.append(
-                f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it contains no "
-                "dynamics, and the fit % is undefined"
+                f"output {output.name!r} is constant ({values[0]:.4g}{unit}) at all "
+                f"{values.size} samples: it contains no dynamics, and the fit % is undefined. "
+                "Choose another channel, or a record in which it moves"
             )
     return messages
 
@@ -202,15 +208,15 @@ def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
 
 
 def _fit_line(x: FloatArray, y: FloatArray) -> FloatArray:
-    centred = x - np.mean(x)
+    centred = x - compute_mean(x)
     spread = float(centred @ centred)
-    slope = float(centred @ (y - np.mean(y))) / spread if spread > 0 else 0.0
-    return np.asarray(np.mean(y) + slope * centred)
+    slope = float(centred @ (y - compute_mean(y))) / spread if spread > 0 else 0.0
+    return np.asarray(compute_mean(y) + slope * centred)
 
 
 def _compute_rms(values: FloatArray) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(np.mean(np.square(values))))
+        return float(np.sqrt(compute_mean(np.square(values))))
 
 
 def _warn_unidentified(estimate: Estimate, *, is_told: bool) -> str:
@@ -363,6 +369,22 @@ def _warn_coloured_residuals(
     ]
 
 
+def _name_suspects(
+    problem: Problem, analysis: Analysis, tests: ResidualTests, *, are_white: bool
+) -> list[str]:
+    """Name what left the residuals, unless it is a lack of dynamics."""
+    suspects = find_suspects(problem, analysis, are_white=are_white)
+    if not suspects or suspects[0].name == DYNAMICS or analysis.uncertainty is None:
+        return []
+    if are_white:
+        return [f"the residuals tell {describe_suspects(suspects)}"]
+    meaning = _STDERR_MEANINGS[analysis.uncertainty.noise_colour]
+    return [
+        f"the residuals are not white (on the {tests.data} data). They tell "
+        f"{describe_suspects(suspects)}. {meaning}"
+    ]
+
+
 def warn_time_limit(is_cut_short: bool) -> tuple[str, ...]:
     """Warn if the time limit ended the refinement."""
     if not is_cut_short:
@@ -414,8 +436,9 @@ def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> 
         ]
         if unidentified and all(float(np.ptp(signal)) == 0.0 for signal in values):
             messages.append(
-                f"input {quantity.name!r} is constant, so it excites nothing. These data leave "
-                f"unidentified: {unidentified}"
+                f"input {quantity.name!r} is constant, so it excites nothing. Choose another "
+                "channel, or a record in which it moves. These data leave unidentified: "
+                f"{unidentified}"
             )
     return messages
 

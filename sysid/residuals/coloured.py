@@ -17,9 +17,9 @@ degrees of freedom. If a is too near 1, the record is short compared with its dr
 are a lower bound. Different outputs are assumed independent here; see
 `sysid.residuals.correlated_outputs`.
 
-The noise variance can also differ between outputs and experiments. If it clearly does in the
-weighted residuals (Bartlett 1937), Ω has one variance for each series. An interval then has the
-degrees of freedom of the series that determine it.
+The noise variance can also differ between outputs and experiments. If it clearly does, or if the
+weights were estimated from the residuals (`sysid.residuals.variances`), Ω has one variance for each
+series. An interval then has the degrees of freedom of the series that determine it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,9 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import rfft
 from numpy.typing import NDArray
-from scipy.special import chdtrc, stdtrit
 
-from sysid.core.types import RANK_TOLERANCE, FloatArray
+from sysid.core.distributions import chi_square_tail, student_quantile
+from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import (
     MIN_SAMPLES,
     ROUNDING_SHARE,
@@ -42,10 +42,11 @@ from sysid.residuals.autocorrelation import (
 )
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.restricted_likelihood import MAX_POLE, NoiseColourModel, fit_noise_colour
+from sysid.residuals.variances import count_used_degrees, have_unequal_variances
 from sysid.simulation.problem import Problem
 
 _SIGNIFICANCE = 1e-3
-"""Level of the tests for coloured residuals and for unequal variances.
+"""Level of the test for coloured residuals.
 
 It is that of χ². With 25 lags of a short record the statistic varies more. So white residuals of 50
 to 100 samples are taken for coloured in 1 % of the cases (decision 19)."""
@@ -67,15 +68,16 @@ class ColouredCovariance(NamedTuple):
     """Ω (D, D) of the sandwich, and the equivalent number of white samples.
 
     `is_drifting`: the number is unknown, because the residuals wander over the whole record.
-    `is_white`: the residuals are white, but of unequal variances. `series` has for each series its
-    part of Ω and its degrees of freedom; empty: there is one series. `models` has the noise model
-    of each series, or None.
+    `is_white`: the residuals are white, but of unequal variances. `is_clustered`: Ω is that of
+    whole repeats. `series` has for each series its part of Ω and its degrees of freedom; empty:
+    there is one series. `models` has the noise model of each series, or None.
     """
 
     middle: FloatArray
     equivalent_samples: float
     is_drifting: bool
     is_white: bool = False
+    is_clustered: bool = False
     series: tuple[tuple[FloatArray, float], ...] = ()
     models: tuple[NoiseColourModel | None, ...] = ()
 
@@ -108,17 +110,21 @@ class ColouredCovariance(NamedTuple):
         variance_ratio = max(
             float(direction @ self.middle @ direction) / (power * norm), _MIN_WIDENING
         )
-        quantile_ratio = float(stdtrit(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
+        quantile_ratio = (
+            float(student_quantile(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
+        )
         return float(variance_ratio * quantile_ratio * self.equivalent_samples / self.degrees)
 
 
 class ResidualPart(NamedTuple):
-    """Scored samples of one output of one experiment: their rows among all, and times."""
+    """Scored samples of one output of one experiment: their rows among all, times, repeats."""
 
+    experiment: int
     output: str
     rows: slice
     times: FloatArray
     largest_value: float
+    repeats: FloatArray | None = None
 
 
 def estimate_coloured_covariance(
@@ -142,9 +148,10 @@ def estimate_coloured_covariance(
     are_coloured = [
         is_free and _are_spaced_coloured(spaced, part.largest_value) for part, spaced in parts
     ]
-    if not any(are_coloured) and not _have_unequal_variances(
+    are_equal = problem.settings.deviations is None and not have_unequal_variances(
         [influence[part.rows] for part, _ in parts]
-    ):
+    )
+    if not any(are_coloured) and are_equal:
         return None
     series = []
     for (part, _), has_colour in zip(parts, are_coloured, strict=True):
@@ -162,17 +169,8 @@ def estimate_coloured_covariance(
                     mean * (part_columns.T @ part_columns), float(values.size), is_drifting=False
                 )
             )
-    used = _count_used_degrees([columns[part.rows] for part, _ in parts])
+    used = count_used_degrees([columns[part.rows] for part, _ in parts])
     return _combine_series(series, used)._replace(is_white=not any(are_coloured))
-
-
-def _count_used_degrees(columns: Sequence[FloatArray]) -> FloatArray:
-    """Compute the degrees of freedom that the D parameters take from each series."""
-    products = [block.T @ block for block in columns]
-    inverse = np.linalg.pinv(np.sum(products, axis=0), rcond=RANK_TOLERANCE**2, hermitian=True)
-    used = np.array([np.sum(inverse * block) for block in products])
-    total = float(np.sum(used))  # 0 where nothing has an effect
-    return np.asarray(used * (len(inverse) / total if total > 0 else 0.0))
 
 
 def _combine_series(series: Sequence[ColouredCovariance], used: FloatArray) -> ColouredCovariance:
@@ -197,21 +195,6 @@ def _combine_series(series: Sequence[ColouredCovariance], used: FloatArray) -> C
     )
 
 
-def _have_unequal_variances(series: Sequence[FloatArray]) -> bool:
-    """Return whether residual series clearly have unequal variances (Bartlett's test)."""
-    long_series = [values for values in series if values.size >= MIN_SAMPLES]
-    variances = np.array([np.mean(np.square(values)) for values in long_series])
-    if len(long_series) < 2 or not np.min(variances) > 0:
-        return False
-    counts = np.array([values.size for values in long_series])
-    total = float(np.sum(counts))
-    pooled = float(counts @ variances) / total
-    statistic = total * np.log(pooled) - counts @ np.log(variances)
-    degrees = len(long_series) - 1
-    correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * degrees)
-    return float(chdtrc(degrees, statistic / correction)) < _SIGNIFICANCE
-
-
 def is_coloured(part: ResidualPart, values: FloatArray) -> bool:
     """Return whether the residuals (n,) of a part are clearly not white."""
     return _are_spaced_coloured(_order_residuals(part, values), part.largest_value)
@@ -222,14 +205,17 @@ def iterate_parts(problem: Problem) -> Iterator[ResidualPart]:
     measured = problem.split_by_output(problem.evaluator.weight * problem.evaluator.measured)
     weights = problem.split_by_output(problem.evaluator.weight)
     first = 0
-    for record, weight, sizes in zip(problem.records, weights, measured, strict=True):
-        times = {channel.name: channel.times for channel in record.outputs}
+    parts = zip(problem.records, weights, measured, strict=True)
+    for experiment, (record, weight, sizes) in enumerate(parts):
+        channels = {channel.name: channel for channel in record.outputs}
         for output, output_weight in weight.items():
-            scored = output_weight > 0
+            scored, channel = output_weight > 0, channels[output]
             n = int(np.count_nonzero(scored))
             if n:
                 size = float(np.max(np.abs(sizes[output][scored])))
-                yield ResidualPart(output, slice(first, first + n), times[output][scored], size)
+                rows = slice(first, first + n)
+                repeats = None if channel.repeats is None else channel.repeats[scored]
+                yield ResidualPart(experiment, output, rows, channel.times[scored], size, repeats)
             first += n
 
 
@@ -251,11 +237,13 @@ def _are_spaced_coloured(spaced: SpacedResiduals, size: float) -> bool:
     ):
         return False
     whiteness = compute_whiteness(spaced)
-    chance = float(chdtrc(spaced.n_lags, whiteness.statistic))
+    chance = float(chi_square_tail(spaced.n_lags, whiteness.statistic))
     if (
         n < _SHORT_RECORD and whiteness.values[0] > 0
     ):  # in short records many lags hide the first one
-        chance = min(chance, float(chdtrc(1, (whiteness.values[0] / whiteness.deviation[0]) ** 2)))
+        chance = min(
+            chance, float(chi_square_tail(1, (whiteness.values[0] / whiteness.deviation[0]) ** 2))
+        )
     return chance < _SIGNIFICANCE
 
 

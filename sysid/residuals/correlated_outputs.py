@@ -10,13 +10,14 @@ Equal residuals count once. So Σe² varies like that of fewer independent ones 
 n²/Σ r² of n, with the sum over all pairs. Two outputs with the same noise count as one.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations, islice
+from collections.abc import Iterator
+from itertools import combinations, groupby
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
 
+from sysid.core.distributions import chi_square_tail
 from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import MIN_SAMPLES, space_residuals
 from sysid.residuals.coloured import (
@@ -29,6 +30,7 @@ from sysid.residuals.coloured import (
     make_white_root,
     transform_sensitivities,
 )
+from sysid.residuals.repeats import estimate_repeat_covariance
 from sysid.simulation.problem import Problem
 
 _SIGNIFICANCE = 1e-3
@@ -56,7 +58,8 @@ def estimate_joint_covariance(
 ) -> ColouredCovariance | None:
     """Estimate the coloured covariance with cross terms of outputs; None: one white noise.
 
-    The series themselves are those of `estimate_coloured_covariance`.
+    The series themselves are those of `estimate_coloured_covariance`. Samples pooled from repeats
+    have the covariance of whole repeats.
 
     Parameters
     ----------
@@ -65,6 +68,9 @@ def estimate_joint_covariance(
     columns : FloatArray, shape (n, D)
         Sensitivities of these samples.
     """
+    clustered = estimate_repeat_covariance(problem, influence, columns)
+    if clustered is not None:
+        return clustered
     pairs = (
         list(_find_correlated_pairs(problem, influence)) if len(problem.model.outputs) > 1 else []
     )
@@ -101,7 +107,7 @@ def _find_correlated_pairs(problem: Problem, influence: FloatArray) -> Iterator[
 
     All pairs of such an experiment count: a part of them might form an impossible covariance.
     """
-    for group in _group_by_experiment(problem):
+    for _, group in groupby(iterate_parts(problem), key=attrgetter("experiment")):
         correlated = [
             _correlate_parts(first, second, influence) for first, second in combinations(group, 2)
         ]
@@ -124,14 +130,6 @@ def _correlate_parts(
     return None if correlation is None else _CorrelatedPair(first, second, *correlation)
 
 
-def _group_by_experiment(problem: Problem) -> Iterator[Sequence[ResidualPart]]:
-    parts = iterate_parts(problem)
-    for weight in problem.split_by_output(problem.evaluator.weight):
-        yield tuple(
-            islice(parts, sum(bool(np.any(output_weight > 0)) for output_weight in weight.values()))
-        )
-
-
 def _compute_correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | None:
     """Compute the correlation of two series (n,) and its p-value; None if a series is 0.
 
@@ -143,7 +141,7 @@ def _compute_correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | 
     correlation = float(a @ b) / size
     poles = float((a[1:] @ a[:-1]) * (b[1:] @ b[:-1]) / size**2)
     widening = (1.0 + max(poles, 0.0)) / (1.0 - max(poles, 0.0))
-    return correlation, float(chdtrc(1, correlation**2 * a.size / widening))
+    return correlation, float(chi_square_tail(1, correlation**2 * a.size / widening))
 
 
 def _compute_cross_term(

@@ -26,6 +26,7 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel, Record
@@ -42,6 +43,7 @@ _REST_SAMPLES = 10  # samples at least
 _LEVEL_SHARE = 0.25  # of a rest: its last part, which defines the level
 _MAX_CREEP = 0.5  # of the threshold: a signal with more drift is not at rest
 _STAY_SAMPLES = 3  # samples beyond the threshold that make an onset
+_SPIKE_REACH = 2  # neighbours on either side
 _MAX_EVENTS = 500  # limit on the events examined
 _GOLDEN_RATIO = 0.5 * (sqrt(5.0) - 1.0)
 
@@ -117,7 +119,7 @@ def find_unprompted_output(record: Record) -> tuple[str, float] | None:
     early_outputs = []
     for output in record.outputs:
         is_measured = np.isfinite(output.values)
-        times, values = output.times[is_measured], output.values[is_measured]
+        times, values = output.times[is_measured], _remove_spikes(output.values[is_measured])
         rest_end = _find_rest_end(times, values)
         if not rest_end < first_input_move:
             continue
@@ -130,6 +132,14 @@ def find_unprompted_output(record: Record) -> tuple[str, float] | None:
         ) <= _MAX_CREEP * _compute_tolerance(values):
             early_outputs.append((rest_end, output.name))
     return None if not early_outputs else (min(early_outputs)[1], min(early_outputs)[0])
+
+
+def _remove_spikes(values: FloatArray) -> FloatArray:
+    """Replace each sample by the median of five neighbours: one or two outliers are no move."""
+    if values.size < 2 * _SPIKE_REACH + 1:
+        return values
+    padded = np.pad(values, _SPIKE_REACH, mode="edge")
+    return np.asarray(np.median(sliding_window_view(padded, 2 * _SPIKE_REACH + 1), axis=1))
 
 
 def _find_first_move(channel: Channel) -> float:

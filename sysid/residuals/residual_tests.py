@@ -30,8 +30,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
 
+from sysid.core.distributions import chi_square_tail
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel
 from sysid.residuals.autocorrelation import (
@@ -46,6 +46,7 @@ from sysid.residuals.autocorrelation import (
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
 from sysid.simulation.loss import compute_influence
+from sysid.simulation.metrics import compute_mean
 
 if TYPE_CHECKING:  # the web pages read these results without a compiler
     from sysid.simulation.problem import Problem
@@ -187,7 +188,7 @@ def list_residual_series(
         inputs = tuple(item for item in record.inputs if item.name in names)
         times = {channel.name: channel.times for channel in record.outputs}
         for output in (item.name for item in problem.model.outputs):
-            factor = problem.output_weights[output]
+            factor = float(np.max(weight[output], initial=0.0))
             series.append(
                 make_residual_series(
                     number,
@@ -245,13 +246,14 @@ def compute_correlations(
     All are tested together at `level`: each of n tests has `level` / n (Bonferroni). Without
     `both_sides` the correlation with future inputs, which is not tested, is omitted.
     """
-    count = sum(1 + len(series.inputs) for series in all_series if not _explain_untestable(series))
-    each = level / max(count, 1)
+    reasons = [_explain_untestable(series) for series in all_series]
+    pairs = [*zip(all_series, reasons, strict=True)]
+    each = level / max(sum(1 + len(series.inputs) for series, reason in pairs if not reason), 1)
     return [
         curve
-        for series in all_series
+        for series, reason in pairs
         for curve in _correlate_series(
-            series, each, both_sides, _count_lost_degrees(series, all_series)
+            series, reason, each, both_sides, _count_lost_degrees(series, all_series)
         )
     ]
 
@@ -267,9 +269,8 @@ def _count_lost_degrees(series: ResidualSeries, all_series: Sequence[ResidualSer
 
 
 def _correlate_series(
-    series: ResidualSeries, level: float, both_sides: bool, lost: float
+    series: ResidualSeries, reason: str, level: float, both_sides: bool, lost: float
 ) -> Iterator[CorrelationFunction]:
-    reason = _explain_untestable(series)
     if reason:
         yield _make_untested(series, "whiteness", None, reason)
         for channel in series.inputs:
@@ -286,7 +287,7 @@ def _explain_untestable(series: ResidualSeries) -> str:
     if n < MIN_SAMPLES:
         return f"{n} samples are too few; need {MIN_SAMPLES} or more"
     if (
-        float(np.sqrt(np.mean(np.square(series.residual[series.scored]))))
+        float(np.sqrt(compute_mean(np.square(series.residual[series.scored]))))
         <= ROUNDING_SHARE * series.size
     ):
         return "the residuals are rounding: the model reproduces the data exactly"
@@ -320,7 +321,9 @@ def _test_independence(
 ) -> CorrelationFunction:
     if not np.ptp(channel.values) > 0:
         return _make_untested(series, "independence", channel.name, "the input is constant")
-    residual = np.where(spaced.present, spaced.values - np.mean(spaced.values[spaced.present]), 0.0)
+    residual = np.where(
+        spaced.present, spaced.values - compute_mean(spaced.values[spaced.present]), 0.0
+    )
     if not np.max(np.abs(residual)) > ROUNDING_SHARE * np.max(np.abs(spaced.values)):
         reason = "the residual is the same everywhere"
         return _make_untested(series, "independence", channel.name, reason)
@@ -361,7 +364,7 @@ def _make_test(
     degrees: float,
     level: float,
 ) -> ResidualTest:
-    p = float(chdtrc(degrees, statistic))
+    p = float(chi_square_tail(degrees, statistic))
     size = np.abs(scaled)
     return ResidualTest(
         series.experiment,

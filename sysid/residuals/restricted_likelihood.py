@@ -17,8 +17,8 @@ likelihood; Kenward and Roger 1997). If the innovations are not white, the model
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, expit
 
+from sysid.core.distributions import chi_square_tail
 from sysid.core.jit import jit_compile
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray, IntArray
@@ -121,6 +121,8 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
 
 def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
     """Convert the two arguments to the pole and the share of white noise."""
+    from scipy.special import expit
+
     return MAX_POLE * float(np.tanh(place[0])), float(expit(place[1]))
 
 
@@ -180,7 +182,7 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
 def _are_white(values: FloatArray) -> bool:
     present = np.ones(values.size, dtype=np.bool_)
     spaced = SpacedResiduals(np.arange(float(values.size)), values, present, 1.0, is_regular=True)
-    return float(chdtrc(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _MIN_CHANCE
+    return float(chi_square_tail(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _MIN_CHANCE
 
 
 def _compute_middle(

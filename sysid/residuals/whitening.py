@@ -31,7 +31,8 @@ class Whitening:
     def whiten(self, values: FloatArray) -> FloatArray:
         """Whiten values (..., n) of the samples."""
         white = np.array(values)
-        white[..., 1:] -= self.ar1_coefficient[1:] * values[..., :-1]
+        with np.errstate(invalid="ignore"):  # a simulation that diverged
+            white[..., 1:] -= self.ar1_coefficient[1:] * values[..., :-1]
         return white / self._innovation_deviation
 
     @property

@@ -160,7 +160,12 @@ def _measure_spans(records: Sequence[Record]) -> _Spans:
 
 def _drop_missing(channel: Channel) -> Channel:
     is_measured = np.isfinite(channel.values)
-    return replace(channel, times=channel.times[is_measured], values=channel.values[is_measured])
+    return replace(
+        channel,
+        times=channel.times[is_measured],
+        values=channel.values[is_measured],
+        repeats=None,
+    )
 
 
 def _integrate(channel: Channel) -> FloatArray:

@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, RecordTooShort, suggest_name
+from sysid.core.settings import FitSettings
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
@@ -55,8 +58,48 @@ class GridExperiment:
     largest_delay_steps: float
 
 
+def split_weights(settings: FitSettings, model: Model, experiments: int) -> FitSettings:
+    """Split weights by experiment into one weight of each output and relative deviations.
+
+    The weight of an output is the root mean square of its weights.
+
+    Raises
+    ------
+    InvalidSettings
+        If a weight names no output or is not a number from 1e-100 to 1e100, or if a list has not
+        one for each experiment.
+    """
+    names = [output.name for output in model.outputs]
+    weights = dict(settings.weights or {})
+    deviations = np.ones((experiments, len(names)))
+    for name, given in weights.items():
+        if name not in names:
+            raise InvalidSettings(
+                f"/weights/{name}", f"the model has no output {name!r}{suggest_name(name, names)}"
+            )
+        if not isinstance(given, list | tuple | np.ndarray):
+            weights[name] = _check_weight(name, given)
+            continue
+        if len(given) != experiments:
+            need = f"need one for each of the {experiments} experiments, or one number"
+            raise InvalidSettings(f"/weights/{name}", f"found {len(given)} weights; {need}")
+        numbers = np.array([_check_weight(name, number) for number in given])
+        weights[name] = float(np.sqrt(np.mean(np.square(numbers))))
+        deviations[:, names.index(name)] = weights[name] / numbers
+    if settings.weights is None or weights == settings.weights:
+        return settings
+    return replace(settings, weights=weights, deviations=tuple(map(tuple, deviations.tolist())))
+
+
+def _check_weight(name: str, weight: Any) -> float:
+    if not isinstance(weight, Real) or not _MIN_WEIGHT <= float(weight) <= _MAX_WEIGHT:
+        need = f"need a number from {_MIN_WEIGHT:g} to {_MAX_WEIGHT:g}"
+        raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a weight; {need}")
+    return float(weight)
+
+
 def compute_output_weights(
-    model: Model, records: Sequence[Record], weights: Mapping[str, float] | None, skip: int
+    model: Model, records: Sequence[Record], weights: Mapping[str, Any] | None, skip: int
 ) -> dict[str, float]:
     """Compute the weight of each output: the setting, or else 1 / its standard deviation.
 
@@ -65,20 +108,10 @@ def compute_output_weights(
 
     Raises
     ------
-    InvalidSettings
-        If a weight names no output or is not a number from 1e-100 to 1e100.
     InvalidRecord
         If an output is constant and `weights` has no entry for it.
     """
     names = [output.name for output in model.outputs]
-    for name, weight in (weights or {}).items():
-        if name not in names:
-            raise InvalidSettings(
-                f"/weights/{name}", f"the model has no output {name!r}{suggest_name(name, names)}"
-            )
-        if not _MIN_WEIGHT <= weight <= _MAX_WEIGHT:
-            need = f"need a number from {_MIN_WEIGHT:g} to {_MAX_WEIGHT:g}"
-            raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a weight; {need}")
     if len(names) == 1:
         return {names[0]: 1.0}
     chosen = weights or {}

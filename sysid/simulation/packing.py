@@ -17,6 +17,7 @@ from sysid.kernels.reads import (
     find_furthest_offset,
     is_difference,
     list_delayed_values,
+    list_delaying_inputs,
     list_stored_histories,
 )
 from sysid.language.functions import Interval
@@ -84,8 +85,9 @@ def interpolate_inputs(
     model: Model, channels: Sequence[Channel], parameters: Mapping[str, Interval], grid: Grid
 ) -> list[FineInput]:
     """Interpolate the inputs, as far back as the largest delays reach."""
-    reach = find_largest_delays(model, "input", parameters, grid)
     back = find_furthest_offset(model)
+    spans = {**parameters, **_measure_ranges(model, channels, grid)}
+    reach = find_largest_delays(model, "input", spans, grid)
     mean: Literal["around", "after"] = "after" if is_difference(model) else "around"
     averaged = find_averaged_inputs(model)
     fine_inputs = []
@@ -99,6 +101,26 @@ def interpolate_inputs(
             )
         )
     return fine_inputs
+
+
+def _measure_ranges(
+    model: Model, channels: Sequence[Channel], grid: Grid
+) -> dict[str, tuple[float, float]]:
+    """Measure the ranges of the inputs that delays read, at the points of the simulation."""
+    ranges = {}
+    names = list_delaying_inputs(model)
+    for quantity, channel in zip(model.inputs, channels, strict=True):
+        if quantity.name in names:
+            fine = interpolate_input(
+                channel, grid.start, grid.integration_step, grid.last_step, 1.0
+            )
+            ranges[quantity.name] = find_range(fine)
+    return ranges
+
+
+def find_range(fine: FineInput) -> tuple[float, float]:
+    """Find the least and the largest value of an input."""
+    return float(np.min(fine.values)), float(np.max(fine.values))
 
 
 def pack_experiment(

@@ -9,11 +9,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.settings import FitSettings, Loss, PredictionKind
+from sysid.core.settings import FitSettings, Loss, PredictionKind, Weights
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
 from sysid.kernels.build import get_kernel_address
 from sysid.kernels.layout import KernelVariant
+from sysid.kernels.reads import list_delaying_inputs
 from sysid.models.delays import check_delays
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter, override_parameters
@@ -25,11 +26,19 @@ from sysid.simulation.experiments import (
     compute_output_weights,
     place_on_grid,
     replace_outputs,
+    split_weights,
 )
-from sysid.simulation.metrics import ChannelMetrics, Metrics, compute_fit_percent, rms
+from sysid.simulation.metrics import (
+    ChannelMetrics,
+    Metrics,
+    compute_fit_percent,
+    compute_mean,
+    rms,
+)
 from sysid.simulation.packing import (
     PackedExperiment,
     are_on_grid,
+    find_range,
     has_weights,
     pack_experiment,
     replace_measured,
@@ -100,7 +109,7 @@ class Problem:
         parameters: Mapping[str, Mapping[str, Any]] | None = None,
         prediction: PredictionKind = "simulation",
         loss: Loss | None = None,
-        weights: Mapping[str, float] | None = None,
+        weights: Weights | None = None,
         skip: int = 0,
         scored_from: Sequence[float] | None = None,
     ) -> "Problem":
@@ -147,6 +156,7 @@ class Problem:
         ties = resolve_ties(model, all_parameters)
         tied = apply_ties(model, ties)
         check_delays(tied, all_parameters)
+        settings = split_weights(settings, tied, len(records))
         per_output = compute_output_weights(tied, records, settings.weights, settings.skip)
         experiments = tuple(
             place_on_grid(
@@ -154,7 +164,7 @@ class Problem:
                 record,
                 e,
                 all_parameters,
-                per_output,
+                _divide_weights(per_output, settings, e),
                 settings.skip,
                 scored_from=scoring_starts[e],
             )
@@ -237,7 +247,7 @@ class Problem:
                 record,
                 e,
                 self.all_parameters,
-                per_output,
+                _divide_weights(per_output, self.settings, e),
                 skip,
                 -np.inf if scoring_starts is None else scoring_starts[e],
             )
@@ -264,6 +274,18 @@ class Problem:
             experiments=experiments,
             output_weights=per_output,
         )
+
+    @cached_property
+    def delaying_ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Range over all experiments of each input that a delay reads."""
+        numbers = {signal.name: i for i, signal in enumerate(self.model.inputs)}
+        return {
+            name: (min(low), max(high))
+            for name in list_delaying_inputs(self.model)
+            for low, high in [
+                zip(*(find_range(e.inputs[numbers[name]]) for e in self.experiments), strict=True)
+            ]
+        }
 
     @property
     def _has_grid_samples(self) -> bool:
@@ -313,6 +335,18 @@ class Problem:
         return self.scored_rows.size
 
     @cached_property
+    def plain_weight(self) -> FloatArray:
+        """Weights (M,) of outputs alone, as if their noise were equal: the measure of J."""
+        if self.settings.deviations is None:
+            return self.evaluator.weight
+        plain = [
+            np.where(weight > 0, self.output_weights[name], 0.0)
+            for part in self.split_by_output(self.evaluator.weight)
+            for name, weight in part.items()
+        ]
+        return np.concatenate(plain)
+
+    @cached_property
     def n_steps(self) -> int:
         """Steps of a simulation: of the integration or of the recursion."""
         return sum(
@@ -326,7 +360,7 @@ class Problem:
         for measured, weight in self._list_channels(self.evaluator.measured):
             scored = weight > 0
             if np.any(scored):
-                centred = measured[scored] - np.mean(measured[scored])
+                centred = measured[scored] - compute_mean(measured[scored])
                 total += float(np.sum(np.square(weight[scored] * centred)))
         return sqrt(total / max(self.n_scored, 1))
 
@@ -337,22 +371,30 @@ class Problem:
 
     def _list_channels(self, values: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         pairs = zip(
-            self.split_by_output(values), self.split_by_output(self.evaluator.weight), strict=True
+            self.split_by_output(values), self.split_by_output(self.plain_weight), strict=True
         )
         return [(value[name], weight[name]) for value, weight in pairs for name in value]
 
 
+def _divide_weights(
+    weights: Mapping[str, float], settings: FitSettings, experiment: int
+) -> dict[str, float]:
+    """Divide the weight of each output by its relative deviation in an experiment."""
+    deviations = (1.0,) * len(weights)
+    if settings.deviations is not None:
+        deviations = settings.deviations[experiment]
+    pairs = zip(weights.items(), deviations, strict=True)
+    return {name: weight / deviation for (name, weight), deviation in pairs}
+
+
 def compute_metrics(problem: Problem, simulated: FloatArray) -> Metrics:
     """Compute the agreement of simulated values (M,) with the records of a problem."""
-    weight = problem.evaluator.weight
+    weight = problem.plain_weight
     error = weight * (problem.evaluator.measured - simulated)
-    has_one_output = len(problem.model.outputs) == 1
     with np.errstate(all="ignore"):  # a diverged simulation has an infinite residual
         channels = tuple(_compute_channel_metrics(problem, simulated))
-        scored = weight > 0
-        total = rms((error / np.where(scored, weight, 1.0) if has_one_output else error)[scored])
-        scale = problem.output_scale
-        fit = 100.0 * (1.0 - rms(error[scored]) / scale) if scale > 0 else float("nan")
+        total, scale = rms(error[weight > 0]), problem.output_scale
+        fit = 100.0 * (1.0 - total / scale) if scale > 0 else float("nan")
     return Metrics(total, problem.unit, fit, channels)
 
 
@@ -368,16 +410,15 @@ def compute_reference_rms(
     records : sequence of Record
         As many as in the problem, with the same channels and times.
     """
-    has_one_output, errors = len(problem.model.outputs) == 1, []
+    errors = []
     for part, outputs, record in zip(
-        problem.split_by_output(problem.evaluator.weight), simulated, records, strict=True
+        problem.split_by_output(problem.plain_weight), simulated, records, strict=True
     ):
         for (name, values), channel in zip(
             zip(part, outputs, strict=True), record.outputs, strict=True
         ):
             scored = part[name] > 0
-            weight = 1.0 if has_one_output else part[name][scored]
-            errors.append(weight * (channel.values - values)[scored])
+            errors.append((part[name] * (channel.values - values))[scored])
     return rms(np.concatenate(errors))
 
 

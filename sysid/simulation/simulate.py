@@ -104,6 +104,34 @@ def simulate(
     >>> print(f"{answer.values[-1]:.3f}")
     5.999
     """
+    model, record, values = prepare_simulation(model, inputs, values, channels, times)
+    values = complete_values(model, values)
+    fixed_parameters = tuple(
+        _fix_parameter(parameter, values[parameter.name]) for parameter in model.parameters
+    )
+    initial = tuple(
+        _fix_initial(start, state.name, values, is_measured=_has_values(record))
+        for start, state in zip(model.initial, model.states, strict=True)
+    )
+    problem = build_simulation_problem(
+        replace(model, parameters=fixed_parameters, initial=initial), record
+    )
+    simulated = problem.split_by_output(problem.predict(np.empty((1, 0)))[0])[0]
+    return Recording(tuple(replace(c, values=simulated[c.name].copy()) for c in record.outputs))
+
+
+def prepare_simulation(
+    model: ModelSource,
+    inputs: Channels | Record | Recording,
+    values: Mapping[str, float] | Identified,
+    channels: Mapping[str, str] | None,
+    times: ArrayLike | None,
+) -> tuple[Model, Record, dict[str, float]]:
+    """Prepare a simulation: the model as it was identified, a record, and checked values.
+
+    The record has the model's inputs, and outputs at the times of the simulation. Their values are
+    those measured for the starts, else missing. Parameters and errors are those of `simulate`.
+    """
     model = resolve_model(model)
     kept = getattr(getattr(values, "data", None), "channels", None)
     signals = name_inputs(model, _read_inputs(inputs), _split_names(channels), kept)
@@ -111,14 +139,6 @@ def simulate(
     if not isinstance(values, Mapping):
         model, signals, values = _restore(model, signals, values)
     _check_values(model, values)
-    values = complete_values(model, values)
-    fixed_parameters = tuple(
-        _fix_parameter(parameter, values[parameter.name]) for parameter in model.parameters
-    )
-    initial = tuple(
-        _fix_initial(start, state.name, values, is_measured=bool(measured))
-        for start, state in zip(model.initial, model.states, strict=True)
-    )
     at, start = _choose_times(signals, times)
     outputs = tuple(
         Channel(
@@ -130,11 +150,12 @@ def simulate(
         )
         for output in model.outputs
     )
-    problem = build_simulation_problem(
-        replace(model, parameters=fixed_parameters, initial=initial), Record(signals, outputs)
-    )
-    simulated = problem.split_by_output(problem.predict(np.empty((1, 0)))[0])[0]
-    return Recording(tuple(replace(c, values=simulated[c.name].copy()) for c in outputs))
+    return model, Record(signals, outputs), dict(values)
+
+
+def _has_values(record: Record) -> bool:
+    """Whether any output has measured values."""
+    return any(np.isfinite(channel.values).any() for channel in record.outputs)
 
 
 def _read_inputs(inputs: Channels | Record | Recording) -> tuple[Channel, ...]:

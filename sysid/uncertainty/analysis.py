@@ -26,8 +26,8 @@ not identify follow from the singular values of S. Both give groups
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
+from sysid.core.distributions import student_quantile
 from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
@@ -41,7 +41,7 @@ from sysid.identifiability.combinations import (
 from sysid.identifiability.exchange import ExchangeGroups
 from sysid.identifiability.scaling import find_scalings
 from sysid.identifiability.translations import find_translations
-from sysid.residuals.coloured import ColouredCovariance
+from sysid.residuals.coloured import ColouredCovariance, iterate_parts
 from sysid.residuals.correlated_outputs import estimate_joint_covariance
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_influence, compute_loss_weight
@@ -138,7 +138,7 @@ def _analyse_without_sensitivities(
         errors = weight * (problem.predict(theta[None])[0] - problem.evaluator.measured)
         error = errors[weight > 0]
     criteria = compute_criteria(
-        error if whitening is None else whitening.whiten(error), theta.size, whitening
+        problem, error if whitening is None else whitening.whiten(error), whitening
     )
     reason = "the budget of simulations left too few for standard errors"
     return Analysis(
@@ -159,7 +159,7 @@ def _analyse_sensitivities(
 ) -> Analysis:
     error, columns, plateau, one_sided, plateau_offset, count = sensitivities
     n, d = columns.shape
-    criteria = compute_criteria(error, d, whitening)
+    criteria = compute_criteria(problem, error, whitening)
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
         return Analysis(
@@ -219,7 +219,7 @@ def _analyse_sensitivities(
         theta,
         statuses,
         physical,
-        stdtrit(degrees, 0.975),
+        student_quantile(degrees, 0.975),
         directions.is_null_member,
         uncertainty.groups,
         rows[~retained],
@@ -266,20 +266,27 @@ def _find_active_bounds(
 
 
 def compute_criteria(
-    error: FloatArray, parameters: int, whitening: Whitening | None = None
+    problem: Problem, error: FloatArray, whitening: Whitening | None = None
 ) -> Criteria:
     """Compute information criteria from the weighted residuals (n,); formulas in `Criteria`.
 
-    With whitened residuals the likelihood is still that of the outputs. So criteria with and
-    without a noise model can be compared. Correlation times count as parameters.
+    With whitened or reweighted residuals the likelihood is still that of the outputs. So criteria
+    with and without a noise model can be compared. Correlation times and variances count as
+    parameters.
     """
-    n, counted = (
-        error.size,
-        parameters + 1 + (0 if whitening is None else whitening.n_correlation_times),
-    )
+    n, parameters = error.size, len(problem.free_parameters)
+    counted = parameters + 1
+    if whitening is not None:
+        counted += whitening.n_correlation_times
+    if problem.settings.deviations is not None and problem.settings.weights is None:
+        counted += len(list(iterate_parts(problem))) - 1
     mean = float(error @ error) / n
     twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
     twice -= 0.0 if whitening is None else whitening.log_determinant
+    if problem.settings.deviations is not None:
+        rows = problem.scored_rows
+        ratio = problem.evaluator.weight[rows] / problem.plain_weight[rows]
+        twice += 2.0 * float(np.sum(np.log(ratio)))
     aic = 2.0 * counted - twice
     left = n - counted - 1
     aicc = aic + 2.0 * counted * (counted + 1) / left if left > 0 else None
@@ -419,6 +426,8 @@ def _classify_noise_colour(
 ) -> NoiseColour:
     if colour is None or colour.is_white:
         return "white" if whitening is None else "first-order"
+    if colour.is_clustered:
+        return "clustered"
     return "drifting" if colour.is_drifting else "coloured"
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import IdentifiableCombination
 
-NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
+NoiseColour = Literal["white", "first-order", "coloured", "drifting", "clustered"]
 EstimateStatus = Literal[
     "identified",
     "not settled",

@@ -87,6 +87,22 @@ def mark_poor_intervals(
     return tuple(marked)
 
 
+def keep_in_bounds(estimates: Sequence[Estimate]) -> tuple[Estimate, ...]:
+    """Cut the intervals of free parameters at their bounds."""
+    return tuple(
+        replace(
+            one,
+            interval95=(
+                min(max(one.interval95[0], one.lower), one.upper),
+                max(min(one.interval95[1], one.upper), one.lower),
+            ),
+        )
+        if one.is_free and one.interval95 is not None
+        else one
+        for one in estimates
+    )
+
+
 def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:
     """Explain how an interval says too little; empty if it says enough."""
     lower, upper = parameter.lower, parameter.upper

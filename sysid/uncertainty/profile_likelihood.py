@@ -33,6 +33,7 @@ from sysid.simulation.loss import compute_influence
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.sensitivities import compute_sensitivities
+from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _SPAN_FACTOR = 1.5  # of the half width by the covariance: position of the outermost value
 _STEP_GROWTH = 1.3  # growth of a step that does not reach the threshold
@@ -117,6 +118,15 @@ def compute_profile(
     if points < _MIN_POINTS:
         raise InvalidSettings("/points", f"found {points}; need {_MIN_POINTS} or more")
     best = _refine_estimate(problem, np.array(theta, dtype=np.float64))
+    reweighted = fit_unequal_noise(problem, best.theta)
+    if reweighted is not None:
+        problem = reweighted.problem
+        best = replace(
+            best,
+            theta=reweighted.theta,
+            rms=reweighted.rms,
+            evaluations=best.evaluations + reweighted.evaluations,
+        )
     groups, spent = find_exchanges(problem, best.theta)
     start = order_exchangeable(problem, best.theta, groups)
     search = _ProfileSearch(problem, start, names.index(name), groups, should_stop)

@@ -60,6 +60,7 @@ CASES = {
     "emps": Case({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
     "exponential": Case({"L": 0.8}, 0.02),
     "fopdt": Case({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
+    "foipdt": Case({"K": 0.8, "T": 0.5, "L": 0.2337, "w(0)": 0.4, "y(0)": 0.3}),
     "ipdt": Case({"K": 0.8, "L": 0.2337, "y(0)": 0.3}),
     "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
     "narx": Case({**NARX, "y(0)": 0.3}),
@@ -97,6 +98,10 @@ CASES = {
         0.1,
     ),
     "sopdt": Case({"K": 2, "T1": 0.8, "r": 0.4, "L": 0.4337, "y0": 0.3, "x(0)": 0.3, "w(0)": 0}),
+    "topdt": Case(
+        {"K": 2, "T1": 0.8, "r2": 0.4, "r3": 0.9, "L": 0.4337, "y0": 0.3}
+        | {"x(0)": 0.3, "w(0)": 0, "v(0)": 0.1}
+    ),
     "tube": Case({"K": 1, "T": 0.3, "L": 0.2137, "y(0)": 0.3}),
     "tube-second-order": Case({"K": 1, "w": 5, "z": 0.5, "L": 0.4337, "y(0)": 0.3}),
 }
@@ -176,6 +181,83 @@ parameters: {K: {lower: 0, upper: 5}, T: {lower: 0, upper: 5}, L: {lower: 0, upp
 equations: {w: (K*(u(t - L) - 0.3*q) - w)/T, x: 2*w(t - L) - 3*x + K}
 outputs: {y: x}
 """
+# Every function that the catalogue does not use.
+FUNCTIONS = """
+name: functions
+form: differential
+inputs: {u: "1"}
+states: {x: "1", w: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+equations:
+  x: (K*erf(u(t - L)) - 2*x + clip(x, -0.4, 0.2) + atan2(w, x + 2) - mod(w, -0.3))/T
+  w: 0.1*floor(9*x) - 3*sinh(w) + 0.1*cosh(x) + log10(1 + x**2) - mod(t, 0.371)
+outputs: {y: "x + mod(w, T) + erf(x)", z: "clip(w, x, 0.3)"}
+initial: {x: 0.2, w: erf(K)}
+"""
+_FUNCTIONS = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
+# Intermediate names everywhere, also of other names and of the past.
+NAMES = """
+name: names
+form: differential
+inputs: {u: "1"}
+states: {x: "1", w: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+let: {drive: rate + u(t - late), rate: "K*exp(-abs(x)/T)", late: L/2 + 0.02}
+equations: {x: "drive - rate(t - late) - x", w: "rate - w(t - late)"}
+outputs: {y: drive - w, z: rate(t - L)}
+initial: {x: late, w: 0.1}
+"""
+RECURSION_OF_NAMES = """
+name: recursion_of_names
+form: difference
+inputs: {u: "1"}
+states: {x: "1", w: "1"}
+parameters: {L: {lower: 0, upper: 1, unit: s}, d: {lower: 0, upper: 3}}
+let: {late: L/h + d, mix: 0.3*x(k-1) + u(k - d) + 0.01*t}
+equations: {x: 0.4*mix + 0.1*mix(k - 1 - late), w: 0.5*w(k-1 - late) + tanh(mix)}
+outputs: {y: x + mix(k-1), z: w}
+initial: {x: 0.2, w: 0.1}
+"""
+# Tables of states, of inputs and of past values, with parameters among the points.
+TABLES = """
+name: tables
+form: differential
+inputs: {u: "1"}
+states: {x: "1", w: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+constants: {last: 1.5}
+equations:
+  x: >-
+    (K*table(u(t - L), [-0.6, 0.1, last], [-1, 0.2, 2*T])
+    - pchip(x, [-1, 0, 0.4, last], [-2, 0, 0.1, K]))/T
+  w: >-
+    pchip(t, [2, 3, 5, 6], [0, 1, 1, K]) - pchip(w, [-0.1, 4], [-K, 3])
+    - table(x(t - L), [0, 1], [0, 2])
+outputs: {y: x, z: "w + pchip(x - w, [-1, 0, 1], [T, 0.1, 3])"}
+initial: {x: "pchip(K, [0, 1, 2], [0, 0.1, 0.2])", w: 0.1}
+"""
+# Transport with a variable flow, behind a name, and in an output.
+FLOW = """
+name: transport_by_flow
+form: differential
+inputs: {u: "1", q: "1"}
+states: {x: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+let: {transport: "0.4*L/max(q, 0.2) + 0.01*exp(-q)"}
+equations: {x: (K*u(t - transport) + 0.1*u - x)/T}
+outputs: {y: x, z: "u(t - transport - L)"}
+initial: {x: 0.2}
+"""
+RECURSION_OF_FLOW = """
+name: recursion_of_flow
+form: difference
+inputs: {u: "1", q: "1"}
+states: {x: "1"}
+parameters: {L: {lower: 0, upper: 1, unit: s}, d: {lower: 0, upper: 3}}
+equations: {x: 0.9*x(k-1) + 0.1*u(k - 1 - d/(1.2 + q)) + 0.1*u(k - L*abs(q)/h)}
+outputs: {y: x}
+initial: {x: 0.2}
+"""
 _RESTING = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
 WRITTEN: dict[str, tuple[Model, Case]] = {
     "rk4": (written(TWO), _TWO),
@@ -186,6 +268,15 @@ WRITTEN: dict[str, tuple[Model, Case]] = {
     "euler_cubic": (written(TWO, method="euler", interpolation="cubic"), _TWO),
     "semi_implicit": (written(TWO, method="semi-implicit", history="zero", step=0.03), _TWO),
     "steady": (starting(RESTING, "steady"), _RESTING),
+    "names": (written(NAMES), _FUNCTIONS),
+    "recursion_of_names": (written(RECURSION_OF_NAMES), _RECURSION),
+    "tables": (written(TABLES), _FUNCTIONS),
+    "flow": (written(FLOW), _FUNCTIONS),
+    "flow_substeps": (written(FLOW, substeps=3), _FUNCTIONS),
+    "flow_own_step": (written(FLOW, step=0.017), _FUNCTIONS),
+    "flow_euler_nearest": (written(FLOW, method="euler", interpolation="nearest"), _FUNCTIONS),
+    "recursion_of_flow": (written(RECURSION_OF_FLOW), _RECURSION),
+    "functions": (written(FUNCTIONS), _FUNCTIONS),
     "steady_substeps": (starting(RESTING, "steady", substeps=2), _RESTING),
     "steady_own_step": (starting(RESTING, "steady", step=0.017), _RESTING),
     "steady_off_samples": (starting(RESTING, "steady", step=0.0171), _RESTING),

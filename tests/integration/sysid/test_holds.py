@@ -1,5 +1,7 @@
 """How an input is held between its samples: said by the user, or chosen by its values."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 
@@ -28,9 +30,10 @@ def step_test(noise: float = 0.0) -> Recording:
     )
 
 
-def fitted(recording: Recording) -> Identification:
+def fitted(recording: Recording, hold: Mapping[str, Hold] | None = None) -> Identification:
     record = recording.to_record({"u": "u"}, {"y": "y"})
-    return identify(load_model("fopdt"), record, GeneticAlgorithm(generations=100))
+    search = GeneticAlgorithm(generations=100)
+    return identify(load_model("fopdt"), record, search, hold=hold, compare_orders=False)
 
 
 def lag(found: Identification) -> float:
@@ -56,10 +59,13 @@ def test_the_estimate_of_the_other_reading_is_told() -> None:
     assert hold.estimates_other is not None
     assert hold.estimates_other["L"] == pytest.approx(lag(lines), abs=1e-4)
     assert hold.rms_other == pytest.approx(lines.rms, rel=1e-3)
-    told = [one for one in found.warnings if "(hold: {u: first})" in one]
+    told = [one for one in found.warnings if "(hold={'u': 'first'})" in one]
     assert len(told) == 1
     assert f"L = {lag(lines):.4g} s instead of {lag(found):.4g}" in told[0]
     assert found.evaluations > lines.evaluations
+    same = fitted(recording, {"u": "first"})
+    assert same.parameter_values == lines.parameter_values
+    assert same.input_holds == lines.input_holds
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
@@ -92,7 +98,7 @@ def moving_test() -> Recording:
 def test_a_reading_that_fits_worse_than_the_other_is_told() -> None:
     found = fitted(moving_test())
     assert found.input_holds[0].chosen == "first"
-    assert any("(hold: {u: zero})" in one and "fits better" in one for one in found.warnings)
+    assert any("(hold={'u': 'zero'})" in one and "fits better" in one for one in found.warnings)
 
 
 def test_jumps_between_irregular_samples_are_uncertain() -> None:

@@ -133,7 +133,8 @@ def test_bounds_and_fixed_values_have_a_short_form(found: Identification) -> Non
 
 def test_a_result_is_a_few_lines(found: Identification) -> None:
     text = repr(found)
-    head, *rows = text.splitlines()
+    head, verdict, *rows = text.splitlines()
+    assert verdict == f"verdict: {found.verdict.text}"
     assert head.startswith(f"Identification of 'fopdt', fit {found.fit_percent:.2f} %, RMS 0.1")
     assert "°C, validation fit" in head
     assert rows[0].split()[:3] == ["K", *summarise_estimate(found, "K")]
@@ -194,6 +195,8 @@ def test_a_result_is_saved_and_read_bit_for_bit(
     result.save(path)
     again = Identification.load(path)
     assert same(again, result)
+    assert again == result
+    assert hash(again) == hash(result)
     assert repr(again) == repr(result)
     assert json.loads(path.read_text())["format"] == FORMAT
     assert same(pickle.loads(pickle.dumps(result)), result)
@@ -205,6 +208,8 @@ def test_numbers_that_json_lacks_are_saved(found: Identification, tmp_path: Path
     path = tmp_path / "odd.json"
     odd.save(path)
     assert same(Identification.load(path), odd)
+    assert Identification.load(path) == odd != found
+    assert found != "found"
 
 
 DAMAGES = [
@@ -449,6 +454,13 @@ ARGUMENTS = [
     ({"records": T}, "type ndarray of shape .240,..*with named columns"),
     ({"records": Channel("u", T, T)}, "Join channels in a record: Record"),
     ({"records": []}, "there is no record"),
+    ({"records": Path("a.csv")}, "found the path 'a.csv'.*Read a file first, with read_recording"),
+    ({"records": [pd.Series(T, T), pd.Series(T, T)]}, "one signal; model 'fopdt' has 2. Join"),
+    ({"records": pd.DataFrame({"t": [], "u": [], "y": []})}, "the table has no rows"),
+    ({"records": {"t": T[::-1], "u": T, "y": T}}, "decrease: sample 1 is at .*Sort the samples"),
+    ({"hold": {"uu": "zero"}}, "/hold/uu: model 'fopdt' has no input 'uu'; did you mean 'u'?"),
+    ({"hold": {"u": "zoh"}}, "/hold/u: found 'zoh'; need one of auto, zero, first, band-limited"),
+    ({"hold": "zero"}, "/hold: found 'zero'; need a mapping of inputs to holds"),
     ({"settings": "fast"}, "/settings: found 'fast'; need GeneticAlgorithm"),
     ({"settings": pd.Series(T)}, r"/settings: found an object of type Series of shape \(240,\)"),
     ({"settings": np.zeros(2)}, r"ndarray of shape \(2,\).*join them: Record\(inputs, outputs\)"),

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import plotly.graph_objects as go
 import pytest
 
-from sysid import Channel, Identification, simulate
+from sysid import Identification
 from sysid.control.linear_form import IdentifiedModel
 from tests.repository import ROOT
 
@@ -24,14 +23,12 @@ TRUTH = {"K": 0.8, "T": 40.0, "L": 12.0, "y0": 20.0, "x(0)": 0.0}
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the file of the page: an oven behind its heater."""
-    t = np.arange(1200.0)
-    heater = np.where((t // 100) % 2 == 0, 0.0, 20.0)
-    oven = simulate("fopdt", Channel("u", t, heater), TRUTH).channel("y").values
-    oven = oven + np.random.default_rng(4).normal(0.0, 0.15, t.size)
-    table = pd.DataFrame({"t": t, "heater [%]": heater, "oven [°C]": oven.round(3)})
-    table.to_csv(tmp_path / "heating.csv", index=False)
+    """A folder with the file of the page, an oven behind its heater, made as the page says."""
     monkeypatch.chdir(tmp_path)
+    [lines] = [snippet for snippet in SNIPPETS if "to_csv" in snippet]
+    names: dict[str, Any] = {}
+    run_cell(lines, names)
+    assert names["truth"] == TRUTH
     return tmp_path
 
 

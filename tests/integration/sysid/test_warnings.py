@@ -148,7 +148,7 @@ def test_an_estimate_that_the_integration_step_has_made_is_replaced_and_told(
 @pytest.mark.parametrize("level", [0.0, 3.0])
 def test_a_constant_output_is_told(level: float) -> None:
     found = identify(parse_model(FIRST), record(steps(), np.full(N, level)), QUICK)
-    assert told(found, f"output 'y' is constant ({level:g}): it contains no dynamics")
+    assert told(found, f"output 'y' is constant ({level:g}) at all {N} samples: it contains no")
     moving = np.where(np.arange(N) == 7, level + 0.1, level)
     assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")
 

@@ -4,7 +4,8 @@ import math
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, timedelta
+from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ import xarray as xr
 
 from sysid.core.errors import InvalidRecord
 from sysid.data.records import Channel, History, Record, Recording
+from sysid.data.table_rules import ReadingNote
 
 TIMES = np.array([0.0, 0.5, 1.0, 1.75])
 VALUES = np.array([1.0, 3.0, 2.0, 5.0])
@@ -159,7 +161,8 @@ def test_a_table_is_a_recording(table: object) -> None:
 
 def test_a_table_of_polars_is_a_recording() -> None:
     table = polars.DataFrame({"when": DATES, "P1 [bar]": [1.0, None, 3.0, 4.0]})
-    recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
+    with pytest.warns(ReadingNote, match="1 of 4 values are missing"):
+        recording = Recording(table.with_columns(polars.col("when").dt.replace_time_zone("CET")))
     [channel] = recording.channels
     assert (channel.name, channel.unit) == ("P1", "bar")
     assert np.array_equal(channel.times, TIMES)
@@ -266,10 +269,45 @@ def test_texts_of_channels_and_records_are_short() -> None:
     assert repr(Recording(())) == "Recording of 0 channels"
 
 
+@pytest.mark.parametrize("start", [None, datetime(2026, 1, 31, 12, tzinfo=UTC)])
+def test_a_recording_is_a_table_that_reads_back(start: datetime | None) -> None:
+    u = Channel("u", TIMES, VALUES, unit="bar", started_at=start)
+    y = Channel("y", TIMES[1:], VALUES[1:], started_at=start)
+    table = Recording((y, u)).to_pandas()
+    assert list(table.columns) == ["y", "u [bar]"]
+    assert table.index.name == ("t" if start is None else "time")
+    with pytest.warns(ReadingNote, match="1 of 4 values are missing"):
+        again = Recording(table)
+    assert again.started_at == start
+    assert again["u"].unit == "bar"
+    assert np.array_equal(again["u"].times, TIMES)
+    assert np.array_equal(again["y"].values, [np.nan, *VALUES[1:]], equal_nan=True)
+    assert np.array_equal(Record(u, u).to_pandas().to_numpy(), np.column_stack([VALUES, VALUES]))
+
+
+def test_channels_are_found_by_name() -> None:
+    u, y = Channel("P1", TIMES, VALUES), Channel("P2", TIMES, VALUES)
+    for recording in (Recording((u, y)), Record(u, y)):
+        assert recording["P2"] is y
+        assert (len(recording), list(recording), "P1" in recording) == (2, ["P1", "P2"], True)
+        with pytest.raises(InvalidRecord, match="no channel 'speed'; known are P1, P2"):
+            recording["speed"]
+
+
+def test_times_that_repeat_have_no_common_table() -> None:
+    pooled = Channel("a", [0.0, 0.0, 1.0], [1.0, 2.0, 3.0])
+    assert Recording((pooled,)).to_pandas().shape == (3, 1)
+    with pytest.raises(InvalidRecord, match="times repeat"):
+        Recording((pooled, Channel("b", TIMES, VALUES))).to_pandas()
+
+
 @pytest.mark.parametrize(
     ("build", "told"),
     [
-        (lambda: Channel("u", TIMES, ["a", "b", "c", "d"]), "channel 'u' has text; need numbers"),
+        (
+            lambda: Channel("u", TIMES, ["a", "b", "c", "d"]),
+            "channel 'u' has text: 'a' at sample 1; need numbers",
+        ),
         (lambda: Channel("u", TIMES, DATES), "channel 'u' has dates; need numbers"),
         (lambda: Channel("u", TIMES, VALUES + 1j), "has complex numbers"),
         (lambda: Channel("u", TIMES, VALUES[None, :]), r"values of shape \(1, 4\)"),
@@ -277,7 +315,7 @@ def test_texts_of_channels_and_records_are_short() -> None:
         (lambda: Channel("u", VALUES), "channel 'u' has no values"),
         (
             lambda: Channel("u", None, VALUES),
-            "the times of channel 'u' decrease or are not finite|cannot be read|shape",
+            "the times of channel 'u' are not finite|cannot be read|shape",
         ),
         (lambda: Channel("u", ["2026-01-01"] * 4, VALUES), "are text such as '2026-01-01'"),
         (lambda: Channel("u", [*DATES[:3], pd.NaT], VALUES), "have NaT among dates"),
@@ -305,3 +343,30 @@ def test_what_cannot_be_read_is_told_in_one_line(build, told: str) -> None:
     with pytest.raises(InvalidRecord, match=told) as caught:
         build()
     assert "\n" not in str(caught.value)
+
+
+def _table(**columns: list[Any]) -> dict[str, list[Any]]:
+    return {"t": [0.0, 1.0, 2.0, 3.0], "u": [0.0, 1.0, 1.0, 0.0], **columns}
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        (_table(u=[0.0, np.inf, 1.0, 0.0]), "channel 'u' is infinite at t = 1 s"),
+        (_table(t=[0.0, 1.0, 1.0, 2.0]), "samples 2 and 3 are both at 1 s"),
+        (_table(u=[0.0, 1.0, "abc", 0.0]), "has text: 'abc' at sample 3"),
+    ],
+)
+def test_what_is_refused_in_a_file_is_refused_in_a_table(
+    table: dict[str, list[Any]], reason: str
+) -> None:
+    with pytest.raises(InvalidRecord, match=reason):
+        Recording(table)
+
+
+def test_missing_values_of_a_table_are_told_as_those_of_a_file() -> None:
+    with pytest.warns(
+        ReadingNote, match=r"'u': 2 of 4 values are missing .*, the first at t = 1 s"
+    ):
+        recording = Recording(_table(u=[0.0, np.nan, None, 0.0]))
+    assert np.isnan(recording.channels[0].values).sum() == 2

@@ -159,7 +159,7 @@ def test_lags_a_period_apart_are_listed_though_few_samples_are_skipped() -> None
 
 def test_a_lag_that_the_assumed_input_has_moved_is_told_with_its_value_without() -> None:
     draw = periodic_input(np.random.default_rng(62_001))
-    found = identify(draw.model, draw.record, seed=1)
+    found = identify(draw.model, draw.record, seed=1, loss=Loss(noise_model="white"))
     (own,) = (one for one in found.estimates if one.name == "L")
     assert own.interval95 is not None
     assert not own.interval95[0] <= draw.truth <= own.interval95[1]

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 
 from sysid import Identification, identify, load_model
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.data.records import Record
 from sysid.identification.run import advance_run, begin_run, exchange_migrants, find_next_border
 from tests.runs import step_record
@@ -31,7 +31,16 @@ def records() -> tuple[Record, Record]:
 
 
 def found(record: Record, warm: dict[str, float] | None = None, seed: int = 1) -> Identification:
-    return identify(load_model("fopdt"), record, seed=seed, parameters=BOUNDS, warm=warm)
+    """Identify without other orders and noise models: the simulations are counted."""
+    return identify(
+        load_model("fopdt"),
+        record,
+        seed=seed,
+        parameters=BOUNDS,
+        warm=warm,
+        loss=Loss(noise_model="white"),
+        compare_orders=False,
+    )
 
 
 def values(one: Identification) -> dict[str, float]:

@@ -132,7 +132,7 @@ def test_a_regulated_record_without_reference_is_warned_of() -> None:
 
     note = told()
     assert note.startswith("input 'u' follows the residuals of y: they explain")
-    assert "use loss: {noise_model: ar1}" in note
+    assert "use loss=Loss(noise_model='ar1')" in note
     assert "noise_model" not in told(loss=Loss(noise_model="ar1"))
     assert describe_feedback([]) == []
 

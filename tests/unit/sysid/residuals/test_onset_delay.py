@@ -240,3 +240,13 @@ def test_missing_samples_hide_no_rest_and_no_rest_is_found_without_samples() -> 
     )
     short = Channel("y", output.times[:5], output.values[:5])
     assert find_unprompted_output(Record(record.inputs, (short,))) is None
+
+
+def test_one_outlier_is_no_output_that_moves_before_its_input() -> None:
+    times = 0.1 * np.arange(200)
+    u, y = np.where(times > 8, 1.0, 0.0), np.where(times > 9, 1.0, 0.0)
+    y[30] = 0.8
+    record = Record((Channel("u", times, u),), (Channel("y", times, y),))
+    assert find_unprompted_output(record) is None
+    early = Record((Channel("u", times, u),), (Channel("y", times, np.where(times > 5, 1.0, 0)),))
+    assert find_unprompted_output(early) is not None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, SequenceSearch
+from sysid.core.types import FloatArray, WordArray
 from sysid.islands.archipelago import create_islands, make_plans
 from sysid.search.evolution import (
     breed_improved_children,
@@ -13,16 +14,24 @@ from sysid.search.evolution import (
     evaluate_new_individuals,
     redraw_population,
     reset_evidence,
+    run_generations,
     select_fittest,
 )
-from sysid.search.island import Island
+from sysid.search.island import Island, evolve
+from sysid.search.known_fitness import make_known_fitness, recall_fitness, remember_fitness
 from sysid.search.operators import decode
 from sysid.search.sequence_search import run_fixed_sequence
-from sysid.search.state import IslandPlan
+from sysid.search.state import COLUMN_VALUES, IslandPlan
 from sysid.simulation.scaling import from_unit
 from tests.searching import example, with_search
 
 PROBLEM = example(n=80)
+
+
+def evaluate(plan: IslandPlan, words: WordArray, fitness: FloatArray) -> int:
+    """Evaluate new individuals without a memory."""
+    known = make_known_fitness(0, words.shape[1])
+    return evaluate_new_individuals(PROBLEM.evaluator, plan, known, words, fitness)
 
 
 def begin(method: str = "simple", size: int = 20) -> tuple[Island, IslandPlan]:
@@ -30,8 +39,7 @@ def begin(method: str = "simple", size: int = 20) -> tuple[Island, IslandPlan]:
     algorithm = GeneticAlgorithm(method=method, population=size, islands=1)  # type: ignore[arg-type]
     (plan,) = make_plans(PROBLEM, algorithm, 5)
     (island,) = create_islands(PROBLEM, algorithm, 5)
-    spent = evaluate_new_individuals(PROBLEM.evaluator, plan, island.chromosomes, island.fitness)
-    assert spent == size
+    assert evaluate(plan, island.chromosomes, island.fitness) == size
     return with_search(island, generation=7), plan
 
 
@@ -39,10 +47,46 @@ def test_new_individuals_are_evaluated_and_all_are_ranked() -> None:
     island, plan = begin()
     words, fitness = island.chromosomes[::-1].copy(), island.fitness[::-1].copy()
     fitness[[3, 11]] = np.nan
-    assert evaluate_new_individuals(PROBLEM.evaluator, plan, words, fitness) == 2
+    assert evaluate(plan, words, fitness) == 2
     assert np.array_equal(fitness, island.fitness)
     assert np.array_equal(words, island.chromosomes)
-    assert evaluate_new_individuals(PROBLEM.evaluator, plan, words, fitness) == 0
+    assert evaluate(plan, words, fitness) == 0
+
+
+def test_known_individuals_count_and_are_not_simulated_again() -> None:
+    island, plan = begin()
+    known = make_known_fitness(1, 4)
+    words, fitness = island.chromosomes.copy(), np.full(20, np.nan)
+    assert evaluate_new_individuals(PROBLEM.evaluator, plan, known, words, fitness) == 20
+    assert np.array_equal(fitness, island.fitness)
+    known.fitness[:] += 1.0  # what no simulation gives
+    others = np.concatenate([words[:5], words[:3] ^ np.uint32(1)])
+    found = np.full(8, np.nan)
+    assert evaluate_new_individuals(PROBLEM.evaluator, plan, known, others, found) == 8
+    assert np.isin(fitness[:5] + 1.0, found).all()
+    assert np.count_nonzero(found < fitness[:5].max() + 0.5) == 3
+
+
+def test_a_chromosome_in_the_place_of_another_is_not_taken_for_it() -> None:
+    known = make_known_fitness(1, 2)
+    words = np.random.default_rng(1).integers(0, 2**24, (4000, 2), np.uint32)
+    remember_fitness(known, words, np.arange(4000.0))
+    recalled = np.full(4000, np.nan)
+    recall_fitness(known, words, recalled)
+    is_kept = np.isfinite(recalled)
+    assert np.array_equal(recalled[is_kept], np.flatnonzero(is_kept))
+    assert 900 < np.count_nonzero(is_kept) <= 1024
+
+
+def test_an_island_evolves_the_same_with_a_memory() -> None:
+    island, plan = begin()
+    evolved, plain = evolve(PROBLEM.evaluator, plan, island, 60), begin()[0]
+    rows = np.empty((61, COLUMN_VALUES + 4))
+    arrays = plain.arrays
+    run_generations(PROBLEM.evaluator, plan, 60, arrays, rows)
+    assert np.array_equal(evolved.chromosomes, arrays.chromosomes)
+    assert np.array_equal(evolved.fitness, arrays.fitness)
+    assert evolved.evaluations == plain.evaluations == 60 * 10
 
 
 def test_survivors_of_the_simple_method_stay_and_their_children_replace_the_others() -> None:

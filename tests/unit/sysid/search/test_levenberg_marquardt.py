@@ -5,6 +5,7 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.search.levenberg_marquardt import (
+    compute_inner_product,
     factor_damped,
     form_normal_equations,
     step_aside,
@@ -29,6 +30,28 @@ def test_normal_equations_are_those_of_weighted_residuals(scale: float, n: int) 
     matrix, gradient = form_normal_equations(error, columns, scale)
     np.testing.assert_allclose(gradient, columns @ (weight * error), rtol=1e-12)
     np.testing.assert_allclose(matrix, np.tril((columns * weight) @ columns.T), rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [0, 3, 4, 43])
+def test_an_inner_product_has_the_bits_of_four_running_sums(n: int) -> None:
+    first, (second, *_) = draw(n=n + 5)
+    sums = [0.0] * 4
+    for m in range(n // 4 * 4):
+        sums[m % 4] += first[m] * second[m]
+    for m in range(n // 4 * 4, n):
+        sums[0] += first[m] * second[m]
+    expected = (sums[0] + sums[1]) + (sums[2] + sums[3])
+    assert compute_inner_product(first, second, n) == expected
+
+
+def test_slopes_beyond_the_residuals_do_not_count() -> None:
+    error, columns = draw()
+    for whole, cut in zip(
+        form_normal_equations(error[:20].copy(), columns, 0.5),
+        form_normal_equations(error[:20].copy(), columns[:, :20].copy(), 0.5),
+        strict=True,
+    ):
+        assert np.array_equal(whole, cut)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.01, 10.0])

@@ -19,7 +19,7 @@ from sysid.simulation.problem import Problem
 PERIOD, N = 0.5, 200
 TIMES = PERIOD * np.arange(N)
 U = np.repeat(np.random.default_rng(1).uniform(40, 60, 10), 20)
-GENERIC = ("fopdt", "ipdt", "sopdt")
+GENERIC = ("foipdt", "fopdt", "ipdt", "sopdt", "topdt")
 
 
 def make_record(gain: float = 3.0, offset: float = 100.0, u: FloatArray = U) -> Record:

@@ -226,6 +226,12 @@ def test_a_record_shorter_than_the_largest_lag_is_refused() -> None:
     with pytest.raises(RecordTooShort, match=r"\(L is 0\.3.*, or a smaller L: below 0\.25"):
         Problem.build(lag_element(), [record(6)], parameters={"L": {"fixed": 0.3}})
     far = difference({"x": "0.5*x(k-12)"}, "x")
+    bounds = {"F": {"lower": 0.5, "upper": 4}, "b": {"lower": 0.1, "upper": 1}}
+    flow = differential({"x": "(u(t - 1/F) - x)/b"}, "x", parameters=bounds)
+    with pytest.raises(RecordTooShort, match=r"lower bound of F is 0\.5\).*bound of F: above 4"):
+        Problem.build(flow, [record(6)], parameters={"F": {"upper": 8}})
+    with pytest.raises(RecordTooShort, match=r"\(F is 2\).*, or a larger F: above 4"):
+        Problem.build(flow, [record(6)], parameters={"F": {"fixed": 2}})
     with pytest.raises(RecordTooShort, match="the model's memory"):
         Problem.build(far, [record(10)])
 

@@ -1,0 +1,35 @@
+"""What is wrong with the values of a channel, or missing: the same words for files and tables."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sysid.data.records import Channel
+
+
+def find_infinite_value(channels: "Iterable[Channel]") -> str | None:
+    """Describe the first infinite value of channels; None if there is none."""
+    for channel in channels:
+        infinite = np.flatnonzero(np.isinf(channel.values))
+        if infinite.size:
+            return (
+                f"channel {channel.name!r} is infinite at t = {channel.times[infinite[0]]:g} s; "
+                "values must be finite (NaN is a missing value)"
+            )
+    return None
+
+
+def describe_missing_values(channels: "Iterable[Channel]") -> list[str]:
+    """Describe the missing values of each channel that has some."""
+    notes = []
+    for channel in channels:
+        missing = np.flatnonzero(np.isnan(channel.values))
+        if missing.size:
+            notes.append(
+                f"channel {channel.name!r}: {missing.size} of {channel.values.size} values are "
+                f"missing (NaN), the first at t = {channel.times[missing[0]]:g} s. An output is "
+                "not scored at missing values. An input with missing values cannot be used."
+            )
+    return notes

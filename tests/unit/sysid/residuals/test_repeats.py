@@ -1,0 +1,126 @@
+"""Errors of samples pooled from repeats, against a linear model that leaves each repeat out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import FloatArray, IntArray
+from sysid.data.derivations import derive_recording
+from sysid.data.records import Channel, Record, Recording, Segment
+from sysid.identification.identify import identify
+from sysid.models.parse import parse_model
+from sysid.residuals.repeats import estimate_repeat_covariance
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse_estimate
+from tests.models import LINE
+from tests.profiles import draw_seeds
+from tests.rates import bound_count
+
+MODEL = parse_model(LINE)
+TRUTH = np.array([2.0, 1.0])
+EACH, PERIOD = 12, 0.1
+
+
+def draw_repeats(count: int, seed: int) -> Recording:
+    """Repeats of one ramp, each with its own phase, gain and offset."""
+    random = np.random.default_rng(seed)
+    times, y, segments, start = [], [], [], 0.0
+    for number in range(count):
+        own = random.uniform(0, PERIOD) + PERIOD * np.arange(EACH)
+        gain, offset = TRUTH + [0.3, 0.2] * random.standard_normal(2)
+        times.append(start + own)
+        y.append(gain * own + offset + 0.02 * random.standard_normal(EACH))
+        first, last = float(times[-1][0]), float(times[-1][-1])
+        segments.append(Segment(first, last, origin=float(own[0]), labels={"n": number}))
+        start += 3.0
+    t = np.concatenate(times)
+    u = np.concatenate([one - 3.0 * n for n, one in enumerate(times)])
+    return Recording((Channel("u", t, u), Channel("y", t, np.concatenate(y))), tuple(segments))
+
+
+def pool(recording: Recording) -> Record:
+    step = {"input": "u", "outputs": ["y"], "bin": 0.02}
+    return derive_recording(recording, [{"pool": step}]).to_record({"u": "u"}, {"y": "y"})
+
+
+def fit_line(problem: Problem) -> tuple[FloatArray, FloatArray, IntArray]:
+    """The regressors, the residuals, and the repeat of each sample."""
+    channel = problem.records[0].outputs[0]
+    zero, one = problem.predict(np.array([[0.1, 0.0], [1.1, 0.0]]))
+    columns = np.column_stack([one - zero, np.ones(zero.size)])
+    theta = np.linalg.lstsq(columns, channel.values, rcond=None)[0]
+    assert channel.repeats is not None
+    return columns, channel.values - columns @ theta, channel.repeats.astype(int)
+
+
+def test_the_covariance_is_that_of_the_jackknife_over_repeats() -> None:
+    problem = Problem.build(MODEL, [pool(draw_repeats(9, 1))])
+    columns, error, repeats = fit_line(problem)
+    y = problem.records[0].outputs[0].values
+    left_out = np.array(
+        [
+            np.linalg.lstsq(columns[repeats != g], y[repeats != g], rcond=None)[0]
+            for g in np.unique(repeats)
+        ]
+    )
+    move = left_out - np.linalg.lstsq(columns, y, rcond=None)[0]
+    found = estimate_repeat_covariance(problem, error, columns)
+    assert found is not None
+    inverse = np.linalg.inv(columns.T @ columns)
+    widening = found.equivalent_samples / found.degrees
+    covariance = widening * inverse @ found.middle @ inverse
+    np.testing.assert_allclose(covariance, 8 / 9 * move.T @ move, rtol=1e-8)
+
+
+def test_intervals_of_pooled_repeats_cover_the_truth() -> None:
+    held, plain = [], []
+    for seed in draw_seeds(gate=60, night=400):
+        record = pool(draw_repeats(12, seed))
+        columns, _, _ = fit_line(Problem.build(MODEL, [record]))
+        theta = np.linalg.lstsq(columns, record.outputs[0].values, rcond=None)[0]
+        without = replace(record, outputs=(replace(record.outputs[0], repeats=None),))
+        for one, counts in ((record, held), (without, plain)):
+            problem = Problem.build(MODEL, [one])
+            for estimate, true in zip(
+                analyse_estimate(problem, theta).estimates, TRUTH, strict=True
+            ):
+                assert estimate.interval95 is not None
+                counts.append(estimate.interval95[0] <= true <= estimate.interval95[1])
+    least, most = bound_count(len(held), 0.93, 0.98)
+    assert least <= sum(held) <= most
+    assert sum(plain) < 0.8 * len(plain)
+
+
+def test_too_few_repeats_and_other_samples_have_no_such_covariance() -> None:
+    few = Problem.build(MODEL, [pool(draw_repeats(3, 2))])
+    columns, error, _ = fit_line(few)
+    assert estimate_repeat_covariance(few, error, columns) is None
+    record = pool(draw_repeats(9, 2))
+    alone = replace(record, outputs=(replace(record.outputs[0], repeats=None),))
+    problem = Problem.build(MODEL, [record, alone])
+    assert estimate_repeat_covariance(problem, np.zeros(216), np.zeros((216, 2))) is None
+
+
+def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -> None:
+    found = identify(
+        LINE, pool(draw_repeats(8, 3)), parameters={"b": {"lower": 0.97, "upper": 1.5}}
+    )
+    assert found.uncertainty is not None
+    assert found.uncertainty.noise_colour == "clustered"
+    interval = found["b"].interval95
+    assert interval is not None
+    assert interval[0] >= 0.97
+    assert interval[1] <= 1.5
+
+
+def test_pooled_samples_keep_the_number_of_their_repeat_when_they_are_cut() -> None:
+    channel = pool(draw_repeats(4, 4)).outputs[0]
+    assert channel.repeats is not None
+    assert np.bincount(channel.repeats.astype(int)).tolist() == [0, *[EACH] * 4]
+    cut = channel.slice_time(0.2, 0.5)
+    rows = (channel.times >= 0.2) & (channel.times <= 0.5)
+    np.testing.assert_array_equal(cut.repeats, channel.repeats[rows])
+    with pytest.raises(InvalidRecord, match="need one number for each sample"):
+        replace(channel, times=channel.times[:3], values=channel.values[:3])
