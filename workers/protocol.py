@@ -92,6 +92,8 @@ class RunSpec:
     warm_starts: WarmStartValues = ()
     posterior: bool = False
     """Whether the posterior is sampled."""
+    compare_orders: bool = False
+    """Whether a process is compared with one order more and one less."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the fields as they are: a dataclass would look them up by name, run by run."""
@@ -101,6 +103,7 @@ class RunSpec:
             self.seed,
             self.warm_starts,
             self.posterior,
+            self.compare_orders,
         )
 
     @property
@@ -114,6 +117,7 @@ class RunSpec:
             self.seed,
             [sorted(values.items()) for values in self.warm_starts],  # JSONB sorts the names too
             self.posterior,
+            self.compare_orders,
         )
         fingerprint = compute_fingerprint(
             Path(__file__).parent

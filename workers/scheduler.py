@@ -25,6 +25,10 @@ MIN_PREFETCH_RUNS = 128
 READ_SECONDS = 0.05
 """Time that a step spends on reading runs: reused ones need no worker, and may be many."""
 
+SENT_PACKS = 32
+"""Packs that a step sends at least, if there are cores; then, if that time is over, it looks for
+results."""
+
 Key = TypeVar("Key", bound=Hashable)
 
 
@@ -92,8 +96,8 @@ class Scheduler(Generic[Key]):
             If the cluster does not respond.
         """
         self._stop_cancelled_jobs()
-        self._send_packs()
-        for handle in self._executor.wait_for_packs(timeout):
+        has_more = self._send_packs()
+        for handle in self._executor.wait_for_packs(0.0 if has_more else timeout):
             self._collect_pack(handle)
         self._send_packs()
         self._executor.check_cluster_alive()
@@ -122,14 +126,22 @@ class Scheduler(Generic[Key]):
     def _n_in_flight(self) -> int:
         return sum(len(work.in_flight) for work in self._jobs.values())
 
-    def _send_packs(self) -> None:
-        deadline = time.monotonic() + READ_SECONDS
+    def _send_packs(self) -> bool:
+        """Send packs while there are cores for them; return whether the time was too short.
+
+        To fill a thousand cores takes seconds. Meanwhile the results of the first ones come back.
+        """
+        deadline, n_sent = time.monotonic() + READ_SECONDS, 0
         while self._n_in_flight < PACKS_PER_CPU * self._executor.slots:
+            if n_sent >= SENT_PACKS and time.monotonic() > deadline:
+                return True
             chosen = self._choose_job(deadline)
             if chosen is None:
-                return
+                return False
             self._shares.record_pack(self._accounts[chosen])
             self._jobs[chosen].send_next_pack(self._count_idle_cores(chosen))
+            n_sent += 1
+        return False
 
     def _choose_job(self, deadline: float) -> Key | None:
         """Choose the job that gets the next slot, if it has work.

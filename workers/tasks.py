@@ -10,6 +10,7 @@ from functools import lru_cache
 
 from sysid.core.errors import SysidError
 from sysid.core.jit import read_clock
+from sysid.core.threads import use_one_thread
 from sysid.data.noise import Noise
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import (
@@ -142,13 +143,14 @@ def process_pack(
     records = dict(zip(keys, shared, strict=True))
     begun = read_clock()
     done: list[ItemResult] = []
-    for item in pack:
-        started = read_clock()
-        if done and started - begun > PACK_LIMIT_SECONDS:
-            done.append(ItemResult(item.run, None, 0.0))
-            continue
-        outcome = _process_item(item, records)
-        done.append(ItemResult(item.run, outcome, read_clock() - started))
+    with use_one_thread():  # once for all runs
+        for item in pack:
+            started = read_clock()
+            if done and started - begun > PACK_LIMIT_SECONDS:
+                done.append(ItemResult(item.run, None, 0.0))
+                continue
+            outcome = _process_item(item, records)
+            done.append(ItemResult(item.run, outcome, read_clock() - started))
     return tuple(done)
 
 
@@ -200,7 +202,12 @@ def _advance_item(
     noise_free = _load_noise_free_records(item.spec.problem, records)
     try:
         identification = conclude_run(
-            problem, algorithm, state, validation, posterior=item.spec.posterior
+            problem,
+            algorithm,
+            state,
+            validation,
+            posterior=item.spec.posterior,
+            orders=item.spec.compare_orders,
         )
     except SysidError as error:
         return RunFailure(str(error), type(error).__name__, state.evaluations)

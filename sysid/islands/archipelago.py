@@ -103,33 +103,29 @@ def create_islands(
     n = len(problem.free_parameters)
     if n == 0:
         raise InvalidSettings("/parameters", "every parameter is fixed. Leave at least one free")
-    islands, n_islands = [], algorithm.n_islands
-    for plan, size in zip(
-        make_plans(problem, algorithm, seed), split_population(algorithm), strict=True
-    ):
-        places = draw_initial_places(plan, size, n)
+    plans = make_shared_plans(algorithm, n, problem.loss_scale)
+    ends = np.cumsum(split_population(algorithm))
+    sizes, methods = np.diff(ends, prepend=0), np.array([plan.method for plan in plans])
+    places = draw_initial_places(seed, algorithm.population, methods, sizes, n)
+    search, points = np.zeros(len(plans), SEARCH_RECORD), np.zeros((len(plans), n))
+    search["evaluations"][0] = spent
+    islands = []
+    for i, (plan, size, end) in enumerate(zip(plans, sizes.tolist(), ends.tolist(), strict=True)):
+        own = places[end - size : end]
         improves = plan.method in (METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE)
-        island_starts = starts[plan.island % max(len(starts), 1) :: n_islands] if improves else ()
-        start_values = (*warm, *island_starts)
-        for p in range(max(1, size // _WARM_SHARE) if start_values else 0):
-            _place_warm_start(
-                problem,
-                plan,
-                start_values[p % len(start_values)],
-                p,
-                places,
-                p >= len(start_values),
-            )
-        search = np.zeros((), SEARCH_RECORD)
-        search["evaluations"] = spent if plan.island == 0 else 0
+        island_starts = starts[i % max(len(starts), 1) :: len(plans)] if improves else ()
+        values = (*warm, *island_starts)
+        for p in range(max(1, size // _WARM_SHARE) if values else 0):
+            shift_seed = seed if p >= len(values) else None
+            _place_warm_start(problem, plan.island, values[p % len(values)], p, own, shift_seed)
         islands.append(
             Island(
-                plan.island,
+                i,
                 seed,
-                encode(places, plan.bits),
+                encode(own, plan.bits),
                 np.full(size, np.nan),
-                search,
-                np.zeros(n),
+                search[i, ...],
+                points[i],
                 make_archive(n),
             )
         )
@@ -138,19 +134,21 @@ def create_islands(
 
 def _place_warm_start(
     problem: Problem,
-    plan: IslandPlan,
+    island: int,
     values: Mapping[str, float],
     p: int,
     places: FloatArray,
-    shifted: bool,
+    seed: int | None,
 ) -> None:
-    """Replace individual `p` by start values, or by a neighbour of them."""
+    """Replace individual `p` by start values, or with a seed by a neighbour of them."""
     theta = np.array(
         [[values.get(q.name, 0.5 * (q.lower + q.upper)) for q in problem.free_parameters]]
     )
     start = to_unit(problem.evaluator, theta)[0]
     for d, parameter in enumerate(problem.free_parameters):
         if parameter.name in values:
-            word = draw_words(plan.seed, USE_WARM_START, plan.island, p, d)
-            shift = _WARM_SPREAD * (2.0 * to_uniform(word[0]) - 1.0) if shifted else 0.0
+            shift = 0.0
+            if seed is not None:
+                word = draw_words(seed, USE_WARM_START, island, p, d)
+                shift = _WARM_SPREAD * (2.0 * to_uniform(word[0]) - 1.0)
             places[p, d] = min(max(start[d] + shift, 0.0), 1.0)

@@ -26,9 +26,17 @@ from sysid.islands.packed import (
 )
 from sysid.islands.stopping import StoppingRule, has_search_ended
 from sysid.kernels.borrowing import borrow
-from sysid.search.evolution import is_done, run_generations
+from sysid.search.evolution import is_done, repeats_chromosomes, run_generations
 from sysid.search.island import NO_TARGET_RMS, Island
-from sysid.search.state import COLUMN_RMS, COLUMN_VALUES, IslandArrays, IslandPlan, Migrant
+from sysid.search.known_fitness import get_island_memory, make_known_fitness
+from sysid.search.state import (
+    COLUMN_RMS,
+    COLUMN_VALUES,
+    IslandArrays,
+    IslandPlan,
+    KnownFitness,
+    Migrant,
+)
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.problem import Problem, compute_record_progress
 
@@ -251,6 +259,7 @@ def _run_epochs(
 ) -> tuple[int, int, bool]:
     """Evolve in place; return the last border, the migrations and whether it was just passed."""
     evaluator, plan, packed, log = borrow((evaluator, plan, packed, log))
+    known = _make_memories(plan.plans, packed.champions.shape[1])
     for _ in range(plan.most_borders):
         target = compute_next_border(
             generation,
@@ -258,7 +267,7 @@ def _run_epochs(
             plan.migration_interval,
             plan.stopping_rule.most_generations,
         )
-        budget = _evolve_to_border(evaluator, plan.plans, packed, target, budget, log)
+        budget = _evolve_to_border(evaluator, plan.plans, packed, known, target, budget, log)
         if budget < 0:
             return generation, epoch, False
         generation = target
@@ -273,16 +282,28 @@ def _run_epochs(
 
 
 @jit_compile
+def _make_memories(plans: PackedPlans, n: int) -> KnownFitness:
+    """Make memories of fitness for all islands, or for none."""
+    islands = plans.integers.shape[0]
+    for i in range(islands):
+        if repeats_chromosomes(unpack_plan(plans, i).method):
+            return make_known_fitness(islands, n)
+    return make_known_fitness(0, n)
+
+
+@jit_compile
 def _evolve_to_border(
     evaluator: Evaluator,
     plans: PackedPlans,
     packed: PackedIslands,
+    known: KnownFitness,
     target: int,
     budget: int,
     log: EvolutionLog,
 ) -> int:
     """Evolve every island up to a border; return the remaining budget, −1 if it ran out."""
     evaluator, plans, packed, log = borrow((evaluator, plans, packed, log))
+    known = borrow(known)
     for i in range(packed.champion_rms.size):
         begin, end = packed.offsets[i], packed.offsets[i + 1]
         plan, search, written = unpack_plan(plans, i), packed.search[i], log.counts[0]
@@ -292,6 +313,7 @@ def _evolve_to_border(
             search,
             packed.points[i],
             packed.archives[i],
+            get_island_memory(known, i),
         )
         if search.generation >= target or is_island_resting(plan, island, packed.champion_rms[i]):
             continue

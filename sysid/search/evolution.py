@@ -3,7 +3,7 @@
 import numpy as np
 
 from sysid.core.jit import jit_compile
-from sysid.core.types import FloatArray, WordArray
+from sysid.core.types import FloatArray, IntArray, WordArray
 from sysid.kernels.borrowing import borrow
 from sysid.search.adaptive_search import (
     EARLY_SEARCHES,
@@ -12,6 +12,7 @@ from sysid.search.adaptive_search import (
     run_adaptive_sequence,
     start_local_search,
 )
+from sysid.search.known_fitness import recall_fitness, remember_fitness
 from sysid.search.operators import (
     USE_CHILDREN,
     USE_INITIAL,
@@ -45,6 +46,7 @@ from sysid.search.state import (
     SAME_OPTIMUM,
     IslandArrays,
     IslandPlan,
+    KnownFitness,
     SearchRecord,
 )
 from sysid.simulation.evaluator import Evaluator, evaluate_population
@@ -52,23 +54,35 @@ from sysid.simulation.scaling import from_unit
 
 
 @jit_compile
-def draw_initial_places(plan: IslandPlan, individuals: int, n: int) -> FloatArray:
-    """Draw random points; the improved method stratifies them over the whole archipelago.
+def draw_initial_places(
+    seed: int, population: int, methods: IntArray, sizes: IntArray, n: int
+) -> FloatArray:
+    """Draw random points (P, D) of all islands; the improved method stratifies them.
 
     Stratified (Latin hypercube): every parameter's range has as many equal parts as the
-    archipelago has individuals, and each part holds one. All islands derive the same permutations.
+    archipelago has individuals, and each part holds one.
+
+    Parameters
+    ----------
+    population : int
+        Individuals of the archipelago, P.
+    methods, sizes : IntArray, shape (I,)
+        Method and number of individuals of each island.
     """
-    places = np.empty((individuals, n))
-    order = np.arange(plan.population)
+    places, order = np.empty((population, n)), np.arange(population)
     for d in range(n):
-        if plan.method >= METHOD_IMPROVED:
-            for i in range(plan.population - 1, 0, -1):
-                j = to_integer(draw_words(plan.seed, USE_STRATA, 0, d, i)[0], i + 1)
+        if methods.max() >= METHOD_IMPROVED:
+            for i in range(population - 1, 0, -1):
+                j = to_integer(draw_words(seed, USE_STRATA, 0, d, i)[0], i + 1)
                 order[i], order[j] = order[j], order[i]
-        for p in range(individuals):
-            places[p, d] = to_uniform(draw_words(plan.seed, USE_INITIAL, plan.island, d, p)[0])
-            if plan.method >= METHOD_IMPROVED:
-                places[p, d] = (order[plan.first_individual + p] + places[p, d]) / plan.population
+        first = 0
+        for island in range(sizes.size):
+            for p in range(sizes[island]):
+                place = to_uniform(draw_words(seed, USE_INITIAL, island, d, p)[0])
+                if methods[island] >= METHOD_IMPROVED:
+                    place = (order[first + p] + place) / population
+                places[first + p, d] = place
+            first += sizes[island]
     return places
 
 
@@ -81,7 +95,6 @@ def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
     for p in range(plan.survivors, fitness.size):
         word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p)
-        next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p + 1)
         first, second = draw_pair(word[0], word[1], plan.survivors)
         cross_over(
             chromosomes[p],
@@ -91,6 +104,7 @@ def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
             plan.bits,
         )
         if to_uniform(word[3]) < rate:
+            next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p + 1)
             flip_bit(chromosomes[p], to_integer(next_word[0], length), plan.bits)
         fitness[p] = np.nan
 
@@ -109,14 +123,16 @@ def _breed_child(
     bits, n = plan.bits, word.size
     first_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
     next_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
-    last_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
     first, second = draw_pair(first_word[0], first_word[1], plan.survivors)
     crossed, third = next_word[0] & 1, to_integer(next_word[1], places.shape[0])
     cross_over(
         word, parents[first], parents[second], 1 + to_integer(first_word[2], n * bits - 1), bits
     )
     rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
-    mutated = to_integer(last_word[0], n) if to_uniform(first_word[3]) < rate else -1
+    mutated, last_word = -1, first_word
+    if to_uniform(first_word[3]) < rate:
+        last_word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
+        mutated = to_integer(last_word[0], n)
     for d in range(n):
         place = word[d] / float((1 << bits) - 1)
         if not crossed:
@@ -172,26 +188,43 @@ def select_fittest(island: IslandArrays, children: WordArray, reached: FloatArra
 
 
 @jit_compile
-def evaluate_new_individuals(
-    evaluator: Evaluator, plan: IslandPlan, chromosomes: WordArray, fitness: FloatArray
-) -> int:
-    """Simulate the individuals that are not evaluated yet (``nan``), and sort all.
+def repeats_chromosomes(method: int) -> bool:
+    """Return whether a method breeds the same chromosomes often: those of the paper do."""
+    return bool(method < METHOD_IMPROVED)
 
-    Returns the number of simulations.
+
+@jit_compile
+def evaluate_new_individuals(
+    evaluator: Evaluator,
+    plan: IslandPlan,
+    known: KnownFitness,
+    chromosomes: WordArray,
+    fitness: FloatArray,
+) -> int:
+    """Evaluate the individuals that are not evaluated yet (``nan``), and sort all.
+
+    Those that are known are not simulated again. They count in the returned number of evaluations.
     """
-    evaluator, plan, chromosomes, fitness = borrow((evaluator, plan, chromosomes, fitness))
-    unevaluated = np.flatnonzero(np.isnan(fitness))
-    if unevaluated.size == 0:
+    evaluator, plan, known = borrow((evaluator, plan, known))
+    chromosomes, fitness = borrow((chromosomes, fitness))
+    evaluated = 0
+    for p in range(fitness.size):
+        evaluated += np.isnan(fitness[p])
+    if evaluated == 0:
         return 0
-    chosen = np.empty((unevaluated.size, chromosomes.shape[1]), np.uint32)
-    for i in range(unevaluated.size):
-        for d in range(chromosomes.shape[1]):
-            chosen[i, d] = chromosomes[unevaluated[i], d]
-    reached = evaluate_population(evaluator, from_unit(evaluator, decode(chosen, plan.bits)))
-    for i in range(unevaluated.size):
-        fitness[unevaluated[i]] = reached[i]
+    recall_fitness(known, chromosomes, fitness)
+    new = np.flatnonzero(np.isnan(fitness))
+    if new.size:
+        chosen = np.empty((new.size, chromosomes.shape[1]), np.uint32)
+        for i in range(new.size):
+            for d in range(chromosomes.shape[1]):
+                chosen[i, d] = chromosomes[new[i], d]
+        reached = evaluate_population(evaluator, from_unit(evaluator, decode(chosen, plan.bits)))
+        for i in range(new.size):
+            fitness[new[i]] = reached[i]
+        remember_fitness(known, chosen, reached)
     sort_population(chromosomes, fitness)
-    return unevaluated.size
+    return evaluated
 
 
 @jit_compile
@@ -217,9 +250,13 @@ def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays
         search.step_count += 1
         children = breed_improved_children(plan, island)
         reached = np.full(fitness.size, np.nan)
-        search.evaluations += evaluate_new_individuals(evaluator, plan, children, reached)
+        search.evaluations += evaluate_new_individuals(
+            evaluator, plan, island.known, children, reached
+        )
         select_fittest(island, children, reached)
-    search.evaluations += evaluate_new_individuals(evaluator, plan, chromosomes, fitness)
+    search.evaluations += evaluate_new_individuals(
+        evaluator, plan, island.known, chromosomes, fitness
+    )
 
 
 @jit_compile
@@ -291,7 +328,9 @@ def run_generations(
         begins = np.all(np.isnan(fitness))
         best = np.inf if begins else np.nanmin(fitness)
         phase = PHASE_START if begins else PHASE_MIGRATION
-        search.evaluations += evaluate_new_individuals(evaluator, plan, island.chromosomes, fitness)
+        search.evaluations += evaluate_new_individuals(
+            evaluator, plan, island.known, island.chromosomes, fitness
+        )
         if fitness[0] < best:
             _record_improvement(evaluator, plan, island, phase, improvements[0])
             written = 1

@@ -9,7 +9,8 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray, WordArray
 from sysid.kernels.abi import LANES
 from sysid.search.adaptive_search import N_TRIALS
-from sysid.search.evolution import run_generations
+from sysid.search.evolution import repeats_chromosomes, run_generations
+from sysid.search.known_fitness import make_known_fitness
 from sysid.search.state import (
     COLUMN_VALUES,
     PHASE_NAMES,
@@ -72,9 +73,14 @@ class Island:
 
     @property
     def arrays(self) -> IslandArrays:
-        """The arrays themselves, not copies, for compiled code to change."""
+        """The arrays themselves, not copies, for compiled code to change; nothing is known."""
         return IslandArrays(
-            self.chromosomes, self.fitness, self.search[()], self.point, self.archive
+            self.chromosomes,
+            self.fitness,
+            self.search[()],
+            self.point,
+            self.archive,
+            make_known_fitness(0, self.point.size),
         )
 
 
@@ -92,7 +98,9 @@ def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -
         archive=island.archive.copy(),
     )
     rows = np.empty((count + 1, COLUMN_VALUES + island.point.size))
-    written = run_generations(evaluator, plan, count, after.arrays, rows)
+    known = make_known_fitness(int(repeats_chromosomes(plan.method)), island.point.size)
+    arrays = after.arrays._replace(known=known)
+    written = run_generations(evaluator, plan, count, arrays, rows)
     return replace(after, history=island.history + tuple(to_improvements(rows[:written])))
 
 

@@ -233,9 +233,9 @@ def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
     evaluator = scored.evaluator
     predicted = predict_partially(evaluator, from_unit(evaluator, places), 1.0)
     errors = np.empty((places.shape[0], scored.rows.size))
-    for i in range(scored.rows.size):
-        row = scored.rows[i]
-        for p in range(places.shape[0]):
+    for p in range(places.shape[0]):
+        for i in range(scored.rows.size):
+            row = scored.rows[i]
             errors[p, i] = scored.weight[i] * (predicted[row, p] - evaluator.measured[row])
     _whiten(scored.ar1_coefficient, errors)
     return errors

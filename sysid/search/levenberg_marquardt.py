@@ -9,6 +9,7 @@ import numpy as np
 from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.kernels.borrowing import borrow
+from sysid.kernels.inner_products import N_SUMS, sum_products
 from sysid.simulation.loss import compute_loss as _plain_loss
 from sysid.simulation.loss import compute_loss_weight as _plain_weight
 
@@ -21,13 +22,10 @@ FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below the scale 
 @jit_compile
 def compute_inner_product(first: FloatArray, second: FloatArray, count: int) -> float:
     """Compute the inner product of the first `count` entries, as four independent sums."""
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    whole = count // 4 * 4
-    for m in range(0, whole, 4):
-        a += first[m] * second[m]
-        b += first[m + 1] * second[m + 1]
-        c += first[m + 2] * second[m + 2]
-        d += first[m + 3] * second[m + 3]
+    first, second = borrow((first, second))
+    whole = count // N_SUMS * N_SUMS
+    sums: tuple[float, float, float, float] = sum_products(first, second, whole)
+    a, b, c, d = sums
     for m in range(whole, count):
         a += first[m] * second[m]
     return (a + b) + (c + d)
@@ -54,9 +52,12 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
 def form_normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Form JᵀJ (lower half) and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss."""
+    """Form JᵀJ (lower half) and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss.
+
+    Slopes may have more columns; the first n count.
+    """
     error, columns = borrow((error, columns))
-    d, n = columns.shape
+    d, n = columns.shape[0], error.size
     if scale > 0.0:
         weighted_error, weighted_columns = np.empty(n), np.empty((d, n))
         for m in range(n):

@@ -101,22 +101,19 @@ def sort_population(words: WordArray, fitness: FloatArray) -> None:
     Insertion sort: populations are small, and half of them is in order after a generation.
     """
     words, fitness = borrow((words, fitness))
-    n = words.shape[1]
-    moved = np.empty(n, np.uint32)
-    for p in range(1, fitness.size):
+    order, is_sorted = np.empty(fitness.size, np.int64), True
+    for p in range(fitness.size):
         value, index = fitness[p], p
-        if fitness[p - 1] <= value:
-            continue
-        for d in range(n):
-            moved[d] = words[p, d]
         while index > 0 and fitness[index - 1] > value:
-            fitness[index] = fitness[index - 1]
-            for d in range(n):
-                words[index, d] = words[index - 1, d]
-            index -= 1
-        fitness[index] = value
-        for d in range(n):
-            words[index, d] = moved[d]
+            fitness[index], order[index] = fitness[index - 1], order[index - 1]
+            index, is_sorted = index - 1, False
+        fitness[index], order[index] = value, p
+    if is_sorted:
+        return
+    before = words.copy()
+    for p in range(fitness.size):
+        for d in range(words.shape[1]):
+            words[p, d] = before[order[p], d]
 
 
 @jit_compile

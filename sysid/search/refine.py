@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import frexp, ldexp
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def _refine_place(
     nor the limit of divergence depend on units. The divisor is a power of two: no rounding.
     """
     scale = max(problem.output_scale, rms)
-    unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
+    unit = ldexp(1.0, frexp(scale)[1]) if scale > 0 else 1.0
     evaluator, rows = problem.evaluator, problem.scored_rows
     steps = min(_MAX_STEPS, (budget - _END_EVALUATIONS) // (place.size + N_TRIED))
     at_once = steps_at_once(place.size, problem.n_steps)

@@ -63,20 +63,20 @@ def build_normal_equations(
     n, (places, steps) = point.size, step_aside(point, difference)
     predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
     weights, measured, progress = evaluator.weight, evaluator.measured, plan.progress
-    count, total, per_step = 0, 0.0, 1.0 / steps
+    # Unsigned, so that no row is checked for being counted from the end.
+    rows, error = np.empty(weights.size, np.uint64), np.empty(weights.size)
+    count, total, columns = 0, 0.0, np.empty((n, weights.size))
     for m in range(weights.size):
-        count += weights[m] != 0.0 and progress[m] <= horizon
-    error, columns = np.empty(count), np.empty((n, count))
-    i = -1
-    for m in range(weights.size):
-        if not (weights[m] != 0.0 and progress[m] <= horizon):
-            continue
-        i += 1
-        weight = weights[m]
-        error[i] = weight * (predicted[m, 0] - measured[m])
-        total += compute_loss(error[i], plan.loss_scale)
-        for d in range(n):
-            columns[d, i] = weight * per_step[d] * (predicted[m, d + 1] - predicted[m, 0])
-    matrix, gradient = form_normal_equations(error, columns, plan.loss_scale)
+        if weights[m] != 0.0 and progress[m] <= horizon:
+            rows[count] = m
+            error[count] = weights[m] * (predicted[m, 0] - measured[m])
+            total += compute_loss(error[count], plan.loss_scale)
+            count += 1
+    for d in range(n):
+        per_step = 1.0 / steps[d]
+        for i in range(count):
+            m = rows[i]
+            columns[d, i] = weights[m] * per_step * (predicted[m, d + 1] - predicted[m, 0])
+    matrix, gradient = form_normal_equations(error[:count], columns, plan.loss_scale)
     fitness = np.sqrt(total / max(count, 1))
     return matrix, gradient, fitness if np.isfinite(fitness) else np.inf

@@ -47,6 +47,21 @@ METHOD_SIMPLE, METHOD_PAPER, METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE = 0
 """Methods: simple GA, GA with fixed sequence, improved with adaptive or with fixed sequence."""
 
 
+class KnownFitness(NamedTuple):
+    """Fitness of chromosomes of one island; a new one takes the place of an older one.
+
+    Attributes
+    ----------
+    words : WordArray, shape (S, D)
+        Chromosomes, each in the place that its own words tell. S is 0 without memory.
+    fitness : FloatArray, shape (S,)
+        Their fitness; ``nan`` where nothing is stored.
+    """
+
+    words: WordArray
+    fitness: FloatArray
+
+
 class SearchRecord(Protocol):
     """State of the search of an island. Fields that read as statements are 0 or 1."""
 
@@ -99,6 +114,8 @@ class IslandArrays(NamedTuple):
         Present point of the local search, in [0, 1].
     archive : FloatArray, shape (16, 2 + D)
         Minima in which searches from random points ended (`sysid.search.archive`).
+    known : KnownFitness
+        Fitness of the chromosomes that were evaluated lately.
     """
 
     chromosomes: WordArray
@@ -106,6 +123,7 @@ class IslandArrays(NamedTuple):
     search: SearchRecord
     point: FloatArray
     archive: FloatArray
+    known: KnownFitness
 
 
 # Columns of an improvement; the D physical values follow.

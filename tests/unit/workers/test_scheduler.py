@@ -8,7 +8,7 @@ import pytest
 from sysid.core.errors import InvalidSettings
 from sysid.identification.run import begin_run
 from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, encode_runs, spec
-from workers import packing, tasks
+from workers import packing, scheduler, tasks
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.inline_executor import InlineExecutor
 from workers.job_queue import JobQueue
@@ -117,6 +117,27 @@ def test_the_packs_in_flight_are_shared_between_jobs() -> None:
     assert len(executor.packs) == PACKS_PER_CPU * executor.slots
     names = [pack[0][0] for pack in executor.sent]
     assert names.count("a") == names.count("b")
+
+
+def test_results_are_collected_while_many_cores_are_being_filled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(scheduler, "READ_SECONDS", -1.0)
+    executor, waits = ScriptedExecutor(fails, slots=1000), []
+    wait_for_packs = executor.wait_for_packs
+
+    def wait(timeout: float) -> tuple[int, ...]:
+        waits.append((timeout, len(executor.sent)))
+        return wait_for_packs(timeout)
+
+    monkeypatch.setattr(executor, "wait_for_packs", wait)
+    feeder = Scheduler(executor)
+    notebooks = jobs(feeder, a=100)
+    feeder.run_step(1.0)
+    assert waits == [(0.0, scheduler.SENT_PACKS)]
+    assert len(notebooks["a"].failures) == scheduler.SENT_PACKS
+    finish(feeder)
+    assert len(notebooks["a"].failures) == 100
 
 
 def test_runs_of_known_cost_share_a_pack() -> None:

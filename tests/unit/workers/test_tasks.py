@@ -206,7 +206,7 @@ def interrupts() -> Iterator[None]:
         (best_estimate, "analyse_estimate"),
         (conclude, "run_residual_tests"),
         (conclude, "estimate_onset_delays"),
-        (generalised_least_squares, "_estimate_correlation_times"),
+        (generalised_least_squares, "estimate_correlation_times"),
         (generalised_least_squares, "_draw_starts"),
     ],
     ids=lambda one: one if isinstance(one, str) else one.__name__.rpartition(".")[2],
