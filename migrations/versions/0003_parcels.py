@@ -134,6 +134,7 @@ def _delete_beyond_gaps() -> None:
     touched = list(connection.execute(sa.text(jobs)).scalars())
     for table in ("checkpoints", "run_history", "migrations_log", "accepted_references"):
         op.execute(f"DELETE FROM {table} WHERE run_id IN (SELECT id FROM beyond)")
+    op.execute(f"DELETE FROM job_summaries WHERE job_id IN ({jobs})")
     op.execute("DELETE FROM runs WHERE id IN (SELECT id FROM beyond)")
     op.execute("DROP TABLE beyond")
     ended = "(SELECT count(*) FROM runs WHERE job_id = jobs.id AND state = '{}')"

@@ -77,9 +77,15 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     # A deleted run is a row without results, which earlier versions would show.
+    deleted = "FROM runs WHERE deleted_at IS NOT NULL"
     for table in ("run_history", "migrations_log", "checkpoints"):
-        deleted = "SELECT id FROM runs WHERE deleted_at IS NOT NULL"
-        op.execute(f"DELETE FROM {table} WHERE run_id IN ({deleted})")
+        op.execute(f"DELETE FROM {table} WHERE run_id IN (SELECT id {deleted})")
+    op.execute(f"DELETE FROM job_summaries WHERE job_id IN (SELECT job_id {deleted})")
+    # They counted as done. A job that may be resumed computes them again.
+    op.execute(
+        f"UPDATE jobs SET n_done = n_done - (SELECT count(*) {deleted} AND job_id = jobs.id) "
+        f"WHERE state <> 'succeeded' AND id IN (SELECT job_id {deleted})"
+    )
     op.execute("DELETE FROM runs WHERE deleted_at IS NOT NULL")
     op.execute("DELETE FROM lineage_edges WHERE relation IN ('computed', 'reference', 'model')")
     op.drop_index("ix_idempotency_keys_job_id", "idempotency_keys")

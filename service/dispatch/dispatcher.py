@@ -20,7 +20,7 @@ from service.core import metrics
 from service.core.errors import Misconfigured
 from service.core.logs import bind_ids
 from service.core.settings import Settings
-from service.dispatch.background import BackgroundJobs
+from service.dispatch.background import BackgroundJobs, DocumentMaker
 from service.dispatch.held_jobs import HeldJob, choose_first_size
 from service.dispatch.job_end import build_end_maker
 from service.dispatch.job_parts import JobParts
@@ -58,6 +58,8 @@ RELEASE_SECONDS = 5.0
 MAX_JOBS = 64
 """Jobs held at a time. They share the workers, and their runs are read when needed. As many again
 may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
+MAX_ENDING = 2
+"""Parcels whose end is being written at most; then the dispatcher waits for the oldest."""
 SHORT_RUNS = 8
 """A job with at most this many runs is short."""
 
@@ -90,6 +92,7 @@ class Dispatcher:
         self._is_filling = False
         self._side_jobs: BackgroundJobs[Lease] = BackgroundJobs()
         self._lost: set[Lease] = set()
+        self._ending: list[Lease] = []  # parcels whose end is being written, the oldest first
         self._checked_at = 0.0
         self._listener = threading.Thread(
             target=self._listen_for_wakeups, name="notifier", daemon=True
@@ -137,13 +140,12 @@ class Dispatcher:
         metrics.record_kernel_seconds("process", get_compile_seconds())
         metrics.record_kernel_seconds("workers", self._scheduler.compile_seconds)
         for recorder in self._list_held_recorders():
-            if not self._leases.is_held(recorder.lease):
+            is_ending = recorder.lease in self._ending  # then the write itself decides
+            if not is_ending and not self._leases.is_held(recorder.lease):
                 continue  # the pending heartbeat, or the next one, decides
-            try:
-                with bind_lease(recorder.lease):
-                    recorder.write_due()
-            except LeaseLost as error:
-                self._drop_lost_parcel(recorder, error)
+            self._write(recorder, recorder.write_due)
+        for lease in tuple(self._ending):
+            self._leave_parcel(lease)
 
     def _share_cores(self) -> None:
         """Take the part of a shared cluster that this dispatcher has, by what others told."""
@@ -161,14 +163,14 @@ class Dispatcher:
         signals = retry_transient(partial(self._leases.check_queue, admission))
         for recorder in self._list_held_recorders():
             lease = recorder.lease
-            if self._leases.is_lost(lease):
+            is_ending = lease in self._ending  # its lease is perhaps gone because it has ended
+            if self._leases.is_lost(lease) and not is_ending:
                 self._drop_lost_parcel(recorder, LeaseLost(lease.job_id, lease.attempt))
             elif lease.job_id in signals.jobs_to_cancel:
                 recorder.is_stopped = True
         self._is_filling = False
-        for job in signals.jobs_to_extend & self._jobs.keys():
-            if self._jobs[job].wants_parcel:
-                self._claim_next(job)
+        for job in signals.jobs_to_extend.intersection(self._list_hungry_jobs()):
+            self._claim_next(job)
         if signals.has_waiting_job and len(self._jobs) < 2 * MAX_JOBS:
             choose = partial(choose_first_size, n_cores=self._executor.slots)
             claim = retry_transient(partial(self._leases.claim_job, admission, choose_size=choose))
@@ -177,8 +179,11 @@ class Dispatcher:
                 self._is_filling = True  # one job per round, so that other dispatchers get some
                 self._woken.set()
 
-    def _claim_next(self, job: str) -> bool:
-        """Claim another parcel of a job that is held; return whether there was one."""
+    def _list_hungry_jobs(self) -> list[str]:
+        return [job for job, held in self._jobs.items() if held.wants_parcel]
+
+    def _claim_next(self, job: str) -> None:
+        """Claim another parcel of a job that is held, if there is one."""
         held = self._jobs[job]
         n_sharing = self._leases.n_alive
         claim = retry_transient(
@@ -188,11 +193,9 @@ class Dispatcher:
                 choose_size=partial(held.choose_size, n_sharing=n_sharing),
             )
         )
-        if claim is None:
-            return False
-        self._take_parcel(claim)
-        self._woken.set()  # it may be read out before the next look at the queue
-        return True
+        if claim is not None:
+            self._take_parcel(claim)
+            self._woken.set()  # it may be read out before the next look at the queue
 
     def _build_admission(self) -> Admission | None:
         """Return which jobs may still be claimed; None admits every job."""
@@ -211,11 +214,12 @@ class Dispatcher:
         self._woken.set()
 
     def _take_parcel(self, claim: Claim) -> None:
+        """Begin to work on a claimed parcel, unless its lease is lost by then."""
         job = claim.job
         held = self._jobs.get(job.id)
         if held is None:
             parts = JobParts(self._database, job, self._store, keeps_signals=self._keeps_signals)
-            held = self._jobs[job.id] = HeldJob(parts, JobSpeed(time.monotonic(), job.n_done))
+            held = HeldJob(parts, JobSpeed(time.monotonic(), job.n_done))
         else:
             held.complete_row(job)
         source = JobRuns(
@@ -225,18 +229,26 @@ class Dispatcher:
             parts=held.parts,
             run_beside=self._overlap.run_beside,
         )
-        recorder = retry_transient(
-            partial(
-                RunRecorder,
-                self._database,
-                claim,
-                self._store,
-                held.parts.encoder,
-                held.parts.warm.record_end,
-                run_beside=self._overlap.run_beside,
-                speed=held.speed,
+        try:
+            recorder = retry_transient(
+                partial(
+                    RunRecorder,
+                    self._database,
+                    claim,
+                    self._store,
+                    held.parts.encoder,
+                    held.parts.warm.record_end,
+                    run_beside=self._overlap.run_beside,
+                    speed=held.speed,
+                )
             )
-        )
+        except LeaseLost as error:  # this process stood still after the claim
+            metrics.lease_losses.labels("owner").inc()
+            with bind_lease(claim.lease):
+                _log.warning("the parcel is not taken: %s", error)
+            self._leases.forget_lease(claim.lease)
+            return
+        self._jobs[job.id] = held
         held.add_parcel(claim, source)
         self._recorders[claim.lease] = recorder
         self._scheduler.add_job(
@@ -261,33 +273,49 @@ class Dispatcher:
         recorder.is_stopped = True
 
     def _end_runs(self, lease: Lease) -> None:
-        """Handle a parcel whose runs have ended. If it is the last one, its job ends after it."""
+        """Begin to end a parcel whose runs have ended; `_leave_parcel` follows."""
         recorder = self._recorders[lease]
         if recorder.is_stopped or lease in self._lost:
             self._conclude_job(lease)
             return
         held = self._jobs[lease.job_id]
         is_whole = held.parcels[lease].has_whole_job
-        try:
-            if not is_whole and len(held.parcels) == 1:
-                self._claim_next(lease.job_id)  # so that the job does not wait in between
-            if not is_whole and retry_transient(recorder.end_parcel):
-                self._forget_parcel(lease)
-                self._leases.forget_lease(lease)
-                return
-            last_steps = retry_transient(
-                partial(build_end_maker, self._database, lease, held.parts)
-            )
-            if is_whole and last_steps is not None:
-                retry_transient(recorder.write_results)
-        except LeaseLost as error:
-            self._drop_lost_parcel(recorder, error)
+        if is_whole and self._build_last_steps(lease) is None:
             self._conclude_job(lease)
             return
-        if last_steps is None:
+        self._ending.append(lease)
+        if not is_whole and all(other in self._ending for other in held.parcels):
+            self._claim_next(lease.job_id)  # so that the job does not wait in between
+        self._write(recorder, recorder.end_parcel)
+        if len(self._ending) > MAX_ENDING:
+            oldest = self._recorders[self._ending[0]]
+            self._write(oldest, oldest.wait_for_end)
+
+    def _leave_parcel(self, lease: Lease) -> None:
+        """Leave a parcel whose end is written. If it is the last one, its job ends after it."""
+        recorder = self._recorders[lease]
+        if lease not in self._lost and recorder.has_ended is None:
+            return
+        self._ending.remove(lease)
+        if recorder.has_ended:
+            self._forget_parcel(lease)
+            self._leases.forget_lease(lease)
+        elif recorder.is_stopped or (last_steps := self._build_last_steps(lease)) is None:
             self._conclude_job(lease)
         else:
             self._side_jobs.start_job(lease, last_steps)
+
+    def _build_last_steps(self, lease: Lease) -> DocumentMaker | None:
+        parts = self._jobs[lease.job_id].parts
+        return retry_transient(partial(build_end_maker, self._database, lease, parts))
+
+    def _write(self, recorder: RunRecorder, write: Callable[[], None]) -> None:
+        """Let a recorder write; drop its parcel if the lease is lost."""
+        try:
+            with bind_lease(recorder.lease):
+                write()
+        except LeaseLost as error:
+            self._drop_lost_parcel(recorder, error)
 
     def _list_ready_to_conclude(self) -> list[Lease]:
         """List jobs whose last steps are done, or are no longer wanted."""
@@ -329,10 +357,11 @@ class Dispatcher:
     def _release_jobs(self, *, lost: bool = False) -> None:
         self._side_jobs.stop()
         for recorder in self._list_held_recorders():
-            try:
-                retry_transient(recorder.write_all)
-            except LeaseLost as error:
-                self._drop_lost_parcel(recorder, error)
+            self._write(recorder, recorder.wait_for_end)
+            if recorder.has_ended:
+                self._leases.forget_lease(recorder.lease)
+            elif recorder.lease not in self._lost:
+                self._write(recorder, partial(retry_transient, recorder.write_all))
         self._leases.release_all(lost=lost)
         self._leases.stop_heartbeat()
         self._overlap.close()

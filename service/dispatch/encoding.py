@@ -21,6 +21,7 @@ from service.queue.packed_results import (
     HISTORY_ROWS,
     MIGRANT_ROWS,
     RESULT_ROWS,
+    SIGNALS_COLUMNS,
     Dialect,
     PackedResults,
     Row,
@@ -126,27 +127,29 @@ def _locate_files(files: Sequence[bytes]) -> list[_SignalsPlace]:
 
 
 def _build_row(run: CompleteRun, place: _SignalsPlace) -> Row:
-    """Build the row of a run that succeeded, in the order of `RESULT_ROWS`."""
+    """Build the row of a run that succeeded."""
     found, noise_free = run.concluded.identification, to_finite(run.concluded.rms_noise_free)
     result = {
         **to_result_document(found, run.seconds),
         "rms_noise_free": noise_free,
         **describe_program(),
     }
-    return (
-        run.run,
-        run.spec.reuse_key,
-        bool(found.valid),
-        to_finite(found.rms),
-        noise_free,
-        to_finite(found.fit_percent),
-        to_finite(found.fit_percent_validation),
-        int(found.evaluations),
-        int(found.generations),
-        float(run.seconds),
-        write_json(_extract_estimates(result)),
-        write_json(result),
-        *place,
+    return RESULT_ROWS.build_row(
+        {
+            "id": run.run,
+            "spec_hash": run.spec.reuse_key,
+            "valid": bool(found.valid),
+            "best_rms": to_finite(found.rms),
+            "rms_noise_free": noise_free,
+            "fit_estimation": to_finite(found.fit_percent),
+            "fit_validation": to_finite(found.fit_percent_validation),
+            "evaluations": int(found.evaluations),
+            "generations": int(found.generations),
+            "seconds": float(run.seconds),
+            "estimates": write_json(_extract_estimates(result)),
+            "result": write_json(result),
+            **dict(zip(SIGNALS_COLUMNS, place, strict=True)),
+        }
     )
 
 

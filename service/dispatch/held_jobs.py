@@ -23,7 +23,7 @@ FIRST_RUNS = 250
 """Runs of the first parcel at least: a job with no more is one parcel."""
 RUNS_PER_CORE = 4
 """Runs of the first parcel for each core of the dispatcher."""
-PARCEL_SECONDS = 10.0
+PARCEL_SECONDS = 5.0
 """Time in which the runs of a parcel should be read."""
 MAX_RUNS = 50_000
 """Runs of a parcel at most."""

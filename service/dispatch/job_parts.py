@@ -116,7 +116,13 @@ class JobParts:
             int(cell.get("/seed", body["seed"])),
             warm,
             posterior=body.get("posterior", False),  # older jobs do not have it
+            compare_orders=self._compares_orders(body),
         )
+
+    def _compares_orders(self, body: Mapping[str, Any]) -> bool:
+        """Whether the orders of a process are compared: by default only if there is no sweep."""
+        requested: bool | None = body.get("compare_orders")  # older jobs do not have it
+        return not self.job.spec["sweep"]["axes"] if requested is None else requested
 
     def _share_parts(self, cell: Mapping[str, Any]) -> _SharedParts:
         """Return the parts of a cell's run that it shares with others, built at the first one."""

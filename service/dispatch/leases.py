@@ -16,6 +16,7 @@ from service.core.processes import describe_process
 from service.dispatch.encoding import describe_program
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
+from service.queue.daily_limit import stop_overruns
 from service.queue.dispatchers import (
     CLUSTER_KEY,
     LEASE_SECONDS_KEY,
@@ -40,9 +41,10 @@ class HeldLeases:
     """Parcels of jobs that this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length. It also reaps
-    expired leases of any dispatcher. A lease that was not renewed `is_lost`. A forgotten lease is
-    no longer renewed, and expires. While a heartbeat waits for the database, the state of a late
-    lease is unknown. Nothing should be written under it, but it may still be held.
+    expired leases of any dispatcher, and stops jobs of projects beyond their evaluations of a day.
+    A lease that was not renewed `is_lost`. A forgotten lease is no longer renewed, and expires.
+    While a heartbeat waits for the database, the state of a late lease is unknown. Nothing should
+    be written under it, but it may still be held.
 
     The same heartbeat tells for how many cores this dispatcher has work (`wanted_cores`), and reads
     `n_alive`, the number of living dispatchers, and `cores_of_others`, the cores wanted by those
@@ -199,7 +201,7 @@ class HeldLeases:
             DispatcherRepository(session).remove_dispatcher(self.owner)
 
     def renew_leases(self) -> None:
-        """Send one heartbeat: renew the held leases, and reap expired ones."""
+        """Send one heartbeat: renew the held leases, reap expired ones, and stop overruns."""
         begun = self._stopwatch()
         before = self.list_held()
         with self._database.write_session(self._heartbeat_seconds) as session:
@@ -214,6 +216,7 @@ class HeldLeases:
                 elif lease in self._held:
                     self._held[lease] = begun
         reap_jobs(self._database, self._clock, busy_seconds=self._heartbeat_seconds)
+        stop_overruns(self._database, self._heartbeat_seconds)
 
     def _look_at_others(self, dispatchers: DispatcherRepository) -> None:
         alive = [one for one in dispatchers.list_alive() if one.owner != self.owner]

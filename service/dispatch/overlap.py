@@ -10,8 +10,8 @@ from typing import Any
 
 from service.storage.sessions import Database
 
-THREADS = 3
-"""Transactions at a time: the writes of two jobs, and the read of the next runs."""
+THREADS = 5
+"""Transactions at a time: the writes of some parcels, and the read of the next runs."""
 
 RunBeside = Callable[[Callable[[], Any]], "Future[Any]"]
 """Begins to carry out a function in a thread."""

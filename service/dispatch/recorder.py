@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from itertools import accumulate
@@ -47,6 +47,8 @@ MAX_ENDED = 1000
 MAX_STARTED = 500
 """Runs marked as running in one transaction. Of thousands of short runs most end unmarked."""
 
+FEW_ENDED = 100
+"""Ended runs that are written sooner than a thread would begin."""
 MAX_UNWRITTEN = 5000
 """Ended runs that wait for the database at most; then the dispatcher waits too."""
 
@@ -130,6 +132,8 @@ class _Batch:
         Runs in progress whose history and checkpoint are written, with their states.
     reused_outcomes : list
         What was taken over from other runs.
+    has_ended : bool or None
+        Whether it ended the parcel; None if it was not the parcel's last one.
     """
 
     taken_at: float
@@ -139,6 +143,7 @@ class _Batch:
     live: dict[str, tuple[_LiveRun, RunState]]
     with_checkpoints: bool
     reused_outcomes: list[RunOutcome] = field(default_factory=list)
+    has_ended: bool | None = None
 
 
 class RunRecorder:
@@ -162,6 +167,13 @@ class RunRecorder:
         Shared by the parcels of the job. By default it begins now.
     stopwatch : callable
         Elapsed seconds of this process.
+
+    Attributes
+    ----------
+    is_stopped : bool
+        Whether the job was cancelled or its lease lost.
+    has_ended : bool or None
+        Whether the parcel has ended, once `end_parcel` is written. The last one of a job has not.
     """
 
     def __init__(
@@ -178,7 +190,8 @@ class RunRecorder:
     ) -> None:
         self.lease = claim.lease
         self.encoder = encoder
-        self.is_stopped = False
+        self.is_stopped = self._is_ending = False
+        self.has_ended: bool | None = None
         self._report_end, self._stopwatch, self._run_beside = (
             report_end,
             stopwatch,
@@ -212,8 +225,7 @@ class RunRecorder:
 
     def record_worker_death(self, run: str, kills: int) -> None:
         """Record that the run alone killed its worker, `kills` times since its last progress."""
-        self._pending.kills[run] = kills
-        self._results_written_at = 0.0  # write at once: the dispatcher may die too
+        self._pending.kills[run] = kills  # written at once: the dispatcher may die too
 
     def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """Record a state from which the run can continue."""
@@ -293,9 +305,13 @@ class RunRecorder:
             If another dispatcher holds the parcel. Nothing was written.
         """
         if self._written_beside is not None:
-            if self._pending.count_ended() < MAX_UNWRITTEN and not self._written_beside[1].done():
+            may_wait = self._pending.count_ended() < MAX_UNWRITTEN and not self._pending.kills
+            if may_wait and not self._written_beside[1].done():
                 return
             self._finish_batch()
+        if self._is_ending:
+            self._write_end()
+            return
         now = self._stopwatch()
         with_progress = (
             self._has_new_progress and now - self._progress_written_at > PROGRESS_SECONDS
@@ -304,35 +320,47 @@ class RunRecorder:
             bool(self._live) and now - self._checkpoints_written_at > CHECKPOINT_SECONDS
         )
         has_results = self._pending.has_runs and now - self._results_written_at > RESULTS_SECONDS
-        has_many = self._pending.count_ended() >= MAX_ENDED
-        if with_progress or with_checkpoints or has_results or has_many:
+        is_urgent = self._pending.kills or self._pending.count_ended() >= MAX_ENDED
+        if with_progress or with_checkpoints or has_results or is_urgent:
             batch = self._take_batch(with_progress=with_progress, with_checkpoints=with_checkpoints)
-            written = self._run_beside(partial(retry_transient, partial(self._write_batch, batch)))
-            self._written_beside = batch, written
-            if written.done():
-                self._finish_batch()
+            self._pending.packs = _take_surplus(batch.pending)  # they follow when this is written
+            self._begin_batch(batch, self._run_beside)
 
     def write_all(self) -> None:
         """Write everything, including checkpoints, because the dispatcher stops."""
         self._write_now(with_checkpoints=True)
 
-    def write_results(self) -> None:
-        """Write the last results without ending the parcel."""
-        self._write_now()
+    def end_parcel(self) -> None:
+        """Begin to write the last results, and to end the parcel unless it is its job's last.
 
-    def end_parcel(self) -> bool:
-        """Write the last results and end the parcel; return False if it is the last of its job.
+        The last one stays open until the job ends. `write_due` goes on until `has_ended` tells
+        the outcome. Few results are written at once.
 
-        The last one stays open until the job ends.
+        Raises
+        ------
+        LeaseLost
+            If another dispatcher holds the parcel. `write_due` raises it too.
         """
-        was_ended = False
+        self._is_ending = True
+        if self._written_beside is None:
+            self._write_end()
+
+    def wait_for_end(self) -> None:
+        """Wait until the end of the parcel is written."""
+        while self._is_ending:
+            if self._written_beside is not None:
+                wait([self._written_beside[1]])
+            self.write_due()
+
+    def _write_end(self) -> None:
+        """Write everything and the end of the parcel, in one batch, which is the last one."""
+        is_small = self._pending.count_ended() <= FEW_ENDED
+        batch = self._take_batch(with_progress=True, with_checkpoints=False)
 
         def end(session: Session) -> None:
-            nonlocal was_ended
-            was_ended = LeaseQueue(session).end_parcel(self.lease)
+            batch.has_ended = LeaseQueue(session).end_parcel(self.lease)
 
-        self._write_now(last=end)
-        return was_ended
+        self._begin_batch(batch, run_at_once if is_small else self._run_beside, end)
 
     def finish_job(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
@@ -373,8 +401,7 @@ class RunRecorder:
         if self._written_beside is not None:
             self._finish_batch()
         batch = self._take_batch(with_progress=True, with_checkpoints=with_checkpoints)
-        written: Future[None] = run_at_once(partial(self._write_batch, batch, last))
-        self._written_beside = batch, written
+        self._written_beside = batch, run_at_once(partial(self._write_batch, batch, last))
         self._finish_batch()
 
     def _take_batch(self, *, with_progress: bool, with_checkpoints: bool) -> _Batch:
@@ -396,6 +423,14 @@ class RunRecorder:
             with_checkpoints,
         )
 
+    def _begin_batch(
+        self, batch: _Batch, run: RunBeside, last: Callable[[Session], None] | None = None
+    ) -> None:
+        work = partial(self._write_batch, batch, last)
+        self._written_beside = batch, run(partial(retry_transient, work))
+        if self._written_beside[1].done():
+            self._finish_batch()
+
     def _finish_batch(self) -> None:
         """Wait for the batch that is being written, and note that it is; else keep its rows."""
         assert self._written_beside is not None
@@ -412,6 +447,8 @@ class RunRecorder:
         self._note_written(batch)
 
     def _note_written(self, batch: _Batch) -> None:
+        if batch.has_ended is not None:
+            self.has_ended, self._is_ending = batch.has_ended, False
         self._pending.started[:0] = batch.pending.started  # those beyond `MAX_STARTED`
         self._results_written_at = batch.taken_at
         self._count_reused(batch.reused_outcomes)
@@ -528,13 +565,14 @@ class RunRecorder:
     def _write_pending(self, session: Session, pending: _PendingWrites) -> list[RunOutcome]:
         """Write runs that began or ended; return the outcomes of those that were taken over."""
         writer, queue = RunWriter(session, self.lease), LeaseQueue(session)
-        reused = take_over_runs(session, self.lease, pending.reused)
         writer.start_runs(pending.started[:MAX_STARTED])
-        writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
         writer.write_kills(pending.kills)
+        # What follows locks the row of the job, for which other parcels wait: the bulk is first.
+        writer.record_results(pending.packs, pending.lost_signals)
+        writer.record_outcomes(pending.outcomes, pending.history, pending.migrants)
+        reused = take_over_runs(session, self.lease, pending.reused)
         for text in pending.messages:
             queue.append_event(self.lease, "log", {"message": text})
-        writer.record_results(pending.packs, pending.lost_signals)
         return reused
 
     def _write_live(self, session: Session, batch: _Batch, reused: list[RunOutcome]) -> None:

@@ -219,7 +219,8 @@ class LeaseQueue:
         """Leave only the first runs in a parcel; the others wait as a new one."""
         stop = parcel.first + max(size, 1)
         if stop < parcel.stop:
-            measured = self._count_evaluations(parcel.job_id, stop) if parcel.evaluations else 0
+            after = range(stop, parcel.stop)
+            measured = self._count_evaluations(parcel.job_id, after) if parcel.evaluations else 0
             rest = Parcel(
                 job_id=parcel.job_id,
                 first=stop,
@@ -231,14 +232,14 @@ class LeaseQueue:
             self._session.add(rest)
             parcel.stop, parcel.evaluations = stop, parcel.evaluations - rest.evaluations
 
-    def _count_evaluations(self, job_id: str, first: int) -> int:
-        """Count the evaluations of the runs from number `first` on, as far as they are stored."""
-        later = Run.job_id == job_id, Run.number >= first
-        ended = select(func.sum(Run.evaluations)).where(*later, ~Run.state.in_(OPEN_STATES))
+    def _count_evaluations(self, job_id: str, runs: range) -> int:
+        """Count the evaluations of the runs of these numbers, as far as they are stored."""
+        these = Run.job_id == job_id, Run.number >= runs.start, Run.number < runs.stop
+        ended = select(func.sum(Run.evaluations)).where(*these, ~Run.state.in_(OPEN_STATES))
         begun = (
             select(func.sum(Checkpoint.evaluations))
             .join(Run, Run.id == Checkpoint.run_id)
-            .where(*later, Run.state.in_(OPEN_STATES))
+            .where(*these, Run.state.in_(OPEN_STATES))
         )
         return sum(int(self._session.scalar(query) or 0) for query in (ended, begun))
 
@@ -493,6 +494,8 @@ class LeaseQueue:
         if failed:
             lock_parcels(self._session, job.id)
         job = self._lock_job(job.id)
+        for parcel in parcels:
+            self._correct_evaluations(parcel, job)
         job.lost_leases = max(parcel.lost_leases for parcel in parcels)
         if failed and not job.cancel_requested:
             self._end_job(
@@ -510,6 +513,12 @@ class LeaseQueue:
                 self._cancel_parcel(parcel, job)
         return JobState.CANCELLED if job.cancel_requested else JobState.QUEUED
 
+    def _correct_evaluations(self, parcel: Parcel, job: Job) -> None:
+        """Take the evaluations of a lost parcel from its runs; its last progress may be older."""
+        stored = self._count_evaluations(job.id, range(parcel.first, parcel.stop))
+        job.evaluations += stored - parcel.evaluations
+        parcel.evaluations = stored
+
     def _count_loss(self, parcel: Parcel, job: Job, busy: Collection[str]) -> bool:
         """Count the loss of a parcel; return whether it was lost too often without progress.
 
@@ -522,7 +531,9 @@ class LeaseQueue:
         return parcel.lost_leases >= job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
 
     def _end_job(self, job: Job, state: JobState, error: str | None) -> None:
-        job.state, job.error, job.finished_at = state, error, self._read_clock()
+        job.state, job.finished_at = state, self._read_clock()
+        if state is not JobState.CANCELLED or error is not None:
+            job.error = error  # else it has the reason, if the service cancelled it
         job.seconds_left = None
         self._session.flush()
         parcels = delete(Parcel).where(Parcel.job_id == job.id)

@@ -21,6 +21,18 @@ class RowLayout(NamedTuple):
     table: str
     columns: Mapping[str, ColumnKind]
 
+    def build_row(self, values: Mapping[str, Any]) -> Row:
+        """Build a row from the values of all columns by name."""
+        return tuple(map(values.__getitem__, self.columns))
+
+
+SIGNALS_COLUMNS: Mapping[str, ColumnKind] = {
+    "signals_sha256": "text",
+    "signals_start": "bigint",
+    "signals_size": "bigint",
+}
+"""Where the fitted signals of a run are: the object, and the place in it."""
+
 
 RESULT_ROWS = RowLayout(
     "runs",
@@ -37,11 +49,10 @@ RESULT_ROWS = RowLayout(
         "seconds": "double precision",
         "estimates": "jsonb",
         "result": "jsonb",
-        "signals_sha256": "text",
-        "signals_start": "bigint",
-        "signals_size": "bigint",
+        **SIGNALS_COLUMNS,
     },
 )
+"""What a run that succeeded has; `service.queue.reuse` copies the same columns."""
 HISTORY_ROWS = RowLayout(
     "run_history",
     {

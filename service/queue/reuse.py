@@ -8,26 +8,14 @@ from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.queue.leases import Lease
+from service.queue.packed_results import RESULT_ROWS
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.storage.sessions import find_project
 from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks
 from service.storage.tables import Job, MigrationLog, Run, RunHistory
 
-_COPIED_COLUMNS = (
-    "spec_hash",
-    "result",
-    "valid",
-    "best_rms",
-    "rms_noise_free",
-    "fit_estimation",
-    "fit_validation",
-    "evaluations",
-    "generations",
-    "seconds",
-    "signals_sha256",
-    "signals_start",
-    "signals_size",
-)
+_COPIED_COLUMNS = [name for name in RESULT_ROWS.columns if name not in ("id", "estimates")]
+"""The estimates are those of the result."""
 
 
 def find_computed_runs(

@@ -16,6 +16,7 @@ from service.queue.packed_results import (
     COPY_HEAD,
     LAYOUTS,
     RESULT_ROWS,
+    SIGNALS_COLUMNS,
     ColumnKind,
     PackedResults,
     RowLayout,
@@ -208,7 +209,7 @@ class RunWriter:
         else:
             n_ended = self._record_in_postgres(packs)
         if lost_signals:
-            signals = {"signals_sha256": None, "signals_start": None, "signals_size": None}
+            signals = dict.fromkeys(SIGNALS_COLUMNS)
             lost = (Run.job_id == self._lease.job_id) & Run.signals_sha256.in_(lost_signals)
             self._session.execute(
                 update(Run).where(lost).values(signals), execution_options=RETURNING_OPTIONS

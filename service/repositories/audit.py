@@ -22,6 +22,7 @@ AuditAction = Literal[
     "job.delete",
     "job.edit",
     "key.create",
+    "key.refuse",
     "key.revoke",
     "model.add",
     "model.delete",

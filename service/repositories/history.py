@@ -19,7 +19,8 @@ PHASES = ("start", "genetic", "sequence", "migration", "refinement")
 _HEAD = "<IIIQdB"  # island, number, generation, evaluations, rms, phase
 _MIGRANT = struct.Struct("<IIIId")  # number, epoch, source, destination, fitness
 _NUMBER_OF = {phase: number for number, phase in enumerate(PHASES)}
-_get_run_id = attrgetter("run_id")
+_get_run_id, _get_rms = attrgetter("run_id"), attrgetter("rms")
+_get_generation, _get_evaluations = attrgetter("generation"), attrgetter("evaluations")
 
 
 class HistoryPoint(NamedTuple):
@@ -70,9 +71,9 @@ def pack_history(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
             "run_id": run,
             "digest": _hash_part(data),
             "n_parameters": count,
-            "generation": max(int(point.generation) for point in part),
-            "evaluations": max(int(point.evaluations) for point in part),
-            "rms": min(float(point.rms) for point in part),
+            "generation": int(max(map(_get_generation, part))),
+            "evaluations": int(max(map(_get_evaluations, part))),
+            "rms": float(min(map(_get_rms, part))),
             "points": data,
         }
 

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from service.core.states import OPEN_STATES, JobState
 from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
+from service.repositories.projects import DAY
 from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document, utc_now
 from service.storage.errors import KeyReused, RowConflict, RowNotFound
@@ -151,24 +152,27 @@ class JobRepository:
         rows = sorted(self._session.scalars(query), key=lambda job: job.id, reverse=True)
         return make_page(rows, limit, (job.id for job in rows))
 
-    def cancel(self, job_id: str) -> Job:
+    def cancel(self, job_id: str, reason: str | None = None) -> Job:
         """Cancel a queued job at once, or ask the dispatcher of a running one to stop.
+
+        Parameters
+        ----------
+        reason : str, optional
+            Why the service cancels it, for its users; the job keeps it as its error.
 
         Raises
         ------
         RowConflict
             If the job has already succeeded or failed. A cancelled job stays unchanged.
         """
-        if self._read_state(job_id) is JobState.QUEUED:
-            lock_parcels(self._session, job_id)  # before its row: a dispatcher may claim one
-        job = self._lock_job(job_id)
+        job = self._lock_to_cancel(job_id)
         if job.state is JobState.CANCELLED:
             return job
         if job.state not in OPEN_STATES:
             raise RowConflict(
                 f"{job_id} is {job.state}; only a queued or running job can be cancelled"
             )
-        job.cancel_requested = True
+        job.cancel_requested, job.error = True, reason
         if job.state is JobState.QUEUED:
             job.state, job.finished_at = JobState.CANCELLED, utc_now()
             self._session.execute(delete(Parcel).where(Parcel.job_id == job_id))
@@ -196,6 +200,8 @@ class JobRepository:
             unsuccessful.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=RETURNING_OPTIONS,
         )
+        if job.finished_at is not None and job.finished_at <= utc_now() - DAY:
+            job.evaluations_before = job.evaluations
         job.state, job.cancel_requested = JobState.QUEUED, False
         job.error = job.finished_at = None
         job.n_done -= job.n_failed
@@ -240,6 +246,23 @@ class JobRepository:
     def _read_state(self, job_id: str) -> JobState | None:
         query = select(Job.state).where(Job.id == job_id, *self._filter_project())
         return self._session.scalar(query)
+
+    def _lock_to_cancel(self, job_id: str) -> Job:
+        """Lock a job, and the parcels of a queued one before its row: a dispatcher may claim one.
+
+        A job that is queued again meanwhile is let go once, so that the order holds.
+        """
+        is_queued = self._read_state(job_id) is JobState.QUEUED
+        while True:
+            if is_queued:
+                lock_parcels(self._session, job_id)
+            attempt = self._session.begin_nested()
+            job = self._lock_job(job_id)
+            if is_queued or job.state is not JobState.QUEUED:
+                attempt.commit()
+                return job
+            attempt.rollback()
+            is_queued = True
 
     def _add_parcel(self, job: Job) -> None:
         """Add one parcel of all runs. Dispatchers divide it as they claim."""

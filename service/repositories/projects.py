@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import timedelta
 
-from sqlalchemy import func, select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from service.core.errors import BudgetExceeded
@@ -116,7 +116,7 @@ class ProjectRepository:
         """Measure what a project uses."""
         return ProjectUse(
             count_stored_bytes(self._session, project_id),
-            sum(_list_daily_evaluations(self._session, project_id)),
+            _count_daily_evaluations(self._session, project_id),
         )
 
 
@@ -155,14 +155,46 @@ def check_daily_evaluations(session: Session, project_id: str, limit: int | None
     """
     if limit is None:
         return
-    ended, running = _list_daily_evaluations(session, project_id)
-    if ended + running < limit:
+    made = _count_daily_evaluations(session, project_id)
+    if made < limit:
         return
     raise BudgetExceeded(
-        f"the jobs of the last 24 hours made {ended + running} evaluations; {limit} are allowed. "
-        "Submit this job later, or ask the operator for more (`lagid project limit`)",
+        f"{_describe_overrun(made, limit)} Submit this job later, or ask the operator for more "
+        "(`lagid project limit`)",
         _find_seconds_until_free(session, project_id),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Overrun:
+    """A project that has used up its evaluations of a day, and its jobs that still go on."""
+
+    project_id: str
+    reason: str
+    job_ids: tuple[str, ...]
+
+
+def list_overruns(session: Session) -> list[Overrun]:
+    """List the projects whose open jobs must stop, because no evaluations of the day are left."""
+    found = []
+    projects = session.execute(select(Project.id, Project.max_daily_evaluations)).all()
+    for project_id, limit in projects:
+        if limit is None or (made := _count_daily_evaluations(session, project_id)) < limit:
+            continue
+        going_on = select(Job.id).where(
+            Job.project_id == project_id, Job.state.in_(OPEN_STATES), ~Job.cancel_requested
+        )
+        if jobs := session.scalars(going_on.order_by(Job.id)).all():
+            reason = (
+                f"stopped: {_describe_overrun(made, limit)} Resume the job when they are a day "
+                "old, or ask the operator for more (`lagid project limit`)."
+            )
+            found.append(Overrun(project_id, reason, tuple(jobs)))
+    return found
+
+
+def _describe_overrun(made: int, limit: int) -> str:
+    return f"the jobs of the last 24 hours made {made} evaluations; {limit} are allowed."
 
 
 def count_stored_bytes(session: Session, project_id: str) -> int:
@@ -173,16 +205,18 @@ def count_stored_bytes(session: Session, project_id: str) -> int:
     return int(session.scalar(query) or 0)
 
 
-def _list_daily_evaluations(session: Session, project_id: str) -> tuple[int, int]:
+def _count_daily_evaluations(session: Session, project_id: str) -> int:
     """Count the evaluations of the jobs that ended in the last 24 hours, and of the open ones.
 
     Runs that were taken over from other jobs cost nothing: their part of a job does not count.
     """
-    own = func.sum(Job.evaluations * (Job.n_runs - Job.n_reused) / Job.n_runs)
+    new = Job.evaluations - Job.evaluations_before
+    counted = case((new > 0, new), else_=0)  # a run that failed is counted anew
+    own = func.sum(counted * (Job.n_runs - Job.n_reused) / Job.n_runs)
     of_project = Job.project_id == project_id
     ended = select(own).where(of_project, Job.finished_at >= utc_now() - DAY)
     running = select(own).where(of_project, Job.state.in_(OPEN_STATES))
-    return int(session.scalar(ended) or 0), int(session.scalar(running) or 0)
+    return int(session.scalar(ended) or 0) + int(session.scalar(running) or 0)
 
 
 def _find_seconds_until_free(session: Session, project_id: str) -> float:

@@ -63,6 +63,11 @@ class RunRepository:
             raise RowNotFound("run", run_id)
         return run
 
+    def lock(self, run_id: str) -> None:
+        """Lock the row of a run against every other writer, until the transaction ends."""
+        row = select(Run.id).where(Run.id == run_id).with_for_update(key_share=True)
+        self._session.execute(row)
+
     def list_page(
         self,
         job_id: str,

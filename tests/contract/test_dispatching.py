@@ -73,6 +73,35 @@ def test_of_two_jobs_the_one_that_is_lost_stops(stand: Stand) -> None:
     assert {run.state for run in stand.place.runs(lost)} <= set(OPEN_STATES)
 
 
+def test_a_parcel_that_is_lost_while_it_is_taken_stays_with_its_new_holder(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process stands still after its claim, for longer than its lease."""
+    lost, rival = stand.place.submit(), leases_of(stand.place.database, stand.clock)
+    rival.claim_job()
+    rival.release_all()  # the recorder of a later claim looks at what was stored before
+    claim = stand.leases.claim_job
+
+    def claim_and_stand_still(*given, **options):
+        claimed = claim(*given, **options)
+        stand.clock.advance(31)
+        rival.renew_leases()
+        assert rival.claim_job().job.id == lost
+        monkeypatch.setattr(stand.leases, "claim_job", claim)
+        return claimed
+
+    monkeypatch.setattr(stand.leases, "claim_job", claim_and_stand_still)
+    turn(stand, 1)
+    assert (stand.leases.list_held(), stand.executor.sent) == ((), [])
+    stand.executor.is_slow = False
+    other = stand.place.submit()
+    turn(stand, 4)
+    assert states(stand, lost, other) == [JobState.RUNNING, JobState.FAILED]
+    rival.release_all()
+    turn(stand, 4)
+    assert states(stand, lost) == [JobState.FAILED]
+
+
 def test_a_full_dispatcher_takes_what_is_short_or_more_urgent_than_one_of_its_jobs(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -234,6 +234,30 @@ def test_a_split_leaves_losses_and_evaluations_with_their_runs(database, shared)
     assert [one.lost_leases for one in parcels_of(database, first.job.id)] == [1, 1, 0]
 
 
+@pytest.mark.parametrize("way", ["failed", "cancelled", "cancelled while it waits"])
+def test_a_job_counts_the_evaluations_of_its_runs_though_its_holder_told_no_progress(database, way):
+    submit(database, n_runs=3 * SIZE, max_attempts=1 if way == "failed" else 3)
+    first, second = claim(database, "d1"), claim(database, "d2")
+    for got in (first, second):
+        with database.write_session() as session:
+            RunWriter(session, got.lease).create_runs(NewRun(number=n) for n in got.runs)
+        ended, begun, *_ = (run.id for run in pending(database, got))
+        outcome = RunOutcome(run_id=ended, state=JobState.SUCCEEDED, evaluations=70)
+        record_outcomes(database, got.lease, outcome)
+        with database.write_session() as session:
+            RunWriter(session, got.lease).save_checkpoints([(begun, 7, b"state")])
+    with database.write_session() as session:
+        LeaseQueue(session).write_progress(second.lease, JobProgress(77))
+    cancel_at = {"cancelled": 0, "cancelled while it waits": 1}.get(way)
+    for step, owners in enumerate([("d1", "d2"), ()]):
+        if step == cancel_at:
+            with database.write_session() as session:
+                JobRepository(session).cancel(first.job.id)
+        reap(database, *owners)
+    job = job_of(database, first.job.id)
+    assert (job.state.value, job.evaluations) == (way.split()[0], 2 * 77)
+
+
 def test_losses_are_counted_for_each_parcel_and_the_first_that_has_too_many_fails_the_job(
     database,
 ):

@@ -13,16 +13,25 @@ from typing import Any
 
 import pytest
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.items.deletion import delete_item, find_dependents
+from service.items.editing import edit_item
 from service.items.items import lock_item
+from service.items.schemas import EditIn
+from service.queue import run_writes
 from service.queue.admission import Admission, count_unfinished
-from service.queue.leases import Claim, LeaseOwners, LeaseQueue
+from service.queue.leases import Claim, JobProgress, LeaseOwners, LeaseQueue
 from service.queue.notifications import read_queue_status
-from service.queue.previous_attempts import delete_progress
+from service.queue.packed_results import LAYOUTS
+from service.queue.previous_attempts import (
+    delete_progress,
+    list_failure_reasons,
+    summarize_attempts,
+)
 from service.queue.queue_state import read_queue_state
-from service.queue.reuse import find_computed_runs
+from service.queue.reuse import find_computed_runs, take_over_runs
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
@@ -50,6 +59,7 @@ from service.storage.tables import (
 )
 from service.upkeep.retention import list_deleted_jobs, list_ended_jobs
 from tests.database import record_statements
+from tests.results import conclude, encode_results
 from tests.stored import claimed, new_dataset
 
 N_JOBS, N_RUNS, N_EVENTS, N_OTHERS = 3000, 2000, 3000, 2000
@@ -304,6 +314,89 @@ def write_runs(at: Filled) -> None:
         find_computed_runs(session, ["h10000000001", "h10000000002"])
 
 
+def read_next_runs(at: Filled) -> None:
+    database, claim, ids = at
+    with database.write_session() as session:
+        summarize_attempts(session, claim.lease)
+        list_failure_reasons(session, claim.job.id, 3)
+        writer = RunWriter(session, claim.lease)
+        assert writer.count_runs(range(2)) == 2
+        writer.create_runs(NewRun(number=number) for number in range(2))
+        assert len(writer.list_pending(2, -1, 2)) == len(ids)
+
+
+def take_over_and_edit_a_run(at: Filled) -> None:
+    database, claim, ids = at
+    with database.write_session() as session:
+        assert take_over_runs(session, claim.lease, {ids[1]: ids[0]})
+        edit_item(session, "run", ids[0], EditIn(note="odd"))
+
+
+def divide_lose_and_end_parcels(at: Filled) -> None:
+    """Parcels of a job with many runs, whose evaluations are counted when one is lost or split."""
+    database, _, _ = at
+    with database.write_session() as session:
+        JobRepository(session).submit(NewJob(name="parcels", spec={}, n_runs=6, priority=100))
+        queue = LeaseQueue(session)
+        first = queue.claim_job("d7", choose_size=lambda _: 4)
+        assert first is not None
+        writer = RunWriter(session, first.lease)
+        runs = writer.create_runs(NewRun(number=number) for number in range(4))
+        ended = RunOutcome(run_id=runs[0].id, state=JobState.SUCCEEDED, evaluations=5)
+        writer.record_outcomes([ended])
+        queue.write_progress(first.lease, JobProgress(5))
+        assert queue.reap_expired(LeaseOwners(ended=frozenset({"d7"}))).requeued
+        again = queue.claim_job("d8", choose_size=lambda _: 1)
+        other = queue.claim_job("d8", choose_size=lambda _: 5)
+        assert again is not None
+        assert other is not None
+        assert (again.runs, other.runs) == (range(1), range(1, 4))
+        assert queue.end_parcel(again.lease)
+        queue.cancel_parcel(other.lease)
+
+
+def write_pack(at: Filled) -> None:
+    """Write the results of a pack in bulk; `explain_bulk_writes` looks at its own statements."""
+    database, claim, ids = at
+    with database.write_session() as session:
+        results = encode_results({ids[0]: conclude(2.0, L=(0.5, 0.1))}, database)
+        RunWriter(session, claim.lease).record_results([results])
+        explained = list(explain_bulk_writes(session, claim))
+    by_key = (
+        r"sqlite_autoindex_runs_1 \(id=" if database.is_sqlite else r"pk_runs \(+id\)?(::text)? ="
+    )
+    (update_of_runs, *inserts) = explained
+    assert [step for step in update_of_runs if not re.search(by_key, step)] == []
+    assert update_of_runs
+    assert not any(inserts)
+
+
+def explain_bulk_writes(session: Session, claim: Claim) -> Iterator[list[str]]:
+    """Steps on stored tables of the bulk statements, planned where they were carried out.
+
+    They go past SQLAlchemy, into the driver. On PostgreSQL they need the temporary tables of this
+    session, and its settings.
+    """
+    connection = session.connection()
+    driver = connection.connection.driver_connection
+    assert driver is not None
+    if connection.dialect.name == "sqlite":
+        inserts = [run_writes._build_sqlite_insert(layout) for layout in LAYOUTS[1:]]
+        for statement in (run_writes._UPDATE_IN_SQLITE, *inserts):
+            numbered = re.findall(r"\?(\d+)", statement)
+            n_marks = max(map(int, numbered)) if numbered else statement.count("?")
+            rows = driver.execute(f"EXPLAIN QUERY PLAN {statement}", [None] * n_marks)
+            yield [str(row[3]) for row in rows if re.match("SCAN|SEARCH", str(row[3]))]
+        return
+    constants = [claim.lease.attempt, *2 * (datetime.now(UTC),), claim.job.id]
+    inserts = [run_writes._build_postgres_insert(layout) for layout in LAYOUTS[1:]]
+    for statement in (run_writes._UPDATE_IN_POSTGRES, *inserts):
+        given = constants if "%s" in statement else None
+        (answer,) = driver.execute(f"EXPLAIN (FORMAT JSON) {statement}", given).fetchone()
+        steps = describe_node(answer[0]["Plan"])
+        yield [step for step in steps if not step.startswith("SCAN packed_")]
+
+
 def end_large_job(at: Filled) -> None:
     """End a job that has many results."""
     database, claim, _ = at
@@ -384,7 +477,11 @@ USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
     summarise: (),
     collect_garbage: ("ix_runs_signals_sha256",),
     poll_and_claim: ("ix_jobs_open",),
+    read_next_runs: ("ix_runs_job_id_state_number",),
+    write_pack: (),
+    divide_lose_and_end_parcels: ("ix_runs_job_id_state_number",),
     write_runs: ("ix_runs_project_id_spec_hash",),
+    take_over_and_edit_a_run: (),
     end_large_job: ("ix_runs_job_id_best_rms", "ix_runs_job_id_state_number"),
     lose_workers_cancel_and_resume: ("ix_runs_job_id_state_number",),
     reap: ("ix_jobs_open",),

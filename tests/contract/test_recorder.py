@@ -1,9 +1,12 @@
 """What a dispatcher writes about the runs of a job, and when; the stopwatch is the test's."""
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +60,7 @@ class Desk:
     """A job of four runs that a dispatcher holds, and the recorder of its runs."""
 
     def __init__(self, place: Place) -> None:
-        self.place, self.stopwatch = place, Stopwatch()
+        self.place, self.stopwatch, self.run_beside = place, Stopwatch(), None
         self.ended: list[tuple[str, Mapping[str, float] | None]] = []
         self.states_told: dict[str, RunState] = {}
         axes = [{"path": "/seed", "range": [0, N_RUNS]}]
@@ -76,6 +79,7 @@ class Desk:
             self.place.store,
             encode_runs,
             lambda run, estimates: self.ended.append((run, estimates)),
+            run_beside=self.run_beside,
             stopwatch=self.stopwatch,
         )
 
@@ -193,6 +197,52 @@ def test_starts_are_collected_for_a_second_and_deaths_are_written_at_once(desk: 
     desk.recorder.record_worker_death(second, 1)
     desk.write_after(0.01)
     assert [run.kills for run in desk.place.runs(desk.job)] == [0, 1, 0, 0]
+
+
+class Held:
+    """A thread whose work waits until it is let go."""
+
+    def __init__(self) -> None:
+        self.gate, self.pool = threading.Event(), ThreadPoolExecutor(1)
+
+    def __call__(self, work: Callable[[], Any]) -> Future[Any]:
+        return self.pool.submit(lambda: (self.gate.wait(30.0), work()))
+
+    def let_go(self) -> None:
+        self.gate.set()
+        self.pool.shutdown()
+
+
+def test_a_death_is_written_at_once_also_while_a_batch_is_being_written(desk: Desk) -> None:
+    desk.run_beside = held = Held()
+    desk.recorder = desk.claim_again()
+    desk.recorder.record_start(desk.runs[0])
+    desk.recorder.write_due()
+    desk.recorder.record_worker_death(desk.runs[1], 1)
+    threading.Timer(0.2, held.gate.set).start()
+    desk.recorder.write_due()
+    held.let_go()
+    assert [run.kills for run in desk.place.runs(desk.job)] == [0, 1, 0, 0]
+
+
+def test_the_end_of_a_parcel_is_written_beside_what_goes_on(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "FEW_ENDED", 0)
+    desk.run_beside = held = Held()
+    desk.recorder = desk.claim_again()
+    for run in desk.runs:
+        desk.tell_result(run, searched(5, 50, 0.5))
+    desk.recorder.end_parcel()
+    desk.recorder.write_due()
+    assert desk.recorder.has_ended is None
+    assert desk.place.job(desk.job).n_done == 0
+    held.let_go()
+    desk.recorder.wait_for_end()
+    assert desk.recorder.has_ended is False  # the last parcel of its job stays
+    assert desk.place.job(desk.job).n_done == N_RUNS
+    desk.recorder.finish_job()
+    assert desk.place.job(desk.job).state is JobState.SUCCEEDED
 
 
 def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:
@@ -541,7 +591,13 @@ def test_under_a_lost_lease_nothing_is_written_and_the_recorder_learns_it(desk: 
         desk.recorder.write_due()
     desk.tell_result(desk.runs[0], searched(5, 50, 0.5))
     desk.tell_progress(desk.runs[1], searched(5, 50, 0.5), 0.2)
-    for write in (desk.recorder.write_due, desk.recorder.cancel_parcel, desk.recorder.finish_job):
+    for write in (
+        desk.recorder.write_due,
+        desk.recorder.cancel_parcel,
+        desk.recorder.end_parcel,
+        desk.recorder.wait_for_end,
+        desk.recorder.finish_job,
+    ):
         with pytest.raises(LeaseLost):
             write()
     assert desk.states() == [JobState.QUEUED] * 4

@@ -8,6 +8,7 @@ from sqlalchemy import func, select, update
 
 from service.core.states import JobState
 from service.items.deletion import delete_item
+from service.repositories.audit import list_actions, record_action
 from service.repositories.datasets import DatasetRepository
 from service.repositories.history import HistoryPoint, pack_history
 from service.repositories.jobs import JobRepository
@@ -29,8 +30,12 @@ from service.storage.tables import (
     StoredSummary,
 )
 from service.upkeep import housekeeper, retention
-from service.upkeep.housekeeper import Housekeeper
-from service.upkeep.retention import delete_expired_jobs, purge_deleted_jobs
+from service.upkeep.housekeeper import Housekeeper, KeptDays
+from service.upkeep.retention import (
+    delete_expired_actions,
+    delete_expired_jobs,
+    purge_deleted_jobs,
+)
 from tests.contract.test_items import add_dataset, add_job, end_job
 from tests.stored import runs_of
 
@@ -175,7 +180,7 @@ def test_the_housekeeper_frees_objects_of_what_was_deleted(
     job, _ = end_job(database, DONE, dataset=data)
     age(database, Job, job, 40)
     age(database, Dataset, data, 40)
-    keeper = Housekeeper(database, store, 30, threading.Event())
+    keeper = Housekeeper(database, store, KeptDays(jobs=30), threading.Event())
     keeper.run_pass()
     assert store.exists(raw)  # a backup may be reading it
     monkeypatch.setattr(housekeeper, "COLLECT_SECONDS", -1.0)
@@ -188,6 +193,28 @@ def test_the_housekeeper_frees_objects_of_what_was_deleted(
     keeper.run_pass()
     assert not store.exists(raw)
     assert count(database, Run) == [0]
+
+
+def test_audit_entries_are_deleted_once_their_days_have_passed(
+    database: Database, tmp_path: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def list_numbers() -> list[str | None]:
+        with database.read_session() as session:
+            return [row.object_id for row in list_actions(session).items]
+
+    with database.write_session() as session:
+        for number in range(6):
+            record_action(session, "key.refuse", f"key_{number}")
+            session.flush()
+        for entry in list_actions(session).items[2:]:
+            entry.at = utc_now() - timedelta(days=31)
+    store = open_store(f"file://{tmp_path}/objects")
+    Housekeeper(database, store, KeptDays(), threading.Event()).run_pass()
+    assert len(list_numbers()) == 6
+    monkeypatch.setattr(retention, "ROWS_AT_ONCE", 2)
+    Housekeeper(database, store, KeptDays(audit=30), threading.Event()).run_pass()
+    assert list_numbers() == ["key_5", "key_4"]
+    assert delete_expired_actions(database, 30) == 0
 
 
 def test_a_job_is_deleted_once_its_days_have_passed(database: Database) -> None:

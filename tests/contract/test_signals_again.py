@@ -15,6 +15,7 @@ from service.jobs.stored_run import load_run
 from service.repositories.datasets import DatasetRepository
 from service.runs.fitted import load_fitted_signals
 from service.storage.errors import ObjectStoreFailed
+from service.storage.sessions import Database
 from service.storage.tables import Run
 from sysid.data.records import Recording
 from tests import polynomials
@@ -54,7 +55,11 @@ CASES: dict[str, dict[str, Any]] = {
 
 @pytest.fixture
 def place(tmp_path: Path) -> Place:
-    made = Place(tmp_path / "data")
+    return make_place(tmp_path / "data")
+
+
+def make_place(folder: Path, database: Database | None = None) -> Place:
+    made = Place(folder, database)
     other = step_record(150, seed=8)
     add_recording(
         made.database,
@@ -95,6 +100,15 @@ def compute_again(place: Place, run: str) -> bytes:
 def test_signals_are_the_bytes_that_would_have_been_stored(
     place: Place, body: dict[str, Any]
 ) -> None:
+    check_signals(place, body)
+
+
+def test_signals_are_computed_again_on_each_database(tmp_path: Path, database: Database) -> None:
+    check_signals(make_place(tmp_path / "data", database), CASES["last part"])
+
+
+def check_signals(place: Place, body: dict[str, Any]) -> None:
+    """Check that the signals of a sweep that stored them are computed again byte for byte."""
     runs = carry_out_sweep(place, **body, keep_signals=True)
     stored = [read_stored(place, run) for run in runs]
     with place.database.write_session() as session:

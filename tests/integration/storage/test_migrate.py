@@ -8,10 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from sqlalchemy import inspect, text
+from sqlalchemy import delete, inspect, text
 
 import migrations
 from service.core.states import JobState
+from service.items.deletion import delete_item
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
@@ -108,6 +109,35 @@ def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):
     assert (held.attempt, held.lease_owner) == (leased.lease.attempt, "d3")
     again = claim(database, "d4")
     assert (again.job.id, again.runs, again.is_new) == (job, range(6), False)
+
+
+@pytest.mark.parametrize("revision", ["0003", "0002"])
+def test_summaries_of_jobs_that_lose_runs_on_the_way_down_go_with_them(empty_database, revision):
+    database = empty_database
+    migrate.upgrade_database(database)
+    kept, _ = claimed(database, n_runs=2)
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(kept.lease, JobState.CANCELLED)
+    claim_of_more, runs = claimed(database, n_runs=3)
+    for run in runs:
+        record_success(database, claim_of_more.lease, run, rms=0.5)
+    with database.write_session() as session:
+        LeaseQueue(session).finish_job(claim_of_more.lease, JobState.FAILED, "as told")
+        for job in (kept.job.id, claim_of_more.job.id):
+            session.add(StoredSummary(job_id=job, attempt=1, document={}))
+        if revision == "0003":
+            delete_item(session, "run", runs[1])
+            session.add(StoredSummary(job_id=claim_of_more.job.id, attempt=1, document={}))
+        else:
+            session.execute(delete(Run).where(Run.id == runs[1]))  # a gap: later runs go
+    migrate.downgrade_database(database, revision)
+    with database.engine.connect() as connection:
+        summaries = connection.scalars(text("SELECT job_id FROM job_summaries"))
+        assert list(summaries) == [kept.job.id]
+        count = text("SELECT n_done FROM jobs WHERE id = :job")
+        n_done = connection.scalar(count, {"job": claim_of_more.job.id})
+        n_rows = text("SELECT count(*) FROM runs WHERE job_id = :job")
+        assert n_done == connection.scalar(n_rows, {"job": claim_of_more.job.id})
 
 
 def test_stored_jobs_and_datasets_are_found_by_what_they_already_had(empty_database):
