@@ -6,6 +6,7 @@ from typing import Any
 
 from service.core.job_fields import SIGMA_PATH
 from service.core.text import format_value
+from service.sweeps.cramer_rao import scale_to_median
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 from sysid.core.text import append_unit, bracket_unit
 from sysid.figures import theme
@@ -91,8 +92,9 @@ def _build_panels(summary: SummaryOut, unit: str) -> list[_Panel]:
             continue
         if group.rms_noise_free is not None:
             _get_band(response, name).add_quantiles(group.sigma, group.rms_noise_free)
-        if group.rms_floor is not None:
-            response.floor[group.sigma] = group.rms_floor
+        floor = scale_to_median(group.model_dump())
+        if floor is not None:
+            response.floor[group.sigma] = floor
         for parameter in group.parameters:
             _add_parameter_error(
                 panels.setdefault(parameter.name, _parameter_panel(parameter)),
@@ -231,7 +233,7 @@ def _floor_traces(
     if not x:
         return []
     signs = (-QUANTILE_95, QUANTILE_95) if panel.is_signed else (1.0,)
-    name = "Cramér–Rao bound (of parameters: 5 and 95 %)"
+    name = "Cramér–Rao bound (of the median; of parameters: 5 and 95 %)"
     lines = []
     for sign in signs:
         lines.append(

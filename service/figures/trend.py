@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from service.core.text import name_label
 from service.trends.schemas import LawOut, LawPointOut, PointOut, QuantityOut, TrendOut
 from sysid.core.text import append_unit
 from sysid.figures import theme
@@ -64,7 +65,7 @@ def _add_axes(
         {
             "nticks": 7,
             "rangemode": "tozero",
-            "title": {"text": x, "font": small, "standoff": 4},
+            "title": {"text": name_label(x), "font": small, "standoff": 4},
             **({} if number == 0 else {"matches": "x"}),
         },
         {"nticks": 6, "title": {"text": append_unit(quantity.name, quantity.unit), "font": small}},

@@ -4,7 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sysid.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
+from sysid.core.text import (
+    DASH,
+    format_estimate,
+    format_number,
+    format_p_value,
+    join_estimate,
+    plain_unit,
+)
 from sysid.figures.plotly import Figure
 from sysid.figures.residuals import plot_residuals
 from sysid.identification.figures import to_correlation_trace
@@ -48,6 +55,18 @@ class SelectedTermView:
 
 
 @dataclass(frozen=True, slots=True)
+class OrderView:
+    """One order of a process as a row of a table."""
+
+    model: str
+    order: int
+    delay: str
+    delay_text: str
+    bic: float
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnostics:
     """Diagnostics of one run; fields are empty if the result has none.
 
@@ -62,6 +81,7 @@ class Diagnostics:
     groups: Sequence[str]
     criteria: Mapping[str, float | None]
     search: str
+    orders: Sequence[OrderView] = ()
     selection: Sequence[SelectedTermView] = ()
 
 
@@ -84,6 +104,7 @@ def to_diagnostics(result: Document) -> Diagnostics:
         groups=[_format_group(group) for group in groups],
         criteria=result.get("criteria", {}),
         search=_describe_search(result.get("search", {})),
+        orders=_list_orders(result.get("order_comparison")),
         selection=[
             SelectedTermView(
                 term["term"],
@@ -93,6 +114,28 @@ def to_diagnostics(result: Document) -> Diagnostics:
             for term in result.get("selection", ())
         ],
     )
+
+
+def _list_orders(comparison: Document | None) -> list[OrderView]:
+    """List the orders of a process; none if they were not compared."""
+    if not comparison:
+        return []
+    unit = plain_unit(comparison["unit"])
+    return [
+        OrderView(
+            fit["model"],
+            fit["order"],
+            comparison["delay"],
+            join_estimate(fit["delay"], fit["delay_stderr"]) + unit,
+            fit["bic"],
+            "preferred"
+            if fit["model"] == comparison["preferred_model"]
+            else "possible"
+            if fit["is_open"]
+            else "ruled out",
+        )
+        for fit in comparison["fits"]
+    ]
 
 
 def plot_residual_tests(tested: "ResidualAnalysis", experiment: int, columns: int = 2) -> Figure:

@@ -15,6 +15,7 @@ from service.formats.mcap import FitRole, FittedOutput
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
+from service.runs.bands import load_bands
 from service.runs.fitted import load_fitted_signals
 from service.runs.residuals import ResidualAnalysis, analyse_residuals
 from service.storage.errors import ObjectMissing, RowNotFound
@@ -33,6 +34,7 @@ from sysid.figures.data import (
 )
 from sysid.identification.figures import (
     RecordTraces,
+    add_bands,
     arrange_experiments,
     label_fitness,
     to_signal_trace,
@@ -171,7 +173,7 @@ def _to_estimated_parameter(
         estimate["upper"],
         scales.get(estimate["name"], "linear"),
         value=estimate["value"],
-        stderr=estimate.get("stderr"),
+        stderr=None if estimate["status"] == "not settled" else estimate.get("stderr"),
     )
 
 
@@ -204,7 +206,22 @@ def read_residual_analysis(
 def read_run_experiments(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[ExperimentTraces]:
-    """Read the records that a run was fitted to; empty until it has signals, or without data."""
+    """Read the records that a run was fitted to; empty until it has signals, or without data.
+
+    Outputs have their bands where these can be computed.
+    """
+    experiments = _read_experiments(session, store, stored)
+    if not experiments or not stored.estimates:
+        return experiments
+    try:
+        return add_bands(experiments, load_bands(session, store, stored))
+    except Conflict:  # no standard errors, or a dataset was deleted
+        return experiments
+
+
+def _read_experiments(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> list[ExperimentTraces]:
     try:
         fits = load_fitted_signals(session, store, stored)
     except Conflict:  # a dataset was deleted: the other figures are shown

@@ -21,6 +21,7 @@ from service.pages.figure_data import (
 from service.pages.trend import load_trend
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
+from service.runs.comparison import build_titles, load_compared_runs
 from service.storage.objects import ObjectStore
 from service.sweeps.summary import summarise_job
 from sysid.figures import plotly, signals
@@ -44,6 +45,12 @@ class FigureChoice(BaseModel):
     experiment: int = Field(default=0, ge=0, description="index of the record, from 0")
     start: float | None = Field(default=None, allow_inf_nan=False, description="start time, s")
     stop: float | None = Field(default=None, allow_inf_nan=False, description="stop time, s")
+
+
+class ComparisonChoice(FigureChoice):
+    """Options of a figure of several runs."""
+
+    run: list[str] = Field(min_length=2, max_length=50, description="the runs")
 
 
 def load_run_figure(
@@ -79,6 +86,41 @@ def load_run_figure(
     if name == "convergence":
         return plotly.plot_convergence(data, choice.columns)
     return plotly.plot_correlation(data) if name == "correlation" else plotly.plot_waterfall(data)
+
+
+MAX_OVERLAID_RUNS = 8
+
+
+def load_comparison_figure(
+    session: Session, store: ObjectStore, choice: ComparisonChoice
+) -> Figure:
+    """Draw the identified outputs of several runs over the measured ones, the best first.
+
+    Raises
+    ------
+    InvalidRequest
+        If the runs cannot be compared.
+    NotFound
+        If the requested experiment does not exist.
+    """
+    ordered = load_compared_runs(session, choice.run)
+    titles = build_titles(ordered)
+    read = {
+        titles[stored.run.id]: read_run_experiments(session, store, stored)
+        for stored in ordered[:MAX_OVERLAID_RUNS]
+    }
+    experiments = next((many for many in read.values() if many), [])
+    if not experiments:
+        return plotly.empty_figure()
+    _check_experiment(choice.experiment, len(experiments))
+    compared = [
+        (title, many[choice.experiment])
+        for title, many in read.items()
+        if len(many) > choice.experiment
+    ]
+    figure = signals.plot_comparison(compared, choice.start, choice.stop)
+    figure["layout"]["meta"]["experiments"] = [experiment.name for experiment in experiments]
+    return figure
 
 
 def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:

@@ -15,17 +15,20 @@ from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, noise_sweep_height
 from service.formats.file_kinds import SUFFIXES
 from service.items.items import compute_etag
-from service.jobs.stored_run import StoredRun
+from service.jobs.outcomes import read_outcomes
+from service.jobs.results import read_verdict
+from service.jobs.stored_run import StoredRun, load_run
 from service.models import models
 from service.models.schemas import ModelOut
-from service.pages.api_reference import list_operations
 from service.pages.cell_grid import build_cell_grid
 from service.pages.choices import DEFAULTS, list_choices
 from service.pages.dataset_links import count_unlisted_datasets, dataset_links
 from service.pages.diagnostics import to_diagnostics
+from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
+from service.pages.guides import read_guide
 from service.pages.render import render_template
-from service.pages.trend import TrendView, load_trend, to_trend_view
+from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
 from service.pages.views import (
     JobView,
     RunView,
@@ -59,15 +62,20 @@ EVENTS_SHOWN = 100
 MAX_COMPARED_RUNS = 50
 
 
-def reference_page(document: Mapping[str, Any]) -> str:
-    """Render the documentation of the REST interface from its OpenAPI document."""
-    about = document["info"]["description"]
-    return render_template(
-        "reference.html",
-        about=about,
-        version=document["info"]["version"],
-        operations=list_operations(document),
-    )
+def reference_page() -> str:
+    """Render the documentation of the REST interface; a script fills it from /openapi.json."""
+    return render_template("reference.html")
+
+
+def guide_page(path: str) -> str:
+    """Render a page of the documentation.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    return render_template("guide.html", guide=read_guide(path))
 
 
 DATASET_FILTER_FIELDS = (
@@ -92,6 +100,7 @@ def jobs_page(
     cursor: str | None,
     chosen: ListFilter = NO_FILTER,
     form: Mapping[str, str] | None = None,
+    base_url: str = "",
 ) -> str:
     """Render the list of jobs and the form of a new identification.
 
@@ -99,24 +108,32 @@ def jobs_page(
     ----------
     form : mapping of str to str, optional
         The filter as the user typed it.
+    base_url : str
+        Address of the service, for the first steps of a new user.
     """
     states = [state] if state else []
     page = JobRepository(session).list_page(
         cursor=cursor, limit=JOBS_PER_PAGE, states=states, chosen=chosen
     )
     now = datetime.now(UTC)
-    jobs = [to_job_view(job, find_rms_unit(session, job.spec), now) for job in page.items]
+    outcomes = read_outcomes(session, page.items)
+    jobs = [
+        to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
+        for job in page.items
+    ]
     typed = dict(form or {})
     query = {**typed, "state": state.value} if state else typed
     return render_template(
         "jobs.html",
         jobs=jobs,
+        flags=count_trend_flags(session, page.items),
         state=state.value if state else "",
         states=[(one.value, _encode_query({**typed, "state": one.value})) for one in JobState],
         query_without_state=_encode_query(typed),
         form=typed,
         filter_fields=JOB_FILTER_FIELDS,
         any_open=any(job.is_open for job in jobs),
+        address=base_url.rstrip("/"),
         cursor=cursor,
         filter_query=_encode_query(query),
         next=_encode_query({**query, "cursor": page.next}) if page.next else "",
@@ -180,18 +197,21 @@ def _describe_obstacle(session: Session, job: Job) -> str:
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:
-    """Render a comparison of runs of several models.
+    """Render a comparison of runs of several models; of fewer than two, how to choose them.
 
     Raises
     ------
     InvalidRequest
         If the runs cannot be compared.
     """
+    if len(runs) < 2:
+        return render_template("compare.html", comparison=None)
     comparison = compare_runs(session, runs)
     rows = []
     for parameter in comparison.parameters:
         texts_by_run = {
-            value.run: join_estimate(value.value, value.stderr) for value in parameter.values
+            value.run: join_estimate(value.value, value.stderr, status=value.status)
+            for value in parameter.values
         }
         texts = [texts_by_run.get(run.run, "") for run in comparison.runs]
         rows.append(
@@ -202,7 +222,17 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
                 "texts": texts,
             }
         )
-    return render_template("compare.html", comparison=comparison, parameters=rows)
+    ordered = [load_run(session, run.run) for run in comparison.runs]
+    first = ordered[0].model
+    return render_template(
+        "compare.html",
+        comparison=comparison,
+        parameters=rows,
+        verdicts=[read_verdict(stored.result) for stored in ordered],
+        differences=list_differences([stored.body for stored in ordered]),
+        query=urlencode([("run", run) for run in runs]),
+        height=signals.response_height(len(first.outputs), len(first.inputs)),
+    )
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:

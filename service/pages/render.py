@@ -1,12 +1,13 @@
 """Render templates, and load the static files of pages and reports.
 
-The files are the package's own, and Plotly from its installed wheel. Nothing is loaded from other
+The files are the package's own, and bundles from installed wheels. Nothing is loaded from other
 servers.
 """
 
 import base64
 import gzip
 import hashlib
+from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -52,24 +53,62 @@ def load_asset(name: str) -> Asset | None:
     return Asset(content, MEDIA_TYPES[path.suffix], etag)
 
 
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A file for browsers in an installed package, which is not imported, since that is slow.
+
+    Attributes
+    ----------
+    package : str
+        Module of the package.
+    path : str
+        Of the file, inside the package.
+    name : str
+        Name under which it is served; it contains the version, so browsers may cache it.
+    """
+
+    package: str
+    path: str
+    name: str
+
+    @property
+    def file(self) -> Path:
+        """Path of the file."""
+        spec = find_spec(self.package)
+        assert spec is not None
+        assert spec.submodule_search_locations
+        return Path(spec.submodule_search_locations[0]) / self.path
+
+    @property
+    def media_type(self) -> str:
+        """Its media type."""
+        return MEDIA_TYPES[self.file.suffix]
+
+
 @cache
-def plotly_file_name() -> str:
-    """Name under which Plotly is served; it contains the version, so browsers may cache it."""
-    return f"plotly-{version('plotly')}.min.js"
+def get_bundles() -> Mapping[str, Bundle]:
+    """Return the bundles by what pages call them: ``plotly``, ``swagger`` and its style."""
+    drawing, interface = version("plotly"), version("swagger-ui-py")
+    return {
+        "plotly": Bundle("plotly", "package_data/plotly.min.js", f"plotly-{drawing}.min.js"),
+        "swagger": Bundle(
+            "swagger_ui", "static/swagger-ui-bundle.js", f"swagger-ui-{interface}.js"
+        ),
+        "swagger-style": Bundle(
+            "swagger_ui", "static/swagger-ui.css", f"swagger-ui-{interface}.css"
+        ),
+    }
 
 
-def plotly_path() -> Path:
-    """Path of the bundle in the wheel. The package is not imported, since that is slow."""
-    spec = find_spec("plotly")
-    assert spec is not None
-    assert spec.submodule_search_locations
-    return Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
+def find_bundle(name: str) -> Bundle | None:
+    """Find a bundle by the name under which it is served."""
+    return next((one for one in get_bundles().values() if one.name == name), None)
 
 
 @cache
-def compress_plotly() -> bytes:
-    """Compress the bundle once per process."""
-    return gzip.compress(plotly_path().read_bytes(), compresslevel=6, mtime=0)
+def compress_bundle(bundle: Bundle) -> bytes:
+    """Compress a bundle once per process."""
+    return gzip.compress(bundle.file.read_bytes(), compresslevel=6, mtime=0)
 
 
 @cache
@@ -88,7 +127,7 @@ def template_environment() -> Environment:
     environment.globals.update(
         root=get_root_path,
         static=lambda name: to_address(f"/static/{name}"),
-        plotly=lambda: to_address(f"/static/{plotly_file_name()}"),
+        bundle=lambda name: to_address(f"/static/{get_bundles()[name].name}"),
     )
     return environment
 
@@ -118,7 +157,7 @@ def security_policy() -> str:
 @cache
 def plotly_script() -> Markup:
     """Load the Plotly bundle as the content of a script element."""
-    return _to_script(plotly_path().read_text(encoding="utf-8"))
+    return _to_script(get_bundles()["plotly"].file.read_text(encoding="utf-8"))
 
 
 @cache

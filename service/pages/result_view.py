@@ -48,6 +48,7 @@ class ResultView:
     generations: int
     seconds: float
     estimates: Sequence[EstimateView]
+    verdict: Document
     warnings: Sequence[str]
     diagnostics: Diagnostics
     posterior: Sequence[PosteriorView]
@@ -67,6 +68,7 @@ def to_result_view(result: Document, unit: str, title: str) -> ResultView:
         generations=result["generations"],
         seconds=result["seconds"],
         estimates=[to_estimate_view(parameter) for parameter in result["parameters"]],
+        verdict=result["verdict"],
         warnings=result["warnings"],
         diagnostics=to_diagnostics(result),
         posterior=to_posterior_views(result),
@@ -94,17 +96,16 @@ def _to_posterior_view(parameter: Document) -> PosteriorView:
 
 def to_estimate_view(estimate: Document) -> EstimateView:
     """Build a row of the table from an entry of the result's ``parameters``."""
-    stderr = estimate["stderr"]
-    is_bound = estimate["status"] == "at bound"
-    value, error = format_estimate(estimate["value"], stderr, is_bound=is_bound)
+    stderr, status = estimate["stderr"], estimate["status"]
+    value, error = format_estimate(estimate["value"], stderr, status=status)
     bounds = [estimate[name] for name in ("lower", "upper") if estimate[name] is not None]
     return EstimateView(
         name=estimate["name"],
         unit=estimate["unit"],
         value_text=value,
         stderr_text=error,
-        interval_text=format_interval(estimate["interval95"], stderr),
+        interval_text=format_interval(estimate["interval95"], stderr, status=status),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=estimate["status"],
+        status=status,
         reason=estimate["reason"] or "",
     )

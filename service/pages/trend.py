@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import perf_counter
 
 from sqlalchemy.orm import Session
 
@@ -51,6 +52,28 @@ def load_trend(session: Session, job: Job) -> TrendOut | None:
         return compute_trend(session, job.id)
     except InvalidRequest:
         return None
+
+
+MAX_FLAGGED_RUNS = 100
+"""The flags of a batch with more runs are shown on its own page only."""
+FLAG_SECONDS = 0.15
+"""Time for the flags of a list. Batches that come later have theirs in the next view."""
+
+
+def count_trend_flags(session: Session, jobs: Sequence[Job]) -> dict[str, int]:
+    """Count the findings that need attention in each batch that has ended, by the job."""
+    counts: dict[str, int] = {}
+    started = perf_counter()
+    for job in jobs:
+        if not job.state.is_terminal or not job.n_done or job.n_runs > MAX_FLAGGED_RUNS:
+            continue
+        trend = load_trend(session, job)
+        if trend is not None:
+            tables = build_tables(trend.model_dump(), TYPESET)
+            counts[job.id] = sum(len(row.flags) for row in tables.rows)
+        if perf_counter() - started > FLAG_SECONDS:
+            break
+    return counts
 
 
 def to_trend_view(trend: TrendOut) -> TrendView:

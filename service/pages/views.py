@@ -11,7 +11,9 @@ from service.core.states import OPEN_STATES, JobState, StateName
 from service.core.text import format_count, format_value
 from service.core.wire import Answer
 from service.items.items import compute_etag
-from service.jobs.schemas import JobOut
+from service.jobs.outcomes import is_batch
+from service.jobs.results import read_verdict
+from service.jobs.schemas import JobOut, OutcomeOut
 from service.jobs.submit import to_job_out
 from service.pages.diagnostics import Diagnostics, to_diagnostics
 from service.pages.result_view import (
@@ -44,6 +46,7 @@ class RunView(Answer):
     seconds: float | None
     error: str | None
     estimates: Sequence[EstimateView]
+    verdict: Mapping[str, Any] | None
     warnings: Sequence[str]
     note: str | None
     tags: Sequence[str]
@@ -78,7 +81,7 @@ class JobView(JobOut):
     @property
     def is_batch(self) -> bool:
         """Whether the job's runs see different recordings."""
-        return any(axis["path"].startswith(DATASETS_PATH) for axis in sweep_axes(self.request))
+        return is_batch(self.request)
 
     @property
     def best_rms(self) -> float | None:
@@ -132,9 +135,9 @@ class EventView:
     text: str
 
 
-def to_job_view(job: Job, unit: str, now: datetime) -> JobView:
+def to_job_view(job: Job, unit: str, now: datetime, outcome: OutcomeOut | None = None) -> JobView:
     """Build the view of a job; `unit` is the unit of its RMS."""
-    document = to_job_out(job, with_request=True, rms_unit=unit, now=now)
+    document = to_job_out(job, with_request=True, rms_unit=unit, outcome=outcome, now=now)
     return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 
@@ -148,6 +151,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         cell_text=format_cell(run.cell, run.labels),
         unit=unit,
         estimates=[to_estimate_view(parameter) for parameter in result.get("parameters", ())],
+        verdict=read_verdict(result) if result else None,
         warnings=result.get("warnings", ()),
         tags=run.tags or (),
         etag=compute_etag(run),

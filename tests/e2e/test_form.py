@@ -9,8 +9,9 @@ import pytest
 import yaml
 from playwright.sync_api import Page, expect
 
+from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from tests.e2e.conftest import LIMIT_SECONDS, Site
+from tests.e2e.conftest import LIMIT_SECONDS, Site, serve_folder
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -82,7 +83,10 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     page.get_by_label("population").fill("2")
     page.get_by_role("button", name="Identify").click()
     expect(page.get_by_label("population")).to_have_attribute("aria-invalid", "true")
-    expect(page.locator('[data-fault="/algorithm"]')).to_contain_text("/algorithm/population")
+    told = page.locator('[data-fault="/algorithm"]')
+    expect(told).to_have_text(re.compile(r"^Population: .* 4.*\.$"))
+    expect(page.locator("#form-fault")).to_have_text("Change the marked fields.")
+    assert page.locator("#job-form").inner_text().count("need 4 or more") == 1  # told once
     expect(page.get_by_label("population")).to_be_focused()
 
 
@@ -166,3 +170,53 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
     with own_site.parts.database.read_session() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["parameters"] == {**asked, "y(0)": {"lower": -3.0, "upper": 900.0}}
+
+
+def test_a_part_of_the_recording_is_chosen_in_its_plot(own_site: Site, page: Page) -> None:
+    opened(own_site, page, f"?dataset={own_site.filled.dataset}&fit=fopdt")
+    plot = page.locator("[data-preview]")
+    expect(plot.locator(".scatterlayer .trace")).to_have_count(2)
+    assert page.locator("table.jobs tbody tr").count() == 5  # the form's model filters no list
+    expect(page.locator("#about-model")).to_contain_text("dx/dt = (K·u(t − L) − x)/T")
+    expect(page.get_by_label("upper of L")).to_have_attribute("placeholder", re.compile(r"^\d"))
+    expect(page.locator("#parameters tr").first).to_contain_text("static gain")
+    plot.evaluate("plot => Plotly.relayout(plot, {'xaxis.range[0]': 6, 'xaxis.range[1]': 12})")
+    expect(page.get_by_label("use it from [s]")).to_have_value("6")
+    page.get_by_label("to [s]").fill("3")
+    page.get_by_label("output y").select_option("P2")
+    page.get_by_role("button", name="Identify").click()
+    expect(page.locator('[data-fault="/datasets"]')).to_contain_text("need more than the start")
+    page.get_by_label("to [s]").fill("15")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    with own_site.parts.database.read_session() as session:
+        [part] = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec["datasets"]
+        dataset = DatasetRepository(session).get(part)
+    assert part != own_site.filled.dataset
+    assert dataset.duration == pytest.approx(9, abs=0.1)
+
+
+def test_a_file_is_dropped_on_the_page(own_site: Site, page: Page) -> None:
+    page.goto(own_site.url)
+    page.evaluate(
+        """() => {
+          const files = new DataTransfer();
+          const rows = Array.from({length: 20}, (_, n) => `${n / 10},${n % 2},${n}`);
+          files.items.add(new File([['t,u,y', ...rows, ''].join('\\n')], 'dropped.csv'));
+          document.dispatchEvent(new DragEvent('drop', {dataTransfer: files, bubbles: true}));
+        }"""
+    )
+    expect(page.locator("#form-state")).to_contain_text("dropped.csv is stored")
+    expect(page.locator("#dataset-facts")).to_have_text("u · y")
+
+
+def test_a_new_user_finds_an_example_to_try(page: Page, tmp_path: Path) -> None:
+    with serve_folder(tmp_path) as server:
+        page.goto(server.url)
+        page.get_by_role("button", name="Try the example").click()
+        page.wait_for_url(re.compile(r"fit=fopdt"))
+        expect(page.locator("[data-preview] .scatterlayer .trace")).to_have_count(2)
+        page.get_by_role("button", name="Identify").click()
+        page.wait_for_url(re.compile(r"/jobs/job_"))
+        expect(page.locator("#job .chip")).to_have_text("queued")
+        page.goto("about:blank")  # it asks the server nothing more

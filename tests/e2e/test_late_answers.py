@@ -1,6 +1,7 @@
 """Answers of the server that come late, or in another order than they were asked for."""
 
 import re
+from pathlib import Path
 
 import httpx
 import pytest
@@ -90,8 +91,8 @@ def test_channels_follow_the_model_that_is_chosen_after_the_recordings(
 
 def test_the_form_shows_the_model_that_was_chosen_last(site: Site, page: Page) -> None:
     opened(site, page)
-    first = Held(page, r"/v1/models/fopdt$")
-    page.locator("select[name=model]").select_option("fopdt")
+    first = Held(page, r"/v1/models/sopdt$")
+    page.locator("select[name=model]").select_option("sopdt")
     first.wait()
     page.locator("select[name=model]").select_option("actuator")
     equations = page.get_by_label("equations in YAML")
@@ -99,6 +100,33 @@ def test_the_form_shows_the_model_that_was_chosen_last(site: Site, page: Page) -
     first.let_go()
     expect(equations).to_have_value(re.compile("actuator"))
     expect(page.locator("[data-parameter=J]").first).to_be_attached()
+
+
+def test_an_upload_that_ends_late_neither_selects_itself_nor_reports(
+    own_site: Site, page: Page, tmp_path: Path
+) -> None:
+    good, bad = tmp_path / "good.csv", tmp_path / "bad.csv"
+    good.write_text("t,u,y\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
+    bad.write_text("t,u,y\n0,1,2\n0.1,oops,2\n0.2,1,2\n")
+    opened(own_site, page)
+    uploads = Held(page, r"/v1/datasets\?name=")
+    chosen, facts = page.locator("[name=dataset]"), page.locator("#dataset-facts")
+    for late in (bad, good):
+        page.get_by_label("or upload a recording").set_input_files(late)
+        uploads.wait()
+        chosen.select_option(own_site.filled.dataset)  # the user has chosen otherwise
+        expect(facts).to_contain_text("P1")
+        uploads.let_go()
+        expect(facts).to_contain_text("P1")
+        expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
+        expect(page.locator("#form-state")).to_be_empty()
+    page.get_by_label("or upload a recording").set_input_files(bad)
+    uploads.wait()
+    page.get_by_label("or upload a recording").set_input_files(good)
+    uploads.let_go()
+    uploads.let_go()
+    expect(page.locator("#form-state")).to_contain_text("good.csv is stored")
+    expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
 
 
 def test_an_answer_about_an_earlier_text_is_not_one_about_the_text_that_is_there(
@@ -157,15 +185,15 @@ def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, page: Pag
     expect(page.locator("[data-signal]").first).to_be_attached()
     sent: list[Request] = []
     page.on("request", lambda one: sent.append(one) if one.method == "POST" else None)
-    model = Held(page, r"/v1/models/fopdt$")
-    page.locator("select[name=model]").select_option("fopdt")
+    model = Held(page, r"/v1/models/sopdt$")
+    page.locator("select[name=model]").select_option("sopdt")
     model.wait()
     page.locator("#job-form [type=submit]").click()
     page.wait_for_timeout(200)
     assert not sent
     model.answer()
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    assert sent[0].post_data_json["model"] == "fopdt"
+    assert sent[0].post_data_json["model"] == "sopdt"
     assert set(sent[0].post_data_json["channels"]) == {"u", "y"}
 
 

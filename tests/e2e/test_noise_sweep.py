@@ -45,7 +45,11 @@ def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(page: Page, job: 
     page.goto(job)
     page.wait_for_selector(f"{PLOT} .main-svg")
     drawn = page.locator(PLOT).evaluate("plot => plot.data.map(one => one.legendgroup)")
-    assert set(drawn) == {"simple", "improved", "Cramér–Rao bound (of parameters: 5 and 95 %)"}
+    assert set(drawn) == {
+        "simple",
+        "improved",
+        "Cramér–Rao bound (of the median; of parameters: 5 and 95 %)",
+    }
     height = page.locator(PLOT).evaluate("plot => [plot.clientHeight, plot.layout.height]")
     assert height[0] == height[1]  # the page had left room: nothing below has moved
     expect(page.locator("table.runs")).to_have_count(0)

@@ -57,7 +57,8 @@ def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
     expect(rows.nth(1)).to_have_text(re.compile(r"T\s*0\.34890\s*± 0\.00041\s*s.*identified", re.S))
     assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
     assert page.locator(f"{figure(page, 'convergence')} {LINES}").count() == 4 * len(TRUE)
-    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 8
+    expect(page.locator('.modebar-btn[data-title^="Share"]')).to_have_count(0)  # to a cloud
     assert page.locator(f"{figure(page, 'residuals')} .barlayer .trace").count() == 2
     assert page.locator(f"{figure(page, 'correlation')} .hm").count() == 1
     assert page.locator(f"{figure(page, 'waterfall')} {LINES}").count() == 2
@@ -117,6 +118,25 @@ def test_plots_of_a_finished_job_follow_the_keyboard_the_scheme_and_the_wish_for
     assert page.locator(f"[data-profile-plot] {LINES}").count() == len(TRUE)
 
 
+def test_a_printed_page_has_every_figure_and_each_is_saved_as_an_image(
+    site: Site, page: Page
+) -> None:
+    page.add_init_script("window.print = () => { window.sheets = document.body.className; }")
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    page.keyboard.press("Control+p")
+    page.wait_for_function("() => window.sheets === 'printing'")
+    figures = page.locator("[data-figure]")
+    expect(page.locator("[data-figure].js-plotly-plot")).to_have_count(figures.count())
+    assert figures.evaluate_all(
+        "plots => plots.every(plot => plot.querySelector('.main-svg').clientWidth <= 720)"
+    )
+    page.evaluate("() => dispatchEvent(new Event('afterprint'))")
+    for kind in ("SVG", "PNG"):
+        with page.expect_download() as saved:
+            page.get_by_role("button", name=f"Measured against identified as {kind}").click()
+        assert saved.value.suggested_filename == f"response.{kind.lower()}"
+
+
 def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.sweep}")
     links = page.locator("table.runs tbody a")
@@ -127,6 +147,49 @@ def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
     page.locator("table.runs tbody a").first.click()
     expect(page.locator('tr[aria-current="true"]')).to_contain_text("run ")
+
+
+def test_results_are_sorted_and_ticked_to_be_compared(site: Site, page: Page) -> None:
+    page.goto(site.url)
+    names = page.locator("table.jobs .name")
+    page.get_by_role("button", name="Fit").click()
+    expect(names.nth(0)).to_have_text("three methods, four seeds")
+    page.get_by_role("button", name="Fit").click()
+    expect(names.nth(0)).to_have_text("tube 40 m, pattern 1")
+    compare = page.get_by_role("button", name="Compare")
+    expect(compare).to_be_disabled()
+    page.get_by_label("compare tube 40 m, pattern 1").check()
+    page.get_by_label("compare three methods, four seeds").check()
+    page.evaluate(
+        """async () => {
+          const script = document.querySelector('script[src*="jobs.js"]').src;
+          document.querySelector('table.jobs tbody tr').append('changed');
+          await (await import(new URL('live.js', script))).refresh();
+        }"""
+    )
+    expect(page.get_by_label("compare three methods, four seeds")).to_be_checked()
+    expect(names.nth(0)).to_have_text("tube 40 m, pattern 1")  # the order stays too
+    compare.click()
+    expect(page.get_by_role("heading", level=1)).to_have_text("Comparison of 2 runs")
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() >= 3
+
+
+def test_the_answer_is_on_the_first_screen_of_a_finished_run(site: Site, page: Page) -> None:
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    tops = {
+        name: page.locator(place).first.evaluate("node => node.getBoundingClientRect().bottom")
+        for name, place in (
+            ("verdict", ".verdict-card"),
+            ("estimates", "table.estimates"),
+        )
+    }
+    plot = page.locator('[data-figure="response"]')
+    tops["outputs"] = plot.evaluate("node => node.getBoundingClientRect().top + 240")
+    assert max(tops.values()) < 800, tops
+    assert page.locator('[data-figure="history"]').evaluate(
+        "node => node.getBoundingClientRect().top > 800"
+    )
 
 
 def test_a_running_job_is_redrawn_as_events_arrive_and_nothing_moves(
@@ -156,7 +219,13 @@ def test_the_result_appears_when_a_running_job_ends(own_site: Site, page: Page) 
     end_running(own_site.parts.database, own_site.parts.store, own_site.filled.lease)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
     expect(page.locator("#job .chip")).to_have_text("succeeded")
-    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
+    expect(page.locator("[data-announcement]")).to_have_text("succeeded: trustworthy")
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 8
+    above = "node => node.getBoundingClientRect().top + scrollY"
+    tops = [
+        page.locator(f'[data-figure="{name}"]').evaluate(above) for name in ("response", "history")
+    ]
+    assert tops == sorted(tops)  # the answer is above the search now
 
 
 def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page) -> None:
@@ -266,6 +335,7 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     page.set_content(answer.text())
     page.wait_for_selector(".plot .main-svg")
     assert page.locator(".js-plotly-plot").count() == 7
+    expect(page.locator('.modebar-btn[data-title^="Share"]')).to_have_count(0)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
 
 

@@ -71,7 +71,10 @@ def test_faults_of_a_sweep_stand_at_their_fields(own_site: Site, page: Page) -> 
     expect(page.get_by_label("σ, as a list")).to_have_attribute("aria-invalid", "true")
     page.get_by_label("σ, as a list").fill("0, 0.1")
     page.get_by_role("button", name="Sweep").click()
-    expect(page.locator('[data-fault="/truth"]')).to_contain_text("K")
+    told = page.locator('[data-fault="/truth"]')
+    expect(told).to_contain_text("Give the true value of K.")
+    expect(told).to_contain_text("such as 10*cos(5*t).")
+    expect(page.locator("#form-fault")).not_to_contain_text("/")
     expect(page.locator('[data-fault="/sigma"]')).to_be_empty()
 
 

@@ -78,6 +78,7 @@ def test_items_are_found_edited_and_deleted_below_the_path(
     form.get_by_role("button", name="Filter").click()
     expect(page.locator("table.jobs tbody tr")).to_have_count(1)
     page.locator("table.jobs tbody a.name").click()
+    page.wait_for_load_state("networkidle")  # no figure of what is deleted is on its way
     page.get_by_role("button", name="Delete").first.click()
     dialog = page.get_by_role("dialog", name="Delete the job")
     dialog.get_by_role("button", name="Delete").click()

@@ -9,6 +9,7 @@ from playwright.sync_api import Page, expect
 
 from tests.batches import LENGTHS, copy_batch
 from tests.e2e.conftest import LIMIT_SECONDS, serve_folder
+from tests.e2e.test_late_answers import LIVE
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -26,8 +27,13 @@ def test_the_trend_is_drawn_and_a_run_accepted(server: tuple[str, str], page: Pa
     page.goto(job)
     trend = page.locator("#trend")
     expect(trend.locator(".js-plotly-plot")).to_be_visible()
-    expect(trend.locator(".plot .xtitle").first).to_have_text("length_m")
+    expect(trend.locator(".plot .xtitle").first).to_have_text("length [m]")
     expect(trend.locator("table").first.locator("tbody tr")).to_have_count(len(LENGTHS))
+    # As on a page that was opened before the first run ended: its choices come with the results.
+    chosen = trend.get_by_label("Accept the run")
+    chosen.evaluate("select => select.replaceChildren()")
+    page.evaluate(f"async () => (await import({LIVE})).refresh()")
+    expect(chosen.locator("option")).to_have_count(len(LENGTHS))
     trend.get_by_label("as the reference").fill("seen in a browser")
     trend.get_by_label("Accept the run").select_option(index=2)
     trend.get_by_role("button", name="Accept").click()

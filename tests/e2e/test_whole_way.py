@@ -57,7 +57,7 @@ def test_a_file_becomes_estimates_with_their_errors(
     delay = table.locator("tr", has=page.get_by_role("rowheader", name="L")).locator("td").first
     assert float(delay.inner_text()) == pytest.approx(L, abs=0.02)
     page.locator('[data-figure="response"]').scroll_into_view_if_needed()
-    expect(page.locator('[data-figure="response"] .scatterlayer .trace')).to_have_count(4)
+    expect(page.locator('[data-figure="response"] .scatterlayer .trace')).to_have_count(8)
 
 
 def test_a_long_search_is_watched_and_cancelled(

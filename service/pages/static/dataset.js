@@ -1,4 +1,4 @@
-// A dataset's page: its signals, and its dialogs.
+// A page with figures and dialogs: of a dataset, of a comparison.
 
 import './items.js';
 import { start } from './figures.js';

@@ -44,10 +44,23 @@ export function fillTable(model, changes) {
       row.append(document.createElement('td'));
       row.lastChild.append(input);
     }
-    row.append(makeElement('td', bounds?.unit ?? '–', 'muted'));
+    row.append(makeElement('td', bounds?.unit ?? '–', 'muted'), makeElement('td', bounds?.description ?? '', 'muted'));
+    row.dataset.row = name;
     return row;
   });
   rows.replaceChildren(...tableRows);
+}
+
+/** Show bounds and units that follow from the data, where nothing else was typed. */
+export function showProposals(proposals) {
+  for (const row of rows.querySelectorAll('[data-row]')) {
+    const proposal = proposals[row.dataset.row];
+    if (!proposal) continue;
+    for (const column of ['lower', 'upper'])
+      row.querySelector(`[data-column="${column}"]`).placeholder = String(Number(proposal[column].toPrecision(4)));
+    row.children[4].textContent = proposal.unit === '1' ? '–' : proposal.unit;
+    row.title = 'Bounds from the data. What you type replaces them.';
+  }
 }
 
 /** Read what differs from the model, as the job body has it. */
@@ -62,24 +75,31 @@ export function readOverrides() {
   return changes;
 }
 
-/** Show every fault next to the field of its pointer, or of the nearest pointer above. */
+/** Show every fault once: at its field, or above the button if the form has no field for it. */
 export function showFaults(form, problem) {
   const top = form.querySelector('#form-fault');
-  problem.errors.forEach((fault) => markFault(form, fault));
-  const summary = problem.errors.length ? 'The request is invalid:' : problem.document.title;
+  const others = problem.errors.filter((fault) => !markFault(form, fault));
+  const texts = problem.errors.length ? others.map((fault) => writeFault(nameField(null, fault.pointer), fault)) : [problem.message];
+  const summary = problem.errors.length > others.length ? 'Change the marked fields.' : problem.document.title;
   top.replaceChildren(makeElement('b', summary));
   const list = document.createElement('ul');
-  const texts = problem.errors.length ? problem.errors.map(formatFault) : [problem.message];
   texts.forEach((text) => list.append(makeElement('li', text)));
-  top.append(list);
+  if (texts.length) top.append(list);
   top.hidden = false;
   (form.querySelector('[aria-invalid="true"]') ?? top).focus();
 }
 
-const formatFault = ({ pointer, detail, column }) =>
-  `${pointer ? `${pointer}: ` : ''}${detail}${column ? ` (column ${column})` : ''}`;
+/** Name a field as the form does; one without a field by the words of its pointer. */
+const nameField = (input, pointer) =>
+  input?.ariaLabel || input?.labels?.[0]?.firstChild?.textContent.trim() || (pointer ?? '').split('/').filter(Boolean).join(', ');
 
-/** Mark the field of a fault, and write the fault below it. */
+/** Write a fault as a sentence. */
+function writeFault(name, { detail, column }) {
+  const text = `${name ? `${name}: ` : ''}${detail}${column ? ` (column ${column})` : ''}`;
+  return `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? '' : '.'}`;
+}
+
+/** Mark the field of a fault, and write the fault below it. Return whether the form has a place for it. */
 function markFault(form, fault) {
   const parts = (fault.pointer ?? '').split('/');
   for (; parts.length > 1; parts.pop()) {
@@ -88,7 +108,9 @@ function markFault(form, fault) {
     const place = form.querySelector(`[data-fault="/${CSS.escape(parts[1])}"]`);
     if (input) input.ariaInvalid = 'true';
     if ((input || parts.length === 2) && place) {
-      place.textContent = [place.textContent, formatFault(fault)].filter(Boolean).join('; ');
+      const isEmpty = input ? input.value.trim() === '' : pointer === fault.pointer;
+      const text = (isEmpty && (input ?? place).dataset.missing) || writeFault(nameField(input, fault.pointer), fault);
+      place.textContent = [place.textContent, text].filter(Boolean).join(' ');
       return true;
     }
   }

@@ -6,8 +6,7 @@ const dark = matchMedia('(prefers-color-scheme: dark)');
 const CONFIG = {
   displaylogo: false,
   responsive: true,
-  modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d'],
-  toImageButtonOptions: { format: 'svg' },
+  modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d', 'toImage', 'sendChartToCloud'], // nothing leaves this service
 };
 const seen = new WeakSet();
 const latest = new WeakMap();
@@ -17,7 +16,7 @@ export const listPlots = () => [...document.querySelectorAll('[data-figure]')];
 /** Build the address of a plot's figure, with what the user chose. */
 function buildAddress(plot, extra = {}) {
   const url = new URL(plot.dataset.url, location.href);
-  const query = new URLSearchParams(plot.dataset.query ?? '');
+  const query = new URLSearchParams([...url.searchParams, ...new URLSearchParams(plot.dataset.query ?? '')]);
   query.set('theme', dark.matches ? 'dark' : 'light');
   if (['convergence', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', countColumns(plot));
   for (const [name, value] of Object.entries(extra)) query.set(name, value);
@@ -44,12 +43,42 @@ export async function draw(plot, extra = {}) {
     await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
     plot.dataset.thinned = figure.layout.meta?.thinned ?? '';
     plot.dispatchEvent(new CustomEvent('drawn', { bubbles: true, detail: figure.layout }));
-    if (first) plot.on('plotly_relayout', (change) => onZoom(plot, change));
+    if (first) {
+      plot.on('plotly_relayout', (change) => onZoom(plot, change));
+      offerImages(plot);
+    }
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     if (latest.get(plot) === request && !plot.classList.contains('js-plotly-plot')) showMessage(plot, error.message);
   }
 }
+
+/** Offer a drawn plot as SVG and as PNG, beside its CSV. */
+function offerImages(plot) {
+  const tools = plot.closest('section')?.querySelector('.tools');
+  for (const format of tools ? ['svg', 'png'] : []) {
+    const button = makeElement('button', format.toUpperCase(), 'link');
+    button.type = 'button';
+    button.ariaLabel = `${plot.ariaLabel} as ${format.toUpperCase()}`;
+    button.addEventListener('click', () => window.Plotly.downloadImage(plot, {
+      format, filename: plot.dataset.figure, width: plot.clientWidth, height: plot.clientHeight, scale: format === 'png' ? 2 : 1,
+    }));
+    tools.append(button);
+  }
+}
+
+/** Draw every plot, fit all to a sheet, and print. */
+async function printAll() {
+  await Promise.all(listPlots().filter((plot) => !seen.has(plot)).map((plot) => {
+    seen.add(plot);
+    return draw(plot);
+  }));
+  document.body.classList.add('printing');
+  await fitPlots();
+  window.print();
+}
+
+const fitPlots = () => Promise.all([...document.querySelectorAll('.js-plotly-plot')].map((plot) => window.Plotly.Plots.resize(plot)));
 
 /** Request the profiles of a run, and draw them. */
 export async function drawProfiles(button) {
@@ -118,6 +147,29 @@ const watcher = new IntersectionObserver(
 
 /** Draw every plot once it is on the screen, including plots added since. */
 export const watch = () => listPlots().filter((plot) => !seen.has(plot)).forEach((plot) => watcher.observe(plot));
+
+// The figure lists its experiments.
+document.addEventListener('drawn', ({ target, detail }) => {
+  const names = detail.meta?.experiments ?? [];
+  const choice = document.querySelector(`[data-experiment="${target.dataset.figure}"]`);
+  if (!choice || names.length < 2 || choice.options.length) return;
+  names.forEach((name, place) => choice.append(new Option(`${place + 1} · ${name}`, place)));
+  choice.parentElement.hidden = false;
+});
+document.addEventListener('change', ({ target }) => {
+  const name = target.dataset.experiment;
+  if (name) setQuery(listPlots().find((p) => p.dataset.figure === name), 'experiment', target.value);
+});
+
+addEventListener('keydown', (event) => {
+  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== 'p') return;
+  event.preventDefault(); // the browser would not wait for the plots
+  printAll();
+});
+addEventListener('afterprint', () => {
+  document.body.classList.remove('printing');
+  fitPlots();
+});
 
 export function start() {
   watch();

@@ -1,24 +1,25 @@
 // New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
 
-import { Problem, address, ask, makeElement, keepLatest } from './live.js';
+import { Problem, address, ask, makeElement, keepLatest, post } from './live.js';
 import * as forms from './fields.js';
-import { clearFaults, fillTable, readOverrides } from './fields.js';
+import { clearFaults, fillTable, readOverrides, showProposals } from './fields.js';
+import { forgetPreview, previewDataset, readRange } from './preview.js';
+import { describeModel } from './equations.js';
 
 const panel = document.getElementById('new');
 const form = document.getElementById('job-form');
 const field = (name) => form.elements.namedItem(name);
-const state = { dataset: null, model: null, cloned: null, extra: {}, started: false };
+const state = { dataset: null, model: null, cloned: null, extra: {}, part: null };
 const query = new URLSearchParams(location.search);
+const USUAL_MODEL = 'fopdt';
 
-async function start() {
-  if (state.started) return;
-  state.started = true;
-  form.inert = true; // until all choices are loaded, because they replace what was typed
-  try {
-    await fill();
-  } finally {
-    form.inert = false;
-  }
+let filling = null;
+
+/** Load the choices once. The form is inert until they are there, because they replace what was typed. */
+function start() {
+  form.inert ||= !filling;
+  filling ??= fill().finally(() => (form.inert = false));
+  return filling;
 }
 
 async function fill() {
@@ -30,6 +31,8 @@ async function fill() {
   for (const { name, title } of models.items) field('model').append(new Option(title ? `${name} – ${title}` : name, name));
   if (query.get('clone')) await fillFrom(query.get('clone'));
   else {
+    field('model').value = query.get('fit') ?? USUAL_MODEL;
+    if (!field('model').value) field('model').selectedIndex = 0;
     if (query.get('dataset')) await selectDataset(query.get('dataset'));
     await showListedModel();
   }
@@ -88,8 +91,20 @@ async function showDataset() {
   state.dataset = answer.dataset;
   const facts = document.getElementById('dataset-facts');
   const channels = state.dataset?.channels ?? [];
+  if (state.dataset) previewDataset(form, state.dataset.id);
+  else forgetPreview(form);
   facts.textContent = channels.map(({ name, unit }) => (unit && unit !== '1' ? `${name} [${unit}]` : name)).join(' · ');
   mapChannels();
+}
+
+/** Store a file. Only the answer to the last choice of a recording is used. */
+const storeFile = keepLatest((question) => question());
+
+/** Forget the upload that is not answered yet, and what the form says of an earlier one. */
+function dropUpload() {
+  storeFile(async () => null);
+  showState('');
+  form.querySelector('[data-fault="/datasets"]').textContent = '';
 }
 
 async function upload() {
@@ -101,9 +116,10 @@ async function upload() {
     const options = new URLSearchParams({ name: file.name });
     const period = field('upload-period').value;
     if (period) options.set('sample_time', period);
-    const stored = await ask(address(`/v1/datasets?${options}`), {
+    const stored = await storeFile(() => ask(address(`/v1/datasets?${options}`), {
       method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
-    });
+    }));
+    if (!stored) return;
     await selectDataset(stored.id);
     showState([`${file.name} is stored`, ...stored.warnings].join(' · '));
   } catch (error) {
@@ -125,6 +141,7 @@ async function showListedModel(changes) {
   const [model, text] = answers;
   field('equations').value = text;
   field('equations').readOnly = true;
+  document.getElementById('yaml').open = false;
   applyModel(model.document, changes);
   showVerdict({ valid: true });
 }
@@ -132,6 +149,7 @@ async function showListedModel(changes) {
 async function showOwnModel(text, changes) {
   if (text !== undefined) field('equations').value = text;
   field('equations').readOnly = false;
+  document.getElementById('yaml').open = true;
   await checkModel(changes);
 }
 
@@ -149,22 +167,23 @@ async function checkModel(changes) {
 function showVerdict(result) {
   const place = document.getElementById('check');
   field('equations').ariaInvalid = String(!result.valid);
-  if (result.valid) return place.replaceChildren(makeElement('span', 'the model is valid', 'status identified'));
   const list = document.createElement('ul');
-  for (const error of result.errors) {
-    const where = [error.pointer, error.column && `column ${error.column}`].filter(Boolean).join(', ');
-    const item = makeElement('li', '', 'fault');
-    item.append(makeElement('b', where), ` ${error.detail}`);
+  for (const fault of (result.valid ? result.warnings : result.errors) ?? []) {
+    const where = [fault.pointer, fault.column && `column ${fault.column}`].filter(Boolean).join(', ');
+    const item = makeElement('li', '', result.valid ? '' : 'fault');
+    item.append(makeElement('b', where), ` ${fault.detail}`);
     list.append(item);
   }
-  place.replaceChildren(makeElement('span', 'the model is not valid yet', 'fault'), list);
+  const verdict = result.valid ? ['the model is valid', 'status identified'] : ['the model is not valid yet', 'fault'];
+  place.replaceChildren(makeElement('span', ...verdict), ...(list.children.length ? [list] : []));
 }
 
-function applyModel(document, changes) {
-  const same = JSON.stringify(state.model) === JSON.stringify(document);
-  state.model = document;
+function applyModel(model, changes) {
+  const same = JSON.stringify(state.model) === JSON.stringify(model);
+  state.model = model;
   if (same && !changes) return;
-  fillTable(document, changes ?? readOverrides());
+  describeModel(model);
+  fillTable(model, changes ?? readOverrides());
   mapChannels();
 }
 
@@ -187,6 +206,19 @@ function mapChannels(wanted = {}, held = readHolds()) {
     return label;
   });
   document.getElementById('channels').replaceChildren(...choices, ...inputs.map((signal) => makeHoldChoice(signal, held[signal])));
+  proposeBounds();
+}
+
+const fetchBounds = keepLatest((url) => ask(url));
+
+/** Show the bounds that a listed model takes from the chosen channels. */
+async function proposeBounds() {
+  if (isOwn() || !state.dataset) return;
+  const url = new URL(address(`/pages/datasets/${encodeURIComponent(state.dataset.id)}/bounds`));
+  url.searchParams.set('model', field('model').value);
+  for (const [signal, name] of Object.entries(readChannels())) url.searchParams.append('channel', `${signal}=${name}`);
+  const proposals = await fetchBounds(url).catch(() => null); // the submission tells what does not fit
+  if (proposals) showProposals(proposals);
 }
 
 /** Make the choice of an input's hold. A wrong hold moves a time lag by half a sample. */
@@ -231,7 +263,7 @@ function buildBody() {
     ...(sweep?.axes?.length ? { sweep } : {}),
     name: field('name').value.trim() || null,
     model: isOwn() ? getOwnModel() : field('model').value,
-    datasets: datasets.filter(Boolean),
+    datasets: state.part ? [state.part] : datasets.filter(Boolean),
     channels: readChannels(),
     hold: readHolds(),
     validation: validation === 'clone' ? extra.validation : buildValidation(validation),
@@ -250,8 +282,30 @@ function buildValidation(value) {
   return value.startsWith('ds_') ? { datasets: [value] } : { fraction: Number(value) };
 }
 
-/** Own equations are checked before they are sent. */
+/** Store the chosen part of the recording, if it is not all of it. */
+async function cutRecording() {
+  const range = readRange(form);
+  state.part = null;
+  if (!range || !state.dataset) return true;
+  try {
+    const part = await post(address(`/v1/datasets/${encodeURIComponent(state.dataset.id)}:derive`), { steps: [{ trim: range }] });
+    state.part = part.id;
+    return true;
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    form.querySelector('[data-fault="/datasets"]').textContent = `The part of the recording: ${error.errors[0]?.detail ?? error.message}.`;
+    showState('');
+    field('from').focus();
+    return false;
+  }
+}
+
+/** Own equations are checked, and the part of the recording is cut, before the job is sent. */
 async function isReady() {
+  return (await isModelReady()) && cutRecording();
+}
+
+async function isModelReady() {
   while (isOwn()) {
     const usable = await checkModel();
     if (usable) return true;
@@ -278,8 +332,28 @@ function openPanel() {
   if (location.hash === '#new') panel.open = true;
 }
 
-field('dataset').addEventListener('change', withFaults(showDataset));
+field('dataset').addEventListener('change', withFaults(() => {
+  dropUpload();
+  return showDataset();
+}));
 for (const name of ['upload', 'upload-period']) field(name).addEventListener('change', withFaults(upload));
+document.getElementById('channels').addEventListener('change', proposeBounds);
+for (const kind of ['dragover', 'drop'])
+  document.addEventListener(kind, (event) => {
+    if (![...event.dataTransfer.types].includes('Files')) return;
+    event.preventDefault();
+    if (kind === 'drop') dropFile(event.dataTransfer.files);
+  });
+
+/** Upload a file that was dropped on the page. */
+async function dropFile(files) {
+  panel.open = true;
+  await start();
+  field('upload').files = files;
+  field('upload').dispatchEvent(new Event('change', { bubbles: true }));
+  panel.scrollIntoView();
+}
+
 field('model').addEventListener('change', withFaults(() => {
   field('source').value = 'listed';
   // Clear the old model's table at once, so that no typed value is lost.

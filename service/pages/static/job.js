@@ -1,6 +1,7 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
 import './items.js';
+import './lists.js';
 import { start, setQuery, listPlots, drawProfiles, redraw, watch } from './figures.js';
 import { Problem, address, post, put, refresh, throttle } from './live.js';
 
@@ -24,6 +25,21 @@ const renew = throttle(async () => {
   else close();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
 }, 1000 + Number(runs) / 10); // the page of a sweep reads all of its runs
+
+const ANNOUNCE_MS = 10_000;
+let announced = 0;
+
+/** Tell a screen reader how far the job is: its state at once, its progress now and then. */
+document.addEventListener('refreshed', () => {
+  const place = document.querySelector('[data-announcement]');
+  const state = document.querySelector('[data-live="chip"]').textContent.trim();
+  const isNew = !place.textContent.startsWith(state);
+  if (!isNew && (!isOpen() || performance.now() - announced < ANNOUNCE_MS)) return;
+  announced = performance.now();
+  const verdict = document.querySelector('.verdict-card h2')?.textContent;
+  const progress = document.querySelector('[data-live="head"] .row small')?.textContent;
+  place.textContent = [state, isOpen() ? progress : verdict].filter(Boolean).join(': ');
+});
 
 function listen() {
   if (!isOpen() || (stream && stream.readyState !== EventSource.CLOSED)) return; // a finished job opens no stream
@@ -95,19 +111,6 @@ function chooseAbscissa(button) {
   for (const choice of button.parentElement.children) choice.ariaPressed = String(choice === button);
   setQuery(listPlots().find((p) => p.dataset.figure === 'history'), 'abscissa', button.dataset.abscissa);
 }
-
-// The figure lists its experiments.
-document.addEventListener('drawn', ({ target, detail }) => {
-  const names = detail.meta?.experiments ?? [];
-  const choice = document.querySelector(`[data-experiment="${target.dataset.figure}"]`);
-  if (!choice || names.length < 2 || choice.options.length) return;
-  names.forEach((name, place) => choice.append(new Option(`${place + 1} · ${name}`, place)));
-  choice.parentElement.hidden = false;
-});
-document.addEventListener('change', ({ target }) => {
-  const name = target.dataset.experiment;
-  if (name) setQuery(listPlots().find((p) => p.dataset.figure === name), 'experiment', target.value);
-});
 
 addEventListener('pagehide', close);
 addEventListener('pageshow', (event) => event.persisted && listen());

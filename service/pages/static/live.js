@@ -2,7 +2,7 @@
 
 const PROBLEM = 'application/problem+json';
 
-/** Replace the shown run if another run of the sweep is now the best. */
+/** Replace the shown run if another run of the sweep is now the best, or if it has ended. */
 function replaceRun(fresh) {
   const [current, next] = [document, fresh].map((root) => root.getElementById('run'));
   if (current && next && current.dataset.run !== next.dataset.run) current.replaceWith(document.adoptNode(next.cloneNode(true)));
@@ -11,7 +11,7 @@ function replaceRun(fresh) {
 const fetchPage = keepLatest(() => ask(location.href, { headers: { Accept: 'text/html' } }));
 
 /**
- * Replace every live region whose content has changed; nothing else of the page moves.
+ * Replace every live region whose content has changed; nothing else of the page moves. Ticked runs stay ticked.
  * If calls overlap, only the answer to the last one is used. An earlier answer may be outdated.
  */
 export async function refresh() {
@@ -25,11 +25,15 @@ export async function refresh() {
     region.dataset.open = next.dataset.open ?? '';
     if (next.innerHTML === region.innerHTML) continue;
     const focused = region.contains(document.activeElement) ? findFocus(region) : -1;
-    const scrolled = region.scrollTop;
+    const { scrollTop, value } = region;
+    const ticked = [...region.querySelectorAll(':checked[name="run"]')].map((box) => box.value);
     region.replaceChildren(...document.adoptNode(next).childNodes);
-    region.scrollTop = scrolled;
+    region.scrollTop = scrollTop;
+    if (region.matches('select') && [...region.options].some((option) => option.value === value)) region.value = value;
+    for (const box of region.querySelectorAll('[type="checkbox"][name="run"]')) box.checked = ticked.includes(box.value);
     if (focused >= 0) listFocusable(region)[focused]?.focus({ preventScroll: true });
   }
+  document.dispatchEvent(new Event('refreshed'));
 }
 
 const listFocusable = (region) => [...region.querySelectorAll('a[href], button, select, input')];

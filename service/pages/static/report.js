@@ -3,7 +3,7 @@
   const read = (node) => JSON.parse(node.textContent);
   const templates = read(document.getElementById('templates'));
   const dark = matchMedia('(prefers-color-scheme: dark)');
-  const config = { displaylogo: false, responsive: true, toImageButtonOptions: { format: 'svg' } };
+  const config = { displaylogo: false, responsive: true, toImageButtonOptions: { format: 'svg' }, modeBarButtonsToRemove: ['sendChartToCloud'] };
   const draw = () => {
     for (const plot of document.querySelectorAll('.plot')) {
       const { data, layout } = read(document.getElementById(plot.dataset.source));

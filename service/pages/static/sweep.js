@@ -25,9 +25,11 @@ function drawTruth() {
   const formatUnit = (unit) => (unit && unit !== '1' ? ` [${unit}]` : '');
   const parameters = Object.entries(model.parameters ?? {})
     .filter(([, parameter]) => parameter?.tied === undefined)
-    .map(([name, parameter]) => makeField(`true ${name}${formatUnit(parameter?.unit)}`, `/truth/parameters/${name}`, { truth: name }));
+    .map(([name, parameter]) => makeField(`true ${name}${formatUnit(parameter?.unit)}`, `/truth/parameters/${name}`,
+      { truth: name, missing: `Give the true value of ${name}.` }));
   const inputs = listInputs(model).map((name) =>
-    makeField(`input ${name}${formatUnit(model.inputs[name])}`, `/truth/inputs/${name}`, { input: name }, 'such as 10*cos(5*t)'));
+    makeField(`input ${name}${formatUnit(model.inputs[name])}`, `/truth/inputs/${name}`,
+      { input: name, missing: `Write the input ${name} as a function of the time t, such as 10*cos(5*t).` }, 'such as 10*cos(5*t)'));
   document.getElementById('truth-values').replaceChildren(...parameters, ...inputs);
 }
 

@@ -1,4 +1,4 @@
-"""The page of the REST interface: complete, and nothing on it comes from elsewhere."""
+"""The page of the REST interface: Swagger UI from this server, and nothing from elsewhere."""
 
 import re
 
@@ -14,24 +14,25 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> TestClient:
     return TestClient(create_app(settings_of(tmp_path_factory.mktemp("reference"))))
 
 
-def test_every_operation_of_the_openapi_document_is_on_the_page(client: TestClient) -> None:
-    page = client.get("/docs").text
-    document = client.get("/openapi.json").json()
-    for path, item in document["paths"].items():
-        for method in item:
-            assert f"{method.upper()} {path}" in page
+def find_addresses(page: str) -> list[str]:
+    return re.findall(r'(?:src|href|data-document)="([^"]+)"', page)
 
 
-def test_the_page_shows_the_fields_of_a_job_with_their_defaults(client: TestClient) -> None:
-    page = client.get("/docs").text
-    job = page[page.index("POST /v1/jobs<") :]
-    assert re.search(r"<code>prediction</code></td><td>simulation \| one-step</td>", job)
-    assert re.search(r"<code>datasets</code> \(required\)</td><td>list of string", job)
-    assert "<summary>Example</summary><pre>{" in job
-    assert "&#34;model&#34;: &#34;fopdt&#34;" in job
-
-
-def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
-    loaded = re.findall(r'(?:src|href)="([^"]+)"', client.get("/docs").text)
-    assert loaded
+def test_what_the_page_loads_is_on_this_server(client: TestClient) -> None:
+    loaded = find_addresses(client.get("/docs").text)
     assert [one for one in loaded if not one.startswith(("/", "#"))] == []
+    files = [one for one in loaded if one.startswith("/static/") or one == "/openapi.json"]
+    assert [one for one in files if client.get(one).status_code != 200] == []
+    assert len([one for one in files if "swagger-ui" in one]) == 2
+
+
+def test_bundles_may_be_cached_for_ever_since_their_names_have_a_version(
+    client: TestClient,
+) -> None:
+    [script] = re.findall(r"/static/swagger-ui-[\d.]+\.js", client.get("/docs").text)
+    answer = client.get(script, headers={"Accept-Encoding": "gzip"})
+    assert "immutable" in answer.headers["Cache-Control"]
+    assert answer.headers["Content-Encoding"] == "gzip"
+    plain = client.get(script, headers={"Accept-Encoding": "identity"})
+    assert plain.text == answer.text
+    assert plain.headers["Content-Type"].startswith("text/javascript")

@@ -1,0 +1,116 @@
+"""The documentation that a server shows: its Markdown pages, as they are in the repository.
+
+A page has the address of its file, so links between pages lead where they lead in the repository.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from posixpath import dirname, join, normpath
+
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
+from markupsafe import Markup
+
+from service.core.errors import NotFound
+
+INDEX = "README.md"
+_SITE_ONLY = "index.md"  # its lists are of the site's builder
+FILES = (".png", ".json", ".ipynb")
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """A page of the documentation; `html` is its content."""
+
+    title: str
+    html: Markup
+    is_index: bool
+
+
+@cache
+def read_guide(path: str) -> Guide:
+    """Read a page of the documentation.
+
+    Parameters
+    ----------
+    path : str
+        Of its file, from the folder of the documentation. A folder lists its pages.
+
+    Raises
+    ------
+    NotFound
+        If there is no such page.
+    """
+    file = _list_files().get(path)
+    if file is not None and file.suffix == ".md":
+        text = file.read_text(encoding="utf-8")
+    else:
+        text = _list_folder(path)
+    title = re.search(r"^# (.+)$", text, re.M)
+    html = _render(text, path)
+    return Guide(title[1] if title else "lagid", Markup(html), path == INDEX)
+
+
+def find_file(path: str) -> Path | None:
+    """Find a picture or another file of a page; None if there is none."""
+    file = _list_files().get(path)
+    return file if file is not None and file.suffix in FILES else None
+
+
+@cache
+def _list_files() -> dict[str, Path]:
+    """List pages and files by their paths; only what is listed is ever opened."""
+    folder = _find_folder()
+    return {
+        path.relative_to(folder).as_posix(): path
+        for suffix in (".md", *FILES)
+        for path in folder.rglob(f"*{suffix}")
+        if path.name != _SITE_ONLY
+    }
+
+
+def _find_folder() -> Path:
+    """Find the documentation: in the installed package, or in the checkout."""
+    spec = find_spec("service.guides")
+    if spec is not None and spec.submodule_search_locations:
+        return Path(next(iter(spec.submodule_search_locations)))
+    return Path(__file__).resolve().parents[2] / "docs"
+
+
+def _list_folder(path: str) -> str:
+    """List the pages of a folder as Markdown, each by its title."""
+    folder = path.rstrip("/") + "/"
+    found = [name for name in sorted(_list_files()) if name.startswith(folder)]
+    pages = [name for name in found if name.endswith(".md") and "/" not in name[len(folder) :]]
+    if not pages:
+        raise NotFound("page", path)
+    lines = [f"* [{read_guide(name).title}]({name[len(folder) :]})" for name in pages]
+    return "\n".join([f"# {folder.rstrip('/').capitalize()}", "", *lines])
+
+
+def _render(text: str, path: str) -> str:
+    parser = MarkdownIt("commonmark").enable("table")
+    tokens = parser.parse(text)
+    for token, content in zip(tokens, [*tokens[1:], None], strict=True):
+        if token.type == "heading_open" and content is not None:
+            token.attrs["id"] = _name_anchor(content.content)
+        _keep_inside(token.children or [], path)
+    html = str(parser.renderer.render(tokens, parser.options, {}))
+    return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)  # an empty heading is none
+
+
+def _name_anchor(heading: str) -> str:
+    """Name a heading for links, as forges do."""
+    words = re.sub(r"[^\w\- ]", "", heading.lower())
+    return words.strip().replace(" ", "-")
+
+
+def _keep_inside(tokens: list[Token], path: str) -> None:
+    """Point links that leave the documentation to nothing: a server has no repository."""
+    for token in tokens:
+        target = str(token.attrs.get("href", ""))
+        if normpath(join(dirname(path), target)).startswith(".."):
+            token.attrs["href"] = "#"

@@ -1,0 +1,34 @@
+"""Pages for keyboards and screen readers: the rules of axe find nothing, light and dark."""
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page
+
+from tests.e2e.conftest import Site
+
+PATHS = (
+    "/",
+    "/datasets",
+    "/datasets/{dataset}",
+    "/jobs/{sweep}",
+    "/jobs/{failed}",
+    "/runs/{finished_run}",
+    "/runs/{finished_run}/simulate",
+    "/new/noise-sweep",
+    "/new/reidentify",
+    "/guides/README.md",
+    "/guides/uncertainty.md",
+)
+
+
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.night)])
+def test_axe_finds_nothing(site: Site, page: Page, scheme: str) -> None:
+    page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+    axe, found = Axe(), []
+    for path in PATHS:
+        page.goto(site.url + path.format(**vars(site.filled)))
+        page.wait_for_load_state("networkidle")
+        for fault in axe.run(page).response["violations"]:
+            places = [node["target"][0] for node in fault["nodes"]]
+            found.append(f"{path}: {fault['id']}: {fault['help']}: {places[:4]}")
+    assert not found, "\n".join(found)

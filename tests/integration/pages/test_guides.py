@@ -1,0 +1,71 @@
+"""The server shows the documentation: every page, its pictures, and links that lead somewhere."""
+
+import re
+from pathlib import PurePosixPath
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.app import create_app
+from tests.repository import ROOT
+from tests.rest import settings_of
+
+FOLDERS = ("", "tutorials", "howto", "answers", "explanation", "decisions", "notes")
+PAGES = sorted(
+    path.relative_to(ROOT / "docs").as_posix()
+    for folder in FOLDERS
+    for path in (ROOT / "docs" / folder).glob("*.md")
+    if path.name != "index.md"
+)
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> TestClient:
+    return TestClient(create_app(settings_of(tmp_path_factory.mktemp("guides"))))
+
+
+def list_targets(page: str, html: str) -> set[str]:
+    """Addresses inside the documentation to which a page leads, from its root."""
+    targets = set()
+    [article] = re.findall(r'<article class="card guide">(.*)</article>', html, re.S)
+    for address in re.findall(r'(?:src|href)="([^"#:]+)', article):
+        if address.startswith(("/", "http")):
+            continue
+        parts: list[str] = []
+        for part in (PurePosixPath(page).parent / address).parts:
+            parts = parts[:-1] if part == ".." else [*parts, part]
+        targets.add("/".join(parts))
+    return targets
+
+
+def test_every_page_is_shown_and_its_links_lead_somewhere(client: TestClient) -> None:
+    broken = []
+    for page in PAGES:
+        answer = client.get(f"/guides/{page}")
+        assert answer.status_code == 200
+        broken += [
+            f"{page}: {target}"
+            for target in sorted(list_targets(page, answer.text))
+            if client.get(f"/guides/{target}").status_code != 200
+        ]
+    assert len(PAGES) > 60
+    assert broken == []
+
+
+def test_headings_have_anchors_as_on_a_forge(client: TestClient) -> None:
+    page = client.get("/guides/model.md").text
+    assert '<h2 id="lagged-states">Lagged states</h2>' in page
+
+
+def test_pictures_come_with_their_type(client: TestClient) -> None:
+    picture = client.get("/guides/tutorials/pictures/first_time_lag.png")
+    assert picture.headers["Content-Type"] == "image/png"
+    assert picture.content.startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["nothing.md", "%2e%2e/README.md", "..%2fREADME.md", "%2fetc%2fpasswd", "site/conf.py", ""],
+)
+def test_only_the_documentation_is_shown(client: TestClient, path: str) -> None:
+    assert client.get(f"/guides/{path}", follow_redirects=False).status_code == 404
