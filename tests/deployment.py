@@ -80,6 +80,19 @@ class Deployment:
                 service, _, number = name.rpartition("-")
                 self.start(service, int(number))
 
+    def run(self, service: str, *command: str) -> str:
+        """Run a command once in the environment of a service; return what it prints."""
+        done = subprocess.run(
+            command,
+            env=self._build_environment(service, f"{service}-once"),
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
     def check_health(self, service: str, number: int = 0) -> bool:
         """Run the health check of a service, as an engine does, and return whether it is well."""
         environment = self._build_environment(service, f"{service}-{number}")

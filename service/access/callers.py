@@ -13,6 +13,7 @@ from service.access.scopes import SCOPES, Scope, include_scopes
 from service.access.tokens import hash_secret, is_secret, make_secret, parse_token
 from service.core.errors import OutOfScope, Unauthorized
 from service.core.settings import Settings, is_loopback
+from service.repositories.audit import record_action
 from service.repositories.keys import (
     USE_INTERVAL,
     add_web_session,
@@ -126,8 +127,17 @@ def find_caller(database: Database, settings: Settings, credentials: Credentials
     return Caller(key.project_id, key.id, _read_scopes(key), key.name, has_session)
 
 
-def sign_in(database: Database, token: str, lifetime: timedelta) -> tuple[str, datetime]:
+def sign_in(
+    database: Database,
+    token: str,
+    lifetime: timedelta,
+    *,
+    cookie: str | None = None,
+    request_id: str | None = None,
+) -> tuple[str, datetime]:
     """Start the session of a browser; return its secret and its end.
+
+    The secret is always new, and the session of the browser's `cookie` ends.
 
     Raises
     ------
@@ -137,23 +147,39 @@ def sign_in(database: Database, token: str, lifetime: timedelta) -> tuple[str, d
     with database.read_session() as session:
         key = _check_token(session, token)
     secret, ends_at = make_secret(), datetime.now(UTC) + lifetime
-    owner = SessionOwner(key.project_id, key.id)
+    owner = SessionOwner(key.project_id, key.id, request_id)
     with database.open_for(owner).write_session() as session:
+        if cookie is not None:
+            end_web_session(session, hash_secret(cookie))
         end = min(filter(None, (ends_at, key.expires_at)))
         add_web_session(session, key, hash_secret(secret), end)
     _note_use(database, key)
     return secret, end
 
 
-def sign_out(database: Database, cookie: str) -> None:
+def sign_out(database: Database, cookie: str, request_id: str | None = None) -> None:
     """End the session of a browser, if there is one."""
     digest = hash_secret(cookie)
     with database.read_session() as session:
         key = find_session_key(session, digest)
     if key is not None:
-        owner = SessionOwner(key.project_id, key.id)
+        owner = SessionOwner(key.project_id, key.id, request_id)
         with database.open_for(owner).write_session() as session:
             end_web_session(session, digest)
+
+
+def record_refusal(
+    database: Database, key_id: str, address: str, request_id: str | None = None
+) -> None:
+    """Write into the audit log of a key's project that a request with it was refused."""
+    with suppress(OperationalError):
+        with database.read_session() as session:
+            key = session.get(ApiKey, key_id)
+        if key is None:
+            return
+        owner = SessionOwner(key.project_id, f"address:{address}", request_id)
+        with database.open_for(owner).write_session(NOTE_BUSY_SECONDS) as session:
+            record_action(session, "key.refuse", key.id)
 
 
 def _check_token(session: Session, token: str) -> ApiKey:
@@ -165,6 +191,7 @@ def _check_token(session: Session, token: str) -> ApiKey:
             "the API key is unknown, has expired, or was revoked. Need a key of the form "
             "lagid_…_…, made by `lagid key create`",
             is_wrong=True,
+            key_id=parts.key_id if parts else None,
         )
     return key
 

@@ -1,6 +1,7 @@
 """Routes of access: who asks, the audit log, and the pages to sign in and to manage keys."""
 
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Query, Request
@@ -8,12 +9,13 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from service.access import keys
-from service.access.callers import sign_in, sign_out
+from service.access.callers import record_refusal, sign_in, sign_out
 from service.access.schemas import AccessOut, AuditEntryOut, AuditPage, LimitsOut, UseOut
 from service.access.scopes import Scope
 from service.api.access_check import COOKIE
 from service.api.dependencies import CallerDep, Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.api.html import HtmlPage
+from service.api.request_log import get_request_id
 from service.core.errors import InvalidRequest, Unauthorized
 from service.core.root_path import get_root_path, to_address
 from service.pages.access import keys_page, sign_in_page
@@ -75,9 +77,20 @@ async def start_session(
     """Start the session of a browser, and lead it to where it was going."""
     target = _check_local(next_page)
     lifetime = timedelta(hours=parts.settings.session_hours)
+    address = request.client.host if request.client else ""
+    request_id = get_request_id(request)
+    record = partial(record_refusal, parts.database, address=address, request_id=request_id)
+    start = partial(
+        sign_in,
+        parts.database,
+        key,
+        lifetime,
+        cookie=request.cookies.get(COOKIE),
+        request_id=request_id,
+    )
     try:
-        async with parts.failures.delay_failures():
-            secret, end = await run_in_threadpool(sign_in, parts.database, key, lifetime)
+        async with parts.failures.delay_failures(address, record):
+            secret, end = await run_in_threadpool(start)
     except Unauthorized as error:
         return HtmlPage(sign_in_page(target, error.detail), error.status, error.headers)
     answer = RedirectResponse(to_address(target.removeprefix(get_root_path())), 303)
@@ -97,7 +110,7 @@ async def start_session(
 def end_session(request: Request, parts: PartsDep) -> Response:
     """End the session of a browser."""
     if COOKIE in request.cookies:
-        sign_out(parts.database, request.cookies[COOKIE])
+        sign_out(parts.database, request.cookies[COOKIE], get_request_id(request))
     answer = RedirectResponse(to_address("/sign-in"), 303)
     answer.delete_cookie(COOKIE, path=get_root_path() or "/", httponly=True, samesite="strict")
     return answer

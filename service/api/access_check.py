@@ -4,6 +4,7 @@ A request without a valid key is answered by 401, or a page by the way to sign i
 request needs goes by its method and path (`service.access.scopes`), so that a new route needs one.
 """
 
+from functools import partial
 from urllib.parse import quote
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -12,11 +13,12 @@ from starlette.requests import Request, cookie_parser
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.access.callers import NOBODY, Caller, Credentials, find_caller
+from service.access.callers import NOBODY, Caller, Credentials, find_caller, record_refusal
 from service.access.scopes import find_needed_scope
 from service.api.dependencies import Parts
 from service.api.html import wants_html
 from service.api.problems import answer_error
+from service.api.request_log import get_request_id
 from service.api.root_path import get_service_path
 from service.core.errors import ServiceError, Unauthorized
 from service.core.root_path import to_address
@@ -59,7 +61,9 @@ class AccessCheck:
             return NOBODY
         parts: Parts = request.app.state.parts
         credentials = read_credentials(request, self._settings)
-        async with parts.failures.delay_failures():
+        peer, request_id = request.state.peer, get_request_id(request)
+        record = partial(record_refusal, parts.database, address=peer, request_id=request_id)
+        async with parts.failures.delay_failures(peer, record):
             caller = await run_in_threadpool(
                 find_caller, parts.database, self._settings, credentials
             )

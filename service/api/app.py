@@ -35,7 +35,7 @@ from service.api.root_path import RootPath
 from service.core.settings import Settings
 from service.queue.orphaned_jobs import Reaper
 from service.storage.open_storage import open_storage
-from service.upkeep.housekeeper import Housekeeper
+from service.upkeep.housekeeper import Housekeeper, KeptDays
 
 DESCRIPTION = (
     "Identification of nonlinear time-lag systems. Upload a recording, name a model or write its "
@@ -114,7 +114,8 @@ def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]
     async def run(app: FastAPI) -> AsyncIterator[None]:
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)
         reaper = Reaper(parts.database, parts.stopping)
-        housekeeper = Housekeeper(parts.database, parts.store, settings.keep_days, parts.stopping)
+        keep = KeptDays(jobs=settings.keep_days, audit=settings.keep_audit_days)
+        housekeeper = Housekeeper(parts.database, parts.store, keep, parts.stopping)
         reaper.start()
         housekeeper.start()
         try:

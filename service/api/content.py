@@ -122,7 +122,7 @@ def content_response(
         **CROSS_ORIGIN,
         "Accept-Ranges": "bytes",
         "ETag": etag,
-        "Cache-Control": "private, max-age=31536000, immutable",
+        "Cache-Control": "private, no-cache",  # kept, but not used without asking for the key
         "Content-Disposition": f'attachment; filename="{file_name}"',
     }
     if "if-match" in request.headers and not _matches_etag(request.headers["if-match"], etag):

@@ -13,6 +13,7 @@ from service.access.callers import Caller
 from service.api.event_feed import EventFeed
 from service.api.failure_delay import FailureDelay
 from service.api.request_log import get_request_id
+from service.api.store_probe import StoreProbe
 from service.core.settings import Settings
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database, SessionOwner
@@ -32,6 +33,8 @@ class Parts:
         Places of the uploads that are received and read at once.
     feed : EventFeed
         The events of all jobs that have a stream.
+    probe : StoreProbe
+        Tells whether objects can be written.
     failures : FailureDelay
         Delays the answers to wrong keys.
     """
@@ -42,6 +45,7 @@ class Parts:
     stopping: Event
     upload_places: asyncio.Semaphore
     feed: EventFeed
+    probe: StoreProbe
     failures: FailureDelay = field(default_factory=FailureDelay)
 
     @classmethod
@@ -49,9 +53,8 @@ class Parts:
         """Build the parts of a process."""
         stopping = Event()
         feed = EventFeed(database, stopping, settings.poll_seconds, settings.max_streams)
-        return cls(
-            settings, database, store, stopping, asyncio.Semaphore(settings.max_uploads), feed
-        )
+        places = asyncio.Semaphore(settings.max_uploads)
+        return cls(settings, database, store, stopping, places, feed, StoreProbe(store))
 
     def open_for(self, owner: SessionOwner) -> "Parts":
         """Return the same parts for requests of an owner."""

@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Header, Request
 from fastapi.responses import Response, StreamingResponse
@@ -17,12 +17,14 @@ from service.api.dependencies import Parts, PartsDep
 from service.api.event_feed import EventBatch
 from service.core.errors import InvalidRequest
 from service.core.text_checks import MANY, parse_digits
+from service.repositories.events import EventKind
 from service.repositories.jobs import JobRepository
 from service.storage.retry import TRANSIENT_ERRORS, is_transient
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 KEEP_ALIVE_S = 15.0
+EVENTS_TYPE = "text/event-stream"
 NO_BUFFER = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 
 
@@ -33,7 +35,7 @@ class EventStreamResponse(StreamingResponse):
     that are opened at once cannot pass the limit together.
     """
 
-    media_type = "text/event-stream"
+    media_type = EVENTS_TYPE
 
     def __init__(
         self,
@@ -50,15 +52,30 @@ class EventStreamResponse(StreamingResponse):
             await super().__call__(scope, receive, send)
 
 
-ENDED: dict[int | str, dict[str, Any]] = {
-    204: {"description": "The job has ended, and there is no further event"}
+EVENT_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "description": "one event; its data is a JSON object",
+    "properties": {
+        "id": {"type": "string", "description": "number of the event, for `Last-Event-ID`"},
+        "event": {"enum": list(get_args(EventKind)), "description": "kind of the event"},
+        "data": {
+            "type": "string",
+            "contentMediaType": "application/json",
+            "description": "what happened; `at` is when, UTC",
+        },
+    },
+    "required": ["id", "event", "data"],
+}
+ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"content": {EVENTS_TYPE: {"itemSchema": EVENT_SCHEMA}}},
+    204: {"description": "The job has ended, and there is no further event"},
 }
 LastEventId = Annotated[
     str | None, Header(description="id of the last event that was received; then the next follow")
 ]
 
 
-@router.get("/{job_id}/events", response_class=EventStreamResponse, responses=ENDED)
+@router.get("/{job_id}/events", response_class=EventStreamResponse, responses=ANSWERS)
 async def stream_events(
     job_id: str, request: Request, parts: PartsDep, last_event_id: LastEventId = None
 ) -> Response:

@@ -35,7 +35,7 @@ def draw_run_figure(
     run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
     """Draw a figure of a run as Plotly JSON, or export its numbers as CSV."""
-    return _figure_response(
+    return figure_response(
         load_run_figure(session, parts.store, run_id, name, choice), name, choice
     )
 
@@ -43,13 +43,13 @@ def draw_run_figure(
 @router.get("/v1/jobs/{job_id}/figures/summary", tags=["jobs"], **FIGURE)
 def draw_summary_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
     """Draw errors against the noise (Figure 15) as Plotly JSON, or export the numbers as CSV."""
-    return _figure_response(load_noise_figure(session, job_id, choice), "summary", choice)
+    return figure_response(load_noise_figure(session, job_id, choice), "summary", choice)
 
 
 @router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], **FIGURE)
 def draw_trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
     """Draw estimates over a batch's label as Plotly JSON, or export the numbers as CSV."""
-    return _figure_response(load_trend_figure(session, job_id, choice), "trend", choice)
+    return figure_response(load_trend_figure(session, job_id, choice), "trend", choice)
 
 
 @router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"], **FIGURE)
@@ -58,7 +58,7 @@ def draw_dataset_figure(
 ) -> Response:
     """Draw the signals of a dataset as Plotly JSON, or export the numbers as CSV."""
     figure = load_dataset_figure(session, parts.store, dataset_id, choice)
-    return _figure_response(figure, "signals", choice)
+    return figure_response(figure, "signals", choice)
 
 
 @router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
@@ -70,7 +70,8 @@ def export_report(job_id: str, request: Request, parts: PartsDep, session: ReadS
     return HTMLResponse(text, headers={"Content-Security-Policy": policy})
 
 
-def _figure_response(figure: Figure, name: str, choice: FigureChoice) -> Response:
+def figure_response(figure: Figure, name: str, choice: FigureChoice) -> Response:
+    """Answer with a figure as Plotly JSON, or with its numbers as CSV."""
     if choice.format == "csv":
         return csv_response(to_csv(figure), name)
     return JSONResponse(apply_theme(figure, choice.theme))

@@ -10,7 +10,6 @@ from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, Write
 from service.api.items import Cascade, IfMatch, JobFilterDep, Tags, delete, edit, set_etag
 from service.core.root_path import to_address
 from service.core.states import JobState
-from service.datasets.rms_unit import find_rms_unit
 from service.items.schemas import DeletedOut, EditIn
 from service.jobs import submit
 from service.jobs.schemas import JobIn, JobOut, JobPage
@@ -73,7 +72,7 @@ def read_job(job_id: str, session: ReadSession, response: Response) -> JobOut:
     """Read one job: state, progress, and the exact request."""
     job = JobRepository(session).get(job_id)
     set_etag(response, job)
-    return submit.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
+    return submit.describe_job(session, job)
 
 
 @router.patch("/{job_id}")
@@ -87,7 +86,7 @@ def edit_job(
     """Change name, note or tags of a job; with `If-Match` only if they are as they were read."""
     edit(session, "job", job_id, body, if_match, response)
     job = JobRepository(session).get(job_id)
-    return submit.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
+    return submit.describe_job(session, job)
 
 
 @router.delete("/{job_id}")

@@ -210,6 +210,7 @@ def _build_problem_answer(errors_of_status: Sequence[type[ServiceError]]) -> dic
         "status": first.status,
         "detail": first.title,
         "instance": "/v1/jobs",
+        "request_id": "5f1c2a7be04d4c0f9f6e6a1d2b3c4d5e",
     }
     reference = {"$ref": f"#/components/schemas/{_PROBLEM_SCHEMA}"}
     content = {PROBLEM_TYPE: {"schema": reference, "example": example}}
@@ -230,6 +231,9 @@ def _describe_answers(operation: dict[str, Any]) -> None:
             answer["description"] = operation["summary"]
         if MCAP_TYPE in answer.get("content", {}):
             answer["content"][MCAP_TYPE]["schema"] = _BINARY
+        for content in answer.get("content", {}).values():
+            if "itemSchema" in content:  # of each event; FastAPI calls the whole a text
+                content.pop("schema", None)
         answer |= _describe_headers(int(code))
 
 

@@ -3,17 +3,25 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from fastapi.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    Response,
+)
 
 from service.api.dependencies import Cursor, PartsDep, ReadSession
-from service.api.figures import csv_response
+from service.api.figures import csv_response, figure_response
 from service.api.html import HtmlPage
 from service.api.items import DatasetFormDep, JobFormDep, parse_form
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.states import JobState
-from service.pages import pages
+from service.pages import guides, pages
 from service.pages import render as assets
+from service.pages.bounds import propose_bounds
+from service.pages.figures import ComparisonChoice, load_comparison_figure
 from service.pages.simulate import simulate_page as simulate
 
 router = APIRouter()
@@ -23,22 +31,35 @@ CACHE_FOREVER = "public, max-age=31536000, immutable"
 
 HIDDEN: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
 StateFilter = Annotated[JobState | None, Query()]
-ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
+ComparedRuns = Annotated[list[str] | None, Query(max_length=50)]
 
 
 @router.get("/docs", **HIDDEN)
-def reference_page(request: Request) -> Response:
-    """Show the documentation of the REST interface."""
-    return HtmlPage(pages.reference_page(request.app.openapi()))
+def reference_page() -> Response:
+    """Show the documentation of the REST interface, with a form to try each request."""
+    return HtmlPage(pages.reference_page())
+
+
+@router.get("/guides/{path:path}", **HIDDEN)
+def guide_page(path: str) -> Response:
+    """Show a page of the documentation, or one of its files."""
+    if file := guides.find_file(path):
+        return FileResponse(file, headers={"Cache-Control": "no-cache"})
+    return HtmlPage(pages.guide_page(path))
 
 
 @router.get("/", **HIDDEN)
 def jobs_page(
-    session: ReadSession, form: JobFormDep, state: StateFilter = None, cursor: Cursor = None
+    session: ReadSession,
+    request: Request,
+    form: JobFormDep,
+    state: StateFilter = None,
+    cursor: Cursor = None,
 ) -> Response:
     """Show the list of jobs, and the form of a new identification."""
     chosen = parse_form(session, form)
-    return HtmlPage(pages.jobs_page(session, state, cursor, chosen, form))
+    url = str(request.base_url)
+    return HtmlPage(pages.jobs_page(session, state, cursor, chosen, form, url))
 
 
 @router.get("/new/noise-sweep", **HIDDEN)
@@ -83,9 +104,18 @@ def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
 
 
 @router.get("/compare", **HIDDEN)
-def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
+def compare_page(session: ReadSession, run: ComparedRuns = None) -> Response:
     """Compare runs of several models on the same data."""
-    return HtmlPage(pages.compare_page(session, run))
+    return HtmlPage(pages.compare_page(session, run or []))
+
+
+@router.get("/pages/compare/response", **HIDDEN)
+def comparison_figure(
+    parts: PartsDep, session: ReadSession, choice: Annotated[ComparisonChoice, Query()]
+) -> Response:
+    """Draw the identified outputs of several runs over the measured ones."""
+    figure = load_comparison_figure(session, parts.store, choice)
+    return figure_response(figure, "comparison", choice)
 
 
 @router.get("/datasets", **HIDDEN)
@@ -98,6 +128,20 @@ def datasets_page(session: ReadSession, form: DatasetFormDep, cursor: Cursor = N
 def dataset_page(dataset_id: str, session: ReadSession) -> Response:
     """Show one dataset: signals, channels, lineage."""
     return HtmlPage(pages.dataset_page(session, dataset_id))
+
+
+@router.get("/pages/datasets/{dataset_id}/bounds", **HIDDEN)
+def show_bounds(
+    dataset_id: str,
+    parts: PartsDep,
+    session: ReadSession,
+    model: str = "fopdt",
+    channel: Annotated[list[str] | None, Query(max_length=100)] = None,
+) -> Response:
+    """Propose the bounds that follow the data; channels are pairs such as ``u=heater``."""
+    pairs = (text.partition("=") for text in channel or ())
+    channels = {signal: name for signal, _, name in pairs}
+    return JSONResponse(propose_bounds(session, parts.store, dataset_id, model, channels))
 
 
 @router.get("/pages/models/{name}.yaml", **HIDDEN)
@@ -114,9 +158,9 @@ def job_model_text(job_id: str, session: ReadSession) -> Response:
 
 @router.get("/static/{name}", **HIDDEN)
 def static_file(name: str, request: Request) -> Response:
-    """Serve the package's static files, and Plotly from its installed wheel."""
-    if name == assets.plotly_file_name():
-        return _plotly_response(request)
+    """Serve the package's static files, and bundles from installed wheels."""
+    if bundle := assets.find_bundle(name):
+        return _answer_bundle(bundle, request)
     asset = assets.load_asset(name)
     if asset is None:
         raise NotFound("file", name)
@@ -126,9 +170,10 @@ def static_file(name: str, request: Request) -> Response:
     return Response(asset.content, media_type=asset.media_type, headers=headers)
 
 
-def _plotly_response(request: Request) -> Response:
+def _answer_bundle(bundle: assets.Bundle, request: Request) -> Response:
     headers = {"Cache-Control": CACHE_FOREVER, "Vary": "Accept-Encoding"}
     if "gzip" not in request.headers.get("accept-encoding", ""):
-        return FileResponse(assets.plotly_path(), media_type="text/javascript", headers=headers)
+        return FileResponse(bundle.file, media_type=bundle.media_type, headers=headers)
     headers["Content-Encoding"] = "gzip"
-    return Response(assets.compress_plotly(), media_type="text/javascript", headers=headers)
+    content = assets.compress_bundle(bundle)
+    return Response(content, media_type=bundle.media_type, headers=headers)

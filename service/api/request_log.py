@@ -78,11 +78,4 @@ def _record_answer(scope: Scope, status: int, head_seconds: float, total: float)
             "status": status,
             "seconds": seconds,
         }
-        _access_log.info(
-            "%s %s %d in %g s", method, _escape(scope["path"]), status, seconds, extra=facts
-        )
-
-
-def _escape(path: str) -> str:
-    """Escape what would break a line of the log."""
-    return path if path.isprintable() else repr(path)[1:-1]
+        _access_log.info("%s %s %d in %g s", method, scope["path"], status, seconds, extra=facts)

@@ -19,8 +19,19 @@ from service.core.wire import FigureOut
 from service.figures.profiles import plot_profiles as profile_figure
 from service.items.schemas import DeletedOut, EditIn
 from service.repositories.runs import RunRepository
-from service.runs import comparison, exports, fitted, free_run, profiles, residuals, run_file, runs
+from service.runs import (
+    bands,
+    comparison,
+    exports,
+    fitted,
+    free_run,
+    profiles,
+    residuals,
+    run_file,
+    runs,
+)
 from service.runs.schemas import (
+    BandsOut,
     CompareIn,
     ComparisonOut,
     ExportedModelOut,
@@ -87,6 +98,14 @@ def read_response(
 ) -> ResponseOut:
     """Read measured and simulated outputs, reduced so that extremes stay visible."""
     return fitted.build_response(session, parts.store, run_id, max_points)
+
+
+@router.get("/{run_id}/bands")
+def read_bands(
+    run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
+) -> BandsOut:
+    """Read the 95 % confidence and prediction bands of the outputs, computed from the estimates."""
+    return bands.build_bands(session, parts.store, run_id, max_points)
 
 
 @router.get("/{run_id}/residuals")

@@ -22,9 +22,10 @@ from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
 from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import format_value
+from service.core.text_checks import escape_controls
 from sysid.core.errors import join_pointer, split_pointer
 from sysid.core.files import open_replacement
-from sysid.core.text import DASH, plain_estimate
+from sysid.core.text import DASH, plain_estimate, rewrite_settings
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -37,10 +38,21 @@ LISTED_ENTRIES = 50
 """Entries of a table, if the user names no other number."""
 COUNTED_ENTRIES = 500
 """Entries beyond those shown that are counted."""
-out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class PlainConsole(Console):  # type: ignore[misc]  # rich's types are not read
+    """Console that shows control characters as codes: names and labels come from others."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print texts and tables; a terminal obeys nothing in a text."""
+        plain = (escape_controls(o, but="\n") if isinstance(o, str) else o for o in objects)
+        super().print(*plain, **options)
+
+
+out = PlainConsole(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 """For notes and progress; ``--quiet`` silences it."""
-_errors = Console(stderr=True, highlight=False, soft_wrap=True)
+_errors = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 
 
 def _silence_notes(context: typer.Context, is_quiet: bool) -> bool:
@@ -315,13 +327,13 @@ def format_cell(value: object) -> str:
     """Format a cell: a dash for None, six digits for a number."""
     if value is None:
         return DASH
-    return format_value(value).replace("[", "\\[")
+    return escape_controls(format_value(value)).replace("[", "\\[")
 
 
 def format_estimate(estimate: Mapping[str, Any]) -> str:
     """Format an estimate, ``0.1193 ± 0.0004``, from an entry of a run's parameters."""
-    is_bound = estimate.get("status") == "at bound"
-    return plain_estimate(estimate["value"], estimate["stderr"], is_bound=is_bound)
+    status = str(estimate.get("status", ""))
+    return plain_estimate(estimate["value"], estimate["stderr"], status=status)
 
 
 def describe_status(estimate: Mapping[str, Any]) -> str:
@@ -465,12 +477,6 @@ UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": 
 POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: to a field of that name elsewhere, or to a fault in an axis value."""
 
-SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
-"""A job field in a note, as in a job file: ``loss: {noise_model: ar1}``.
-
-Text after "the model" is excluded: it names a field of the model document, which no option sets.
-"""
-
 
 @dataclass(frozen=True, slots=True)
 class FieldOrigins:
@@ -507,10 +513,9 @@ class FieldOrigins:
 
     def rewrite_note(self, note: str) -> str:
         """Rewrite a note so that it names options instead of job fields."""
-        return SETTING_PATTERN.sub(self._format_setting, note)
+        return rewrite_settings(note, self._format_setting)
 
-    def _format_setting(self, match: re.Match[str]) -> str:
-        part, name, value = match.groups()
+    def _format_setting(self, part: str, name: str, value: str) -> str:
         origin = self.locate(join_pointer(part, name))
         return f"{origin}{'=' if origin.startswith('--set ') else ' '}{value}"
 

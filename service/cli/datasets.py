@@ -10,6 +10,7 @@ import typer
 from service.cli.common import (
     DATA_HELP,
     DOCUMENT_HELP,
+    LISTED_ENTRIES,
     STANDARD_INPUT,
     AsJson,
     FieldOrigins,
@@ -105,12 +106,15 @@ def list_datasets(
     "add",
     epilog=show_examples(
         "lagid dataset add recording.csv",
+        "lagid dataset add tube-5m.csv tube-10m.csv",
         "zcat recording.csv.gz | lagid dataset add - --name recording",
     ),
 )
-def add_dataset(
-    file: Annotated[Path, typer.Argument(help=DATA_HELP)],
-    name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
+def add_datasets(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help=DATA_HELP)],
+    name: Annotated[
+        str | None, typer.Option(help="Name of a single one; by default that of the file.")
+    ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
     url: Url = DEFAULT_URL,
@@ -118,12 +122,19 @@ def add_dataset(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Store a recording."""
-    check_file(file)
-    source = read_file(file) if file == STANDARD_INPUT else file
-    with connect_client(url, key) as client, report_faults(upload_origins(file)):
-        stored = client.add_dataset(source, name, segments=segments, sample_time=sample_time)
-    _print_dataset(stored, as_json)
+    """Store recordings."""
+    if name is not None and len(files) > 1:
+        fail_usage(f"--name names one recording; found {len(files)} files")
+    for file in files:
+        check_file(file)
+    with connect_client(url, key) as client:
+        for file in files:
+            source = read_file(file) if file == STANDARD_INPUT else file
+            with report_faults(upload_origins(file)):
+                stored = client.add_dataset(
+                    source, name, segments=segments, sample_time=sample_time
+                )
+            _print_dataset(stored, as_json)
 
 
 @app.command("show", epilog=show_examples("lagid dataset show recording"))
@@ -261,8 +272,8 @@ def find_dataset(client: "Client", name: str) -> Mapping[str, Any]:
         return client.dataset(name)
     found = [dataset for dataset in client.datasets(name=name) if dataset["name"] == name]
     if not found:
-        datasets = client.datasets()
-        hint = suggest_name(name, {dataset["name"] for dataset in datasets})
+        latest = client.datasets(LISTED_ENTRIES)
+        hint = suggest_name(name, {dataset["name"] for dataset in latest})
         fail(f"there is no dataset {name!r}{hint}")
     if len(found) > 1:
         ids = ", ".join(dataset["id"] for dataset in found)

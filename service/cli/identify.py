@@ -44,6 +44,7 @@ from service.cli.common import (
     write_file,
 )
 from service.core.errors import FieldError, to_field_errors
+from service.core.extras import check_extra
 from sysid.core.errors import (
     InvalidRecord,
     InvalidSettings,
@@ -138,7 +139,7 @@ def identify(
         typer.Option(
             metavar=f"[{'|'.join(NOISE_MODELS)}]",
             help="white: least squares. ar1: generalised least squares for first-order noise. "
-            "auto (default): ar1 if residuals are autocorrelated and the model integrates.",
+            "auto (default): what predicts left-out data better, if residuals are coloured.",
         ),
     ] = None,
     posterior: Annotated[
@@ -187,23 +188,22 @@ def identify(
             ).records
     from sysid.core.jit import announce_compilation, read_clock
 
+    printed = [*read.notes]
     begun = read_clock()
     with _report_core_faults(), announce_compilation(err.print):
-        result = _run_identification(loaded, read.records, validation_records, body, quiet=as_json)
+        result = _run_identification(
+            loaded, read.records, validation_records, body, printed, quiet=as_json
+        )
     seconds = read_clock() - begun
     result = replace(result, warnings=(*read.notes, *result.warnings))
-    print_result(loaded, result, seconds, output, as_json=as_json, printed=read.notes)
+    print_result(result, seconds, output, as_json=as_json, printed=printed)
     if report is not None:
         _write_report(report, Path(name_file(data)), loaded, result, seconds, body)
 
 
 def _check_report(path: Path, force: bool) -> None:
     """End the command before the search if no report could be written after it."""
-    from importlib.util import find_spec
-
-    missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
-    if missing:
-        fail_usage(f"--report needs {' and '.join(missing)}: pip install 'lagid[server]'")
+    check_extra("server", "--report", ("jinja2", "plotly"))
     protect_file(path, force, "--report")
 
 
@@ -349,7 +349,6 @@ def read_input_file(path: Path, reading: FileOptions) -> "Recording":
 
 
 def print_result(
-    model: "Model",
     result: "Identification",
     seconds: float,
     output: Path | None,
@@ -362,7 +361,7 @@ def print_result(
     Warnings that are `printed` already are in the JSON only.
     """
     from service.runs.result import to_result_document
-    from sysid.identification.summary import describe_residuals
+    from sysid.identification.summary import describe_order, describe_residuals, find_output_unit
 
     document = to_result_document(result, seconds)
     if output is not None:
@@ -383,15 +382,15 @@ def print_result(
         ),
         empty="no parameters",
     )
-    unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
+    unit = plain_unit(find_output_unit(result))
     out.print(
-        f"RMS {result.rms:.6g}{plain_unit(unit)}, fit {_format_fit(result.fit_percent)}",
+        f"RMS {result.rms:.6g}{unit}, fit {_format_fit(result.fit_percent)}",
         markup=False,
         end="",
     )
     if result.rms_validation is not None and result.fit_percent_validation is not None:
         out.print(
-            f"; validation RMS {result.rms_validation:.6g}{plain_unit(unit)}, "
+            f"; validation RMS {result.rms_validation:.6g}{unit}, "
             f"fit {_format_fit(result.fit_percent_validation, 'it hardly moves')}",
             markup=False,
             end="",
@@ -406,6 +405,9 @@ def print_result(
         )
     if result.residual_tests is not None and result.residual_tests.passed is not None:
         out.print(describe_residuals(result.residual_tests), markup=False, soft_wrap=True)
+    if result.order_comparison is not None:
+        out.print(describe_order(result.order_comparison), markup=False, soft_wrap=True)
+    out.print(f"verdict: {result.verdict.text}", markup=False, soft_wrap=True)
     _print_posterior(result.posterior)
     _print_notes(warning for warning in result.warnings if warning not in printed)
 
@@ -456,15 +458,18 @@ def _run_identification(
     records: "Sequence[Record]",
     validation_records: "Sequence[Record]",
     body: "JobIn",
+    printed: list[str],
     *,
     quiet: bool,
 ) -> "Identification":
+    """Run the search under a bar; what is told before it is printed, and added to `printed`."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from service.jobs.to_core import to_algorithm, to_loss
+    from sysid.core.settings import FitSettings
     from sysid.data.noise import Noise
-    from sysid.identification.identify import identify as identified
+    from sysid.identification.identify import identify_records
 
     document = body.to_normal_form()
     algorithm = to_algorithm(document["algorithm"])
@@ -483,21 +488,29 @@ def _run_identification(
         def show(state: Any) -> None:
             progress.update(bar, completed=state.generation, rms=f"{state.rms:.6g}")
 
-        return identified(
+        def tell(notes: Sequence[str]) -> None:
+            _print_notes(notes)
+            printed.extend(notes)
+
+        return identify_records(
             model,
             records,
             algorithm,
+            FitSettings(
+                document["parameters"],
+                body.prediction,
+                to_loss(document["loss"]),
+                body.weights,
+                body.skip,
+            ),
             seed=body.seed,
-            parameters=document["parameters"],
-            prediction=body.prediction,
-            loss=to_loss(document["loss"]),
-            weights=body.weights,
-            skip=body.skip,
             posterior=body.posterior,
+            compare_orders=body.compare_orders is not False,
             validation=validation_records or None,
             validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
             progress=show,
+            tell=tell,
         )
 
 

@@ -9,6 +9,7 @@ import typer
 from service.cli.common import (
     MODEL_SUFFIXES,
     AsJson,
+    FieldOrigins,
     Force,
     Key,
     Limit,
@@ -18,6 +19,7 @@ from service.cli.common import (
     check_succeeded,
     connect_client,
     fail,
+    fail_usage,
     fetch_listing,
     file_origins,
     format_decimals,
@@ -65,6 +67,15 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
+RUN_FILTER_ORIGINS = FieldOrigins(
+    {
+        "?state": "--state",
+        "?cell": "--cell",
+        "?label": "--label",
+        "?tag": "--tag",
+        "?order": "--order",
+    }
+)
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 
 
@@ -151,7 +162,7 @@ def list_jobs(
     print_listing(
         listing,
         as_json,
-        ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
+        ("id", "name", "state", "model", "runs", ">RMS", "unit", "verdict", "submitted"),
         lambda job: (
             job["id"],
             job["name"],
@@ -159,6 +170,7 @@ def list_jobs(
             job["model"],
             _format_progress(job),
             *_single_run_rms(job),
+            job["outcome"] and job["outcome"]["verdict"],
             format_moment(job["created_at"]),
         ),
         empty=_explain_no_jobs(state, filters),
@@ -176,6 +188,28 @@ def list_runs(
         str | None,
         typer.Argument(metavar="[JOB|RUN]", help="Id of a job (default: the latest) or of a run."),
     ] = None,
+    state: Annotated[
+        list[JobState] | None,
+        typer.Option(
+            help="Only runs in this state; may be repeated.", rich_help_panel=FILTER_PANEL
+        ),
+    ] = None,
+    cell: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATH=VALUE",
+            help="Only those with this value of an axis: /noise/sigma=0.1; may be repeated.",
+            rich_help_panel=FILTER_PANEL,
+        ),
+    ] = None,
+    label: LabelFilter = None,
+    tag: TagFilter = None,
+    order: Annotated[
+        str | None, typer.Option(help="Column to sort by, such as rms (default: number).")
+    ] = None,
+    descending: Annotated[
+        bool, typer.Option("--descending", help="The largest value first.")
+    ] = False,
     url: Url = DEFAULT_URL,
     key: Key = None,
     limit: Limit = None,
@@ -183,19 +217,31 @@ def list_runs(
     quiet: Quiet = False,
 ) -> None:
     """List the runs of a job with their estimates, or show one run."""
-    with connect_client(url, key) as client:
+    chosen = read_filters(state=state, cell=cell, label=label, tag=tag)
+    sorting = read_filters(order=order, descending=descending)
+    with connect_client(url, key) as client, report_faults(RUN_FILTER_ORIGINS):
         if job is not None and job.startswith("run_"):
+            if chosen or sorting:
+                fail_usage(f"{job} is one run; name a job to choose or sort its runs")
             print_run(client.run(job), as_json)
             return
         about = client.job(job or _find_latest_job(client))
         most = limit if limit is not None or as_json else MAX_PRINTED
-        runs = client.runs(about["id"], at_most=most or None)
-    others = about["progress"]["runs"] - len(runs) if len(runs) == most else 0
+
+        def fetch(at_most: int | None) -> Sequence[Mapping[str, Any]]:
+            return client.runs(about["id"], at_most=at_most, **chosen, **sorting)
+
+        if chosen:
+            listing = fetch_listing(fetch, most, as_json)
+        else:  # the job knows how many there are
+            runs = fetch(most or None)
+            others = about["progress"]["runs"] - len(runs) if len(runs) == most else 0
+            listing = Listing(runs, others)
     if as_json:
-        print_json(runs)
+        print_json(listing.entries)
     else:
-        print_runs(runs, about["rms_unit"])
-    print_rest(Listing(runs, others), as_json)
+        print_runs(listing.entries, about["rms_unit"])
+    print_rest(listing, as_json)
 
 
 def cancel_job(

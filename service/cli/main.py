@@ -1,8 +1,9 @@
-"""`lagid`: the command line. Commands import late, so `--help` is fast."""
+"""`lagid`: the command line. Only the command that is run is imported; `--help` imports all."""
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,23 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import (
-    access,
-    backup,
-    datasets,
-    health,
-    jobs,
-    models,
-    retention,
-    runs,
-    server,
-    sweeps,
-)
-from service.cli import reidentify as references
 from service.cli.common import out, print_error, print_line, show_examples
-from service.cli.identify import identify
-from service.cli.paper import reproduce_paper
-from service.cli.reidentify import reidentify
 from service.client.calls import ClientError, NotFinite, ProblemError
 from service.core.errors import ServiceError
 
@@ -34,16 +19,6 @@ SERVER_ERROR_STATUS = 500
 EXTRA_ARGUMENT = "unexpected extra argument"
 SURROGATE_REASON = "surrogates not allowed"
 """Python's reason for an argument or a file name in another encoding."""
-app = typer.Typer(
-    name="lagid",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=show_examples(
-        "lagid identify recording.csv --model fopdt", "lagid models", "lagid demo"
-    ),
-)
 
 
 def _print_version(is_asked: bool) -> None:
@@ -52,7 +27,6 @@ def _print_version(is_asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def describe_program(
     version: Annotated[
         bool,
@@ -67,21 +41,6 @@ def describe_program(
     `lagid serve`, or name one by LAGID_URL. Exit code 0: success, 1: the work failed, 2: wrong
     arguments.
     """
-
-
-class _HelpPanel:
-    """A group of commands in the help, in the order in which they are added."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def add(self, name: str, command: Callable[..., Any], *examples: str) -> None:
-        """Add a command with examples that can be copied."""
-        app.command(name, rich_help_panel=self.name, epilog=show_examples(*examples))(command)
-
-    def add_group(self, name: str, group: typer.Typer) -> None:
-        """Add a command that has commands."""
-        app.add_typer(group, name=name, rich_help_panel=self.name)
 
 
 def run_demo(
@@ -100,78 +59,122 @@ def run_demo(
     demo.run_demo(data_dir, port, out)
 
 
-first = _HelpPanel("Try it")
-first.add("demo", run_demo, "lagid demo", "lagid demo --data-dir /tmp/demo")
-first.add(
-    "identify",
-    identify,
-    "lagid identify recording.csv --model fopdt",
-    "lagid identify recording.csv --model mine.yaml --channels u=P1,y=P2",
-    "lagid identify recording.csv --model tube --set parameters.L.upper=0.5",
-    "lagid identify - --model fopdt --json < recording.csv",
-)
-first.add(
-    "paper",
-    reproduce_paper,
-    "lagid paper --quick",
-    "lagid paper --only table1,figure15 --output table1.html",
-)
-data = _HelpPanel("Data and models")
-data.add("datasets", datasets.list_datasets, "lagid datasets", "lagid datasets --name tube --json")
-data.add_group("dataset", datasets.app)
-data.add_group("models", models.app)
-work = _HelpPanel("Jobs")
-work.add(
-    "submit",
-    jobs.submit_job,
-    "lagid submit job.yaml --wait",
-    "lagid submit - --json < job.yaml",
-)
-work.add("watch", jobs.watch_job, "lagid watch job_1", "lagid watch job_1 --quiet --json")
-work.add(
-    "jobs",
-    jobs.list_jobs,
-    "lagid jobs --state running",
-    "lagid jobs --tag night --since 2026-01-31",
-)
-work.add("cancel", jobs.cancel_job, "lagid cancel job_1")
-work.add("resume", jobs.resume_job, "lagid resume job_1")
-work.add_group("job", jobs.app)
-work.add_group("sweep", sweeps.app)
-work.add(
-    "reidentify",
-    reidentify,
-    "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv --wait",
-    "lagid reidentify --model tube --label length_m --reference tube 30=new.csv",
-)
-results = _HelpPanel("Results")
-results.add_group("runs", runs.app)
-results.add(
-    "export",
-    runs.export_model,
-    "lagid export run_1 --format c --output model.c",
-    "lagid export run_1 --json",
-)
-results.add("report", jobs.write_report, "lagid report job_1 --output tube.html")
-results.add_group("references", references.app)
-upkeep = _HelpPanel("Server")
-upkeep.add(
-    "serve", server.serve, "lagid serve", "lagid serve --port 8001 --data-dir measurements --cpus 4"
-)
-upkeep.add("dispatcher", server.run_dispatcher, "lagid dispatcher --cpus 8")
-upkeep.add_group("key", access.key_app)
-upkeep.add_group("project", access.project_app)
-upkeep.add("audit", access.list_audit_log, "lagid audit", "lagid audit --project tubes --json")
-upkeep.add("backup", backup.write_backup, "lagid backup lagid.zip")
-upkeep.add(
-    "restore",
-    backup.restore_backup,
-    "lagid restore lagid.zip --data-dir restored",
-    "lagid restore lagid.zip --force",
-)
-upkeep.add_group("db", retention.app)
-upkeep.add("health", health.check_health, "lagid health web", "lagid health dispatcher")
-upkeep.add("doctor", server.check_installation, "lagid doctor", "lagid doctor --json")
+# Panels of the help in their order: commands, each with examples that can be copied, and groups.
+_PANELS: Mapping[str, Mapping[str, tuple[Callable[..., None] | str, *tuple[str, ...]]]] = {
+    "Try it": {
+        "demo": (run_demo, "lagid demo", "lagid demo --data-dir /tmp/demo"),
+        "identify": (
+            "identify:identify",
+            "lagid identify recording.csv --model fopdt",
+            "lagid identify recording.csv --model mine.yaml --channels u=P1,y=P2",
+            "lagid identify recording.csv --model tube --set parameters.L.upper=0.5",
+            "lagid identify - --model fopdt --json < recording.csv",
+        ),
+        "paper": (
+            "paper:reproduce_paper",
+            "lagid paper --quick",
+            "lagid paper --only table1,figure15 --output table1.html",
+        ),
+    },
+    "Data and models": {
+        "datasets": (
+            "datasets:list_datasets",
+            "lagid datasets",
+            "lagid datasets --name tube --json",
+        ),
+        "dataset": ("datasets:app",),
+        "models": ("models:app",),
+    },
+    "Jobs": {
+        "submit": (
+            "jobs:submit_job",
+            "lagid submit job.yaml --wait",
+            "lagid submit - --json < job.yaml",
+        ),
+        "watch": ("jobs:watch_job", "lagid watch job_1", "lagid watch job_1 --quiet --json"),
+        "jobs": (
+            "jobs:list_jobs",
+            "lagid jobs --state running",
+            "lagid jobs --tag night --since 2026-01-31",
+        ),
+        "cancel": ("jobs:cancel_job", "lagid cancel job_1"),
+        "resume": ("jobs:resume_job", "lagid resume job_1"),
+        "job": ("jobs:app",),
+        "sweep": ("sweeps:app",),
+        "reidentify": (
+            "reidentify:reidentify",
+            "lagid reidentify --model tube --label length_m 5=a.csv 10=b.csv --wait",
+            "lagid reidentify --model tube --label length_m --reference tube 30=new.csv",
+        ),
+    },
+    "Results": {
+        "runs": ("runs:app",),
+        "export": (
+            "runs:export_model",
+            "lagid export run_1 --format c --output model.c",
+            "lagid export run_1 --json",
+        ),
+        "report": ("jobs:write_report", "lagid report job_1 --output tube.html"),
+        "references": ("reidentify:app",),
+    },
+    "Server": {
+        "serve": (
+            "server:serve",
+            "lagid serve",
+            "lagid serve --port 8001 --data-dir measurements --cpus 4",
+        ),
+        "dispatcher": ("server:run_dispatcher", "lagid dispatcher --cpus 8"),
+        "key": ("access:key_app",),
+        "project": ("access:project_app",),
+        "audit": ("access:list_audit_log", "lagid audit", "lagid audit --project tubes --json"),
+        "backup": ("backup:write_backup", "lagid backup lagid.zip"),
+        "restore": (
+            "backup:restore_backup",
+            "lagid restore lagid.zip --data-dir restored",
+            "lagid restore lagid.zip --force",
+        ),
+        "db": ("retention:app",),
+        "health": ("health:check_health", "lagid health web", "lagid health dispatcher"),
+        "doctor": ("server:check_installation", "lagid doctor", "lagid doctor --json"),
+    },
+}
+
+
+def build_program(only: str | None = None) -> typer.Typer:
+    """Build the program with all its commands, or with one; no other is imported then."""
+    program = typer.Typer(
+        name="lagid",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+        context_settings={"help_option_names": ["-h", "--help"]},
+        epilog=show_examples(
+            "lagid identify recording.csv --model fopdt", "lagid models", "lagid demo"
+        ),
+    )
+    program.callback()(describe_program)
+    for panel, commands in _PANELS.items():
+        for name, (source, *examples) in commands.items():
+            if only not in (None, name):
+                continue
+            command = _load_command(source) if isinstance(source, str) else source
+            if isinstance(command, typer.Typer):
+                program.add_typer(command, name=name, rich_help_panel=panel)
+            else:
+                epilog = show_examples(*examples)
+                program.command(name, rich_help_panel=panel, epilog=epilog)(command)
+    return program
+
+
+def _load_command(source: str) -> Any:
+    module, _, name = source.partition(":")
+    return getattr(import_module(f"service.cli.{module}"), name)
+
+
+def _find_command() -> str | None:
+    """Find the command that is run; None if it takes all of them to know, as for a help text."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    return name if any(name in commands for commands in _PANELS.values()) else None
 
 
 def main() -> None:
@@ -181,7 +184,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Errors of the core are imported late, since the package may load compiled code.
     try:
-        code = app(prog_name="lagid", standalone_mode=False)
+        code = build_program(_find_command())(prog_name="lagid", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         _exit_with_message(_usage_message(error), error.exit_code)

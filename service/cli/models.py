@@ -140,7 +140,10 @@ def check_model(
     file: ModelFile,
     as_json: AsJson = False,
 ) -> None:
-    """Check a model document; each error has its place and, in equations, its column."""
+    """Check a model document; each error has its place and, in equations, its column.
+
+    Warnings name what is declared but used nowhere.
+    """
     from service.models.catalogue import check_model as checked
 
     try:
@@ -150,14 +153,19 @@ def check_model(
     if as_json:
         print_json(answer)
     elif answer["valid"]:
+        _print_faults(file, answer["warnings"], "warning: ")
         out.print(f"{name_file(file)}: the model is valid", markup=False)
     else:
-        for fault in answer["errors"]:
-            column = f", column {fault['column']}" if fault.get("column") else ""
-            where = f"{fault['pointer'] or 'document'}{column}"
-            err.print(f"{name_file(file)}: {where}: {fault['detail']}", markup=False)
+        _print_faults(file, answer["errors"])
     if not answer["valid"]:
         raise typer.Exit(1)
+
+
+def _print_faults(file: Path, faults: list[dict[str, Any]], kind: str = "") -> None:
+    for fault in faults:
+        column = f", column {fault['column']}" if fault.get("column") else ""
+        where = f"{fault['pointer'] or 'document'}{column}"
+        err.print(f"{name_file(file)}: {where}: {kind}{fault['detail']}", markup=False)
 
 
 @app.command(

@@ -69,7 +69,13 @@ app = typer.Typer(
     "lagid runs RUN. Or analyse a run with one of the commands.",
 )
 app.command(
-    LIST_COMMAND, epilog=show_examples("lagid runs", "lagid runs job_1", "lagid runs run_1")
+    LIST_COMMAND,
+    epilog=show_examples(
+        "lagid runs",
+        "lagid runs job_1 --state failed --tag suspect",
+        "lagid runs job_1 --order best_rms",
+        "lagid runs run_1",
+    ),
 )(listing)
 
 

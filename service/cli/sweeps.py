@@ -33,8 +33,9 @@ from service.cli.common import (
 from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.job_fields import METHOD_PATH, SIGMA_PATH
+from service.sweeps.cramer_rao import scale_to_median
 from sysid.core.settings import SEARCH_METHODS
-from sysid.core.text import append_unit
+from sysid.core.text import RELATIVE_UNIT, append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -221,7 +222,7 @@ def build_sweep_tables(summary: Mapping[str, Any]) -> list[tuple[list[str], list
         for group in groups
     ]
     unit = summary["rms_unit"]
-    one_output = None if unit == "σ" else unit
+    one_output = None if unit == RELATIVE_UNIT else unit
     keys = [
         *relative,
         f">{append_unit('σ', one_output)}",
@@ -262,7 +263,7 @@ def _group_cells(group: Mapping[str, Any]) -> list[str]:
         f"{100 * group['success_rate']:.0f} %" if ended else "–",
         "–" if group["evaluations"] is None else f"{group['evaluations']:.0f}",
         _format_band(group["rms_noise_free"]),
-        _format_short(group["rms_floor"]),
+        _format_short(scale_to_median(group)),
     ]
 
 

@@ -58,7 +58,7 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
                 parameter["name"],
                 format_estimate(parameter),
                 parameter["unit"],
-                _format_interval(parameter["interval95"]),
+                _format_interval(parameter),
                 describe_status(parameter),
             ]
             for parameter in run["parameters"]
@@ -67,6 +67,8 @@ def print_run(run: Mapping[str, Any], as_json: bool) -> None:
     )
     if run["rms"] is not None:
         print_line(_format_fit(run))
+    if run["verdict"]:
+        print_line(f"verdict: {run['verdict']['text']}")
     if run["error"]:
         print_line(run["error"])
     if run["reused_from"]:
@@ -102,12 +104,12 @@ def _format_fit(run: Mapping[str, Any]) -> str:
 
 
 def _format_rms(run: Mapping[str, Any], name: str) -> str:
-    unit = "standard deviations" if run["rms_unit"] == "σ" else run["rms_unit"]
-    return f"{run[name]:.6g}{plain_unit(unit)}"
+    return f"{run[name]:.6g}{plain_unit(run['rms_unit'])}"
 
 
-def _format_interval(ends: list[float | None] | None) -> str:
-    if ends is None:
+def _format_interval(estimate: Mapping[str, Any]) -> str:
+    ends = estimate["interval95"]
+    if ends is None or estimate["status"] == "not settled":
         return DASH
     low, high = ("open" if end is None else f"{end:.6g}" for end in ends)
     return f"{low} to {high}"

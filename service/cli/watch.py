@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from service.cli.common import err
+from service.cli.common import PlainConsole, err
 from service.client.calls import TERMINAL_STATES
 from service.core.text import format_duration, format_value
+from service.core.text_checks import escape_controls
 from sysid.core.text import plain_unit
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> "JobDoc
     if quiet or err.quiet:
         return client.wait(job_id)
     first = client.job(job_id)
-    console = Console(stderr=True, highlight=False)
+    console = PlainConsole(stderr=True, highlight=False)
     runs = RunsProgress(lambda: _find_newest_run(client, job_id), first["rms_unit"])
     if not console.is_terminal:
         lines = ProgressLog(partial(console.print, markup=False, soft_wrap=True), runs)
@@ -173,6 +173,7 @@ class _ProgressBars:
             )
 
     def _update_bar(self, key: str, label: str, part: float, text: str, state: str) -> None:
+        label, text = escape_controls(label), escape_controls(text)
         if key not in self._bars:
             self._bars[key] = self._progress.add_task(label, total=1.0, text=text, state=state)
         self._progress.update(

@@ -80,7 +80,7 @@ class AsyncClient:
 
     async def _send_once(self, call: RestCall[Any], stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
-        request = self._http.build_request(**call.request(content, stream=stream))
+        request = self._http.build_request(**call.request(content))
         response = await self._http.send(request, stream=stream)
         if not response.is_success:
             await response.aread()
@@ -340,7 +340,13 @@ class AsyncClient:
     async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
         """Yield the events of a job until its end; `after` is the id of the last event received.
 
-        After a lost connection the stream is opened again, and continues with the next event.
+        After a lost connection, or 45 s without a sign of life, the stream is opened again. It
+        continues with the next event.
+
+        Raises
+        ------
+        ServerUnreachable
+            If the server stays silent, or too many streams break in succession.
         """
         events = calls.EventParser(after, self._retries)
         while not events.is_over:
@@ -410,6 +416,10 @@ class AsyncClient:
     async def response(self, run: str, max_points: int = 1000) -> "documents.ResponseDocument":
         """Fetch the measured and simulated outputs."""
         return await self._fetch(calls.RESPONSE(run, max_points=max_points))
+
+    async def bands(self, run: str, max_points: int = 1000) -> "documents.BandsDocument":
+        """Fetch the 95 % confidence and prediction bands of the outputs."""
+        return await self._fetch(calls.BANDS(run, max_points=max_points))
 
     async def simulate_run(
         self, run: str, body: Mapping[str, Any], max_points: int = 1000

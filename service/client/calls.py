@@ -39,6 +39,8 @@ IDEMPOTENCY_HEADER = "Idempotency-Key"
 
 POLL_SECONDS = 0.3
 TIMEOUT_SECONDS = 60.0
+EVENT_TIMEOUT_SECONDS = 45.0
+"""Three times the pause between two signs of life of an event stream."""
 PAGE_SIZE = 500
 
 
@@ -138,6 +140,8 @@ class NotFinite(ClientError):
 class RestCall(Generic[Answer]):
     """One request, not yet sent, and the type of its answer.
 
+    `timeout` is its own longest time without a byte, s; by default that of the client.
+
     Raises
     ------
     NotFinite
@@ -150,14 +154,15 @@ class RestCall(Generic[Answer]):
     json: Any = None
     content: bytes | Path | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
+    timeout: float | None = None
 
     def __post_init__(self) -> None:
         _check_finite("", self.json)
 
-    def request(self, content: Any, *, stream: bool) -> dict[str, Any]:
-        """Return the arguments of httpx's ``build_request``; a stream has no time limit."""
+    def request(self, content: Any) -> dict[str, Any]:
+        """Return the arguments of httpx's ``build_request``."""
         request = {"method": self.method, "url": self.path, "content": content, "json": self.json}
-        limit = {"timeout": None} if stream else {}
+        limit = {} if self.timeout is None else {"timeout": self.timeout}
         return {**request, "params": dict(self.params), "headers": dict(self.headers), **limit}
 
 
@@ -233,6 +238,7 @@ TREND: "Endpoint[documents.TrendDocument]" = Endpoint("GET", "jobs/{}/trend")
 RUN: "Endpoint[documents.RunDocument]" = Endpoint("GET", "runs/{}")
 HISTORY: "Endpoint[documents.HistoryDocument]" = Endpoint("GET", "runs/{}/history")
 RESPONSE: "Endpoint[documents.ResponseDocument]" = Endpoint("GET", "runs/{}/response")
+BANDS: "Endpoint[documents.BandsDocument]" = Endpoint("GET", "runs/{}/bands")
 SIMULATE_RUN: "Endpoint[documents.RunSimulationDocument]" = Endpoint("POST", "runs/{}:simulate")
 VALIDATE_RUN: "Endpoint[documents.FreeRunDocument]" = Endpoint("POST", "runs/{}:validate")
 MIGRATIONS: "Endpoint[documents.MigrationsDocument]" = Endpoint("GET", "runs/{}/migrations")
@@ -297,7 +303,8 @@ def build_submission(
 
 def build_event_stream(job: str, after: str | None) -> RestCall[bytes]:
     """Build the call for a job's events, or for those after an event."""
-    return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
+    headers = {"Last-Event-ID": after} if after else {}
+    return replace(EVENTS(job), headers=headers, timeout=EVENT_TIMEOUT_SECONDS)
 
 
 def build_download(dataset: str, file_format: str) -> RestCall[bytes]:

@@ -31,7 +31,8 @@ class Client:
     key : str, optional
         API key, if the server requires one; by default that of LAGID_API_KEY.
     timeout : float
-        Longest time without a byte of an answer, s. A stream has no limit.
+        Longest time without a byte of an answer, s. For events it is 45 s: the server sends a sign
+        of life every 15 s.
     retries : int
         How often a request is repeated after a lost connection, or an answer 429 or 503. Only
         requests that may be sent twice are repeated: those that read or replace, and those with
@@ -106,7 +107,7 @@ class Client:
         file: AbstractContextManager[BinaryIO | bytes | None]
         file = source.open("rb") if isinstance(source, Path) else nullcontext(source)
         with file as content:
-            request = self._http.build_request(**call.request(content, stream=stream))
+            request = self._http.build_request(**call.request(content))
             response = self._http.send(request, stream=stream)
             if not response.is_success:
                 response.read()
@@ -355,7 +356,13 @@ class Client:
     def events(self, job: str, after: str | None = None) -> Iterator[Document]:
         """Yield the events of a job until its end; `after` is the id of the last event received.
 
-        After a lost connection the stream is opened again, and continues with the next event.
+        After a lost connection, or 45 s without a sign of life, the stream is opened again. It
+        continues with the next event.
+
+        Raises
+        ------
+        ServerUnreachable
+            If the server stays silent, or too many streams break in succession.
         """
         events = calls.EventParser(after, self._retries)
         while not events.is_over:
@@ -422,6 +429,10 @@ class Client:
     def response(self, run: str, max_points: int = 1000) -> "documents.ResponseDocument":
         """Fetch the measured and simulated outputs."""
         return self._fetch(calls.RESPONSE(run, max_points=max_points))
+
+    def bands(self, run: str, max_points: int = 1000) -> "documents.BandsDocument":
+        """Fetch the 95 % confidence and prediction bands of the outputs."""
+        return self._fetch(calls.BANDS(run, max_points=max_points))
 
     def simulate_run(
         self, run: str, body: Mapping[str, Any], max_points: int = 1000

@@ -123,6 +123,49 @@ class AuditPageDocument(TypedDict):
     """cursor of the following page; null on the last one"""
 
 
+class BandExperimentDocument(TypedDict):
+    """Bands of all outputs of one record."""
+
+    name: str
+    """name of the record"""
+    outputs: list[BandDocument]
+    """bands of each output"""
+
+
+class BandDocument(TypedDict):
+    """95 % bands of one output, in `unit`; null where the simulation diverged."""
+
+    name: str
+    """name of the output"""
+    unit: str
+    """unit of all values"""
+    samples: int
+    """samples before the reduction"""
+    times: list[float]
+    """times, s"""
+    simulated: list[float | None]
+    """output at the estimates"""
+    confidence_lower: list[float | None]
+    """lower end for the output itself"""
+    confidence_upper: list[float | None]
+    """upper end for the output itself"""
+    prediction_lower: list[float | None]
+    """lower end for a new measurement"""
+    prediction_upper: list[float | None]
+    """upper end for a new measurement"""
+
+
+class BandsDocument(TypedDict):
+    """95 % bands of the outputs on the records that the run was fitted to."""
+
+    id: str
+    """identifier of the run"""
+    source: Literal["covariance", "posterior"]
+    """covariance of the estimates, or samples of the posterior"""
+    experiments: list[BandExperimentDocument]
+    """records of the run"""
+
+
 class BatchLabelDocument(TypedDict):
     """All runs of one label."""
 
@@ -170,6 +213,8 @@ class CheckDocument(TypedDict):
     """whether the document is a model"""
     errors: list[FaultDocument]
     """every fault of the document"""
+    warnings: NotRequired[list[FaultDocument]]
+    """what is declared in a valid document but used nowhere"""
     normal_form: NotRequired[ModelDocumentDocument | None]
     """document with every default; null if it has faults"""
 
@@ -727,8 +772,8 @@ class JobInDocument(TypedDict):
     """from its own past (simulation) or from the measured past"""
     loss: NotRequired[LossInDocument]
     """loss function"""
-    weights: NotRequired[dict[str, float] | None]
-    """weight of each output; by default one over its standard deviation"""
+    weights: NotRequired[dict[str, float | list[float]] | None]
+    """weight of each output, or a list with one for each experiment; by default by the estimated noise of each output in each experiment"""
     skip: NotRequired[int]
     """samples at the start of each output that are not scored"""
     algorithm: NotRequired[AlgorithmInDocument]
@@ -755,6 +800,8 @@ class JobInDocument(TypedDict):
     """trend of the estimates over a label"""
     posterior: NotRequired[bool]
     """sample the posterior distribution of the free parameters"""
+    compare_orders: NotRequired[bool | None]
+    """fit a process with dead time with one order more and one less, too; null: in a job without a sweep"""
 
 
 class JobDocument(TypedDict):
@@ -798,6 +845,8 @@ class JobDocument(TypedDict):
     """progress of its runs"""
     rms_unit: NotRequired[str | None]
     """unit of the best RMS; σ for several weighted outputs"""
+    outcome: NotRequired[OutcomeDocument | None]
+    """outcome so far; null without a result, and of a batch, whose runs see different recordings"""
     request: NotRequired[JobInDocument | None]
     """the request with every default; null in lists"""
 
@@ -1080,6 +1129,63 @@ class OnsetDelayDocument(TypedDict):
     """why there is no delay; empty with one"""
 
 
+class OrderComparisonDocument(TypedDict):
+    """A process with dead time, with one order less and one more."""
+
+    model: str
+    """the catalogue's name of the model's own order"""
+    preferred_model: str | None
+    """the one order that is not ruled out; null if there are several"""
+    delay: str
+    """the parameter that is the dead time"""
+    unit: str
+    """unit of the dead times"""
+    delay_range: list[float]
+    """smallest and largest dead time of the orders that are not ruled out, in `unit`"""
+    noise_model: str
+    """noise model of the criteria: white or ar1"""
+    fits: list[OrderFitDocument]
+    """the orders, the lowest first"""
+
+
+class OrderFitDocument(TypedDict):
+    """A process of one order, fitted to the same samples."""
+
+    model: str
+    """its name in the catalogue"""
+    order: int
+    """number of poles"""
+    delay: float | None
+    """dead time, in the comparison's `unit`"""
+    delay_stderr: float | None
+    """standard error of the dead time; null without one"""
+    values: dict[str, float | None]
+    """all parameters of that model"""
+    rms: float | None
+    """RMS error, in the unit of `rms`"""
+    bic: float | None
+    """Schwarz's criterion; smaller is better"""
+    is_open: bool
+    """whether its BIC is within 6 of the lowest: not ruled out"""
+
+
+class OutcomeDocument(TypedDict):
+    """Outcome of a job: that of its only run, or of the best one by RMS."""
+
+    run: str
+    """identifier of the run"""
+    fit_estimation: float | None
+    """fit to the estimation data, %"""
+    fit_validation: float | None
+    """fit to the validation data, %; null without them"""
+    trust: Literal["trustworthy", "limited", "not trustworthy"]
+    """limited: the estimates hold under the condition that the verdict names"""
+    verdict: str
+    """the verdict in words"""
+    warnings: int
+    """number of its warnings"""
+
+
 class OutputAgreementDocument(TypedDict):
     """Agreement of one output of one record."""
 
@@ -1289,6 +1395,17 @@ class ReadyDocument(TypedDict):
     """at least one claims jobs"""
 
 
+class ReasonDocument(TypedDict):
+    """One finding about a result."""
+
+    severity: Literal["note", "caution", "serious"]
+    """serious: do not rely on the estimates; caution: they hold under a condition; note: worth knowing"""
+    brief: str
+    """a few words, as they follow “trustworthy, but” or “not trustworthy:”"""
+    text: str
+    """what was found, and what helps"""
+
+
 class ReferenceDocument(TypedDict):
     """Reference: the run in use, its estimates, and earlier acceptances."""
 
@@ -1481,6 +1598,8 @@ class RunDocument(TypedDict):
     """noise model of the estimates"""
     correlation_times: NotRequired[dict[str, float] | None]
     """correlation time of each output's noise, s"""
+    noise_deviations: NotRequired[list[list[float]] | None]
+    """relative deviation of the noise by experiment and output, by which residuals were divided; null if all count alike or weights were given"""
     residual_tests: NotRequired[ResidualVerdictDocument | None]
     """tests of the residuals; empty if none were made"""
     onset_delays: NotRequired[list[OnsetDelayDocument] | None]
@@ -1495,6 +1614,12 @@ class RunDocument(TypedDict):
     """whether the search settled, and the minima that were found"""
     posterior: NotRequired[PosteriorDocument | None]
     """samples of the posterior; null if not requested"""
+    order_comparison: NotRequired[OrderComparisonDocument | None]
+    """one order less and one more; null if not compared, or no process with delay"""
+    delays: NotRequired[list[str] | None]
+    """free parameters that time lags depend on"""
+    verdict: NotRequired[VerdictDocument | None]
+    """whether the estimates can be relied on, with the reasons"""
     warnings: NotRequired[list[str]]
     """what limits the result"""
     substeps: NotRequired[int | None]
@@ -1819,3 +1944,14 @@ class ValidationInDocument(TypedDict):
     """datasets that are compared, but not fitted"""
     fraction: NotRequired[float | None]
     """last part of each record that is compared, but not fitted"""
+
+
+class VerdictDocument(TypedDict):
+    """Whether the estimates can be relied on."""
+
+    trust: Literal["trustworthy", "limited", "not trustworthy"]
+    """limited: the estimates hold under the condition that the text names"""
+    text: str
+    """the verdict in words"""
+    reasons: list[ReasonDocument]
+    """what speaks against it, the most severe first"""

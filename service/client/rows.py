@@ -26,13 +26,10 @@ class Rows(list[Item]):
         >>> list(runs.to_pandas().columns)
         ['number', 'cell./seed']
         """
-        try:
-            import pandas as pd
-        except ImportError:
-            from sysid.core.errors import MissingLibrary
+        from sysid.core.lazy_names import load_library  # a client loads no library of its own
 
-            raise MissingLibrary("to_pandas()", "pandas") from None
-        return pd.DataFrame([dict(_list_columns(item)) for item in self])
+        pandas = load_library("pandas", "to_pandas()")
+        return pandas.DataFrame([dict(_list_columns(item)) for item in self])
 
 
 def _list_columns(item: Any) -> Iterator[tuple[str, Any]]:

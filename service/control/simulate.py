@@ -210,7 +210,9 @@ def _list_plant_inputs(loop: LoopResponse | None) -> list[Channel]:
 
 
 def _sample_channel(channel: Channel, times: FloatArray) -> Channel:
-    return replace(channel, times=times, values=interpolate_channel(channel, times), history=None)
+    return replace(
+        channel, times=times, values=interpolate_channel(channel, times), history=None, repeats=None
+    )
 
 
 def _store_simulation(

@@ -108,13 +108,15 @@ class Unauthorized(ServiceError):
     ----------
     is_wrong : bool
         Whether it has one that is not valid.
+    key_id : str or None
+        The key that it names.
     """
 
     status, kind, title = 401, "unauthorized", "A valid API key is needed"
 
-    def __init__(self, detail: str, *, is_wrong: bool = False) -> None:
+    def __init__(self, detail: str, *, is_wrong: bool = False, key_id: str | None = None) -> None:
         super().__init__(detail)
-        self.is_wrong = is_wrong
+        self.is_wrong, self.key_id = is_wrong, key_id
 
     @property
     def headers(self) -> Mapping[str, str]:

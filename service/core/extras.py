@@ -1,6 +1,7 @@
 """Parts of the installation that a user chooses: `pip install 'lagid[server]'`."""
 
 import re
+from collections.abc import Collection
 from importlib.metadata import PackageNotFoundError, distribution, requires
 
 from service.core.errors import Misconfigured
@@ -8,20 +9,22 @@ from service.core.errors import Misconfigured
 _OF_AN_EXTRA = re.compile(r"(?P<name>[\w.-]+)[^;]*;.*\bextra == ['\"](?P<extra>[\w-]+)['\"]")
 
 
-def check_extra(extra: str, purpose: str) -> None:
+def check_extra(extra: str, purpose: str, libraries: Collection[str] | None = None) -> None:
     """Check that the libraries of an extra are installed, before a command needs one of them.
 
     Parameters
     ----------
     purpose : str
         What needs it, as the subject of the message.
+    libraries : collection of str, optional
+        Those of the extra that are needed; by default all.
 
     Raises
     ------
     Misconfigured
         If one is missing; the message has the command that installs it.
     """
-    missing = list_missing(extra)
+    missing = [name for name in list_missing(extra) if libraries is None or name in libraries]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise Misconfigured(

@@ -12,6 +12,8 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from service.core.text_checks import escape_controls
+
 LogFormat = Literal["text", "json"]
 
 ID_NAMES = ("request_id", "job_id", "run_id", "attempt")
@@ -59,10 +61,14 @@ class TextFormatter(logging.Formatter):
         super().__init__(_TEXT_FORMAT)
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - name of logging
-        """Format the line without its traceback."""
+        """Format the line without its traceback; nothing in it begins a line of its own."""
         line, ids = super().formatMessage(record), _collect_ids(record)
         listed = " ".join(f"{name}={value}" for name, value in ids.items())
-        return f"{line} [{listed}]" if listed else line
+        return escape_controls(f"{line} [{listed}]" if listed else line)
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - name of logging
+        """Format a traceback, whose lines are its own."""
+        return escape_controls(super().formatException(ei), but="\n")
 
 
 class JsonFormatter(logging.Formatter):
@@ -81,7 +87,7 @@ class JsonFormatter(logging.Formatter):
         line |= {name: vars(record)[name] for name in ACCESS_NAMES if name in vars(record)}
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False, default=str)
+        return escape_controls(json.dumps(line, ensure_ascii=False, default=str))
 
 
 def _collect_ids(record: logging.LogRecord) -> dict[str, object]:

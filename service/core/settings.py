@@ -111,6 +111,8 @@ class Settings(BaseSettings):
     keep_days: float | None = Field(default=None, gt=0, le=36_500)
     """Ended jobs are deleted after this number of days, unless their project says otherwise
     (`lagid db keep`). Without it: they are kept."""
+    keep_audit_days: float | None = Field(default=None, gt=0, le=36_500)
+    """Entries of the audit log are deleted after this number of days. Without it: they are kept."""
     keep_signals: bool = False
     """Whether sweeps store fitted signals, unless a job says otherwise (`keep_signals`). Else they
     are computed again when they are asked for."""

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from datetime import datetime
 
 from sysid.core.text import DASH, format_number, format_unit
+from sysid.core.units import is_known_unit
 
 _THIN_SPACE = "\u202f"  # narrow no-break space: groups digits and joins a number to its unit
 _MAX_JSON = 60
@@ -65,6 +66,18 @@ def format_labels(labels: Mapping[str, object]) -> str:
     return ", ".join(f"{name} = {format_value(value)}" for name, value in labels.items())
 
 
+def name_label(name: str) -> str:
+    """Name a label with its unit, if its name ends with one.
+
+    Examples
+    --------
+    >>> name_label("length_m"), name_label("number")
+    ('length [m]', 'number')
+    """
+    quantity, _, unit = name.rpartition("_")
+    return f"{quantity} [{unit}]" if quantity and is_known_unit(unit) else name
+
+
 def escape_formula(value: object) -> object:
     """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
     if not isinstance(value, str):
@@ -83,6 +96,7 @@ TEMPLATE_FILTERS = {
     "count": format_count,
     "duration": format_duration,
     "age": format_age,
+    "label_name": name_label,
 }
 
 

@@ -8,28 +8,22 @@ from sqlalchemy.orm import Session
 from service.models.models import load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import RowNotFound
+from sysid.core import text
 
 JobBody = Mapping[str, Any]
 
 
 def find_rms_unit(session: Session, body: JobBody) -> str:
-    """Return the unit of the RMS: that of the output, or σ for several outputs together.
-
-    σ are standard deviations. A model that fits any unit has the unit "1"; then the unit is that of
-    the recorded channel.
-    """
-    model = load_stored_model(body["model"])
-    if len(model.outputs) > 1:
-        return "σ"
-    output = model.outputs[0]
-    if output.unit != "1":
-        return output.unit
-    return _find_recorded_unit(
-        session, body, body.get("channels", {}).get(output.name, output.name)
+    """Return the unit of the RMS of a job: that of its output, or σ for several together."""
+    outputs = load_stored_model(body["model"]).outputs
+    return text.find_rms_unit(
+        {output.name: output.unit for output in outputs},
+        lambda output: _find_recorded_unit(session, body, output),
     )
 
 
-def _find_recorded_unit(session: Session, body: JobBody, channel: str) -> str:
+def _find_recorded_unit(session: Session, body: JobBody, output: str) -> str:
+    channel = body.get("channels", {}).get(output, output)
     try:
         channels = DatasetRepository(session).get(body["datasets"][0]).channels
     except RowNotFound:

@@ -104,7 +104,7 @@ class InputSignals:
         if isinstance(signal, DatasetInput):
             channel = self._convert_recorded(pointer, name, unit, signal)
             values = interpolate_channel(channel, self._times)
-            return replace(channel, times=self._times, values=values, history=None)
+            return replace(channel, times=self._times, values=values, history=None, repeats=None)
         return Channel(
             name, self._times, self.evaluate_input(pointer, signal), unit, choose_hold(signal)
         )

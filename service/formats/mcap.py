@@ -34,6 +34,7 @@ from service.formats.topics import (
     build_manifest,
     group_history_topics,
     group_into_topics,
+    group_repeat_topics,
     make_topic,
     parse_manifest,
 )
@@ -103,7 +104,8 @@ def write_recording(
     """Write a recording as an MCAP file.
 
     The same recording and metadata give the same bytes. Values and times come back bit for bit.
-    Samples before the start of the record are stored in separate topics below ``/history``.
+    Samples before the start of the record are stored in separate topics below ``/history``, the
+    numbers of pooled repeats below ``/repeats``.
 
     Parameters
     ----------
@@ -118,8 +120,9 @@ def write_recording(
         recording exceeds a limit of the reader.
     """
     topics, history = group_into_topics(recording), group_history_topics(recording)
-    manifest = build_manifest(recording, topics, metadata or {}, history)
-    _write_file(target, (*topics, *history), manifest)
+    repeats = group_repeat_topics(recording)
+    manifest = build_manifest(recording, topics, metadata or {}, history, repeats)
+    _write_file(target, (*topics, *history, *repeats), manifest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -353,7 +356,9 @@ def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> R
         if source.topic in manifest.clocks:
             topics[source.topic] = _decode_topic(source, manifest)
     channels = tuple(
-        _attach_history(_build_channel(entry, topics), manifest, topics)
+        _attach_repeats(
+            _attach_history(_build_channel(entry, topics), manifest, topics), manifest, topics
+        )
         for entry in manifest.channels
     )
     return Recording(channels, manifest.segments, manifest.started_at)
@@ -381,6 +386,17 @@ def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns)
     history = History(*_find_column(f"the history of {channel.name!r}", topic, field, topics))
     try:
         return replace(channel, history=history)
+    except InvalidRecord as error:
+        raise UnreadableFile(str(error)) from None
+
+
+def _attach_repeats(channel: Channel, manifest: Manifest, topics: _TopicColumns) -> Channel:
+    if channel.name not in manifest.repeats:
+        return channel
+    topic, field = manifest.repeats[channel.name]
+    _, repeats = _find_column(f"the repeats of {channel.name!r}", topic, field, topics)
+    try:
+        return replace(channel, repeats=repeats)
     except InvalidRecord as error:
         raise UnreadableFile(str(error)) from None
 

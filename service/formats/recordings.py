@@ -16,6 +16,7 @@ from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import tell_notes
+from sysid.data.tables import describe_value, is_labelled
 
 
 @runtime_checkable
@@ -93,13 +94,17 @@ def read_with_notes(
             return _read_file(Path(file.name), options)
     if not isinstance(source, str | os.PathLike):
         raise UnreadableFile(
-            f"found {source!r}; need the path of a file, its content as bytes, or an open file"
+            f"found {describe_value(source)}; need the path of a file, its content as bytes, or "
+            f"an open file.{_NO_FILE if is_labelled(source) else ''}"
         )
     try:
         return _read_file(Path(source), options)
     except UnreadableFile as error:
         error.name = str(source)
         raise
+
+
+_NO_FILE = " A table is a recording already: give it to identify, or to Recording"
 
 
 def _read_file(path: Path, options: ReadOptions) -> tuple[Recording, tuple[str, ...]]:

@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from service.core.temporary_files import FULL_DISK_ERRORS
 from service.formats.csv_recordings import read_csv
 from service.formats.file_kinds import FileKind
@@ -18,6 +16,7 @@ from service.formats.table_recordings import build_recording
 from sysid.core.child_processes import limit_resources
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
+from sysid.data.value_checks import describe_missing_values, find_infinite_value
 
 
 def main() -> int:
@@ -89,22 +88,9 @@ def _read_table(path: Path, kind: FileKind, options: ReadOptions) -> tuple[Table
 
 def _check_finite_values(recording: Recording) -> list[str]:
     """Refuse infinite values; return a note for each channel with missing values."""
-    notes = []
-    for channel in recording.channels:
-        infinite = np.flatnonzero(np.isinf(channel.values))
-        if infinite.size:
-            raise UnreadableFile(
-                f"channel {channel.name!r} is infinite at t = {channel.times[infinite[0]]:g} s; "
-                "values must be finite (NaN is a missing value)"
-            )
-        missing = np.flatnonzero(np.isnan(channel.values))
-        if missing.size:
-            notes.append(
-                f"channel {channel.name!r}: {missing.size} of {channel.values.size} values are "
-                f"missing (NaN), the first at t = {channel.times[missing[0]]:g} s. An output is "
-                "not scored at missing values. An input with missing values cannot be used."
-            )
-    return notes
+    if fault := find_infinite_value(recording.channels):
+        raise UnreadableFile(fault)
+    return describe_missing_values(recording.channels)
 
 
 def _describe_error(error: UnreadableFile) -> dict[str, Any]:

@@ -19,7 +19,6 @@ from service.formats.cells import begins_like_number, classify_cell, classify_co
 from service.formats.limits import DEFAULT_LIMITS
 from sysid.core.errors import Advice, UnreadableFile, suggest_name
 from sysid.data.table_rules import (
-    INDEX_NAMES,
     STAMP_KINDS,
     CellKind,
     Heading,
@@ -27,6 +26,7 @@ from sysid.data.table_rules import (
     find_time_column,
     find_time_unit,
     find_unit_seconds,
+    is_index_name,
     is_nameless,
     is_plain_time_name,
     is_time_name,
@@ -344,7 +344,7 @@ def _build_layout(
 def classify_cells(cells: Sequence[str], name: str) -> CellKind:
     """Return what a column holds; one without a name of its own may count rows."""
     kind = classify_column(cells)
-    is_count = kind == "number" and name.lower() in INDEX_NAMES and counts_rows(cells)
+    is_count = kind == "number" and is_index_name(name) and counts_rows(cells)
     return "count" if is_count else kind
 
 
@@ -554,8 +554,11 @@ def _assign_time(
     if time is None:
         if sample_time is None:
             names = ", ".join(column.name for column in columns if column.name)
+            counts = next((column.name for column in columns if column.kind == "count"), "")
+            counted = f" Column {counts!r} only counts rows." if counts else ""
             raise UnreadableFile(
-                f"there is no time column; found {names}. Name one of them t (in seconds), or ",
+                f"there is no time column; found {names}.{counted} Name one of them t (in "
+                "seconds), or ",
                 GIVE_PERIOD,
                 row=row,
             )

@@ -26,10 +26,10 @@ from sysid.core.errors import Advice, UnreadableFile
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Channel, Recording, Segment, measure_sampling
 from sysid.data.table_rules import (
-    INDEX_NAMES,
     NO_NAMES,
     TimeAxis,
     counts_rows,
+    is_index_name,
     read_number_times,
 )
 
@@ -112,7 +112,7 @@ def _name_signals(table: Table, notes: list[str]) -> Table:
     """Return the table with an index that does not count rows as a signal, and tell it."""
     columns, values = list(table.columns), list(table.values)
     for place, column in enumerate(columns):
-        if column.name.lower() not in INDEX_NAMES or column.name.lower() in NO_NAMES:
+        if not is_index_name(column.name) or column.name.lower() in NO_NAMES:
             continue
         texts = [str(value).removesuffix(".0") for value in values[place].tolist()]
         if column.role == "nameless" and any(texts) and not counts_rows(texts):
@@ -265,12 +265,15 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
     wrong = np.flatnonzero(stays)
     if wrong.size == 0:
         return
+    before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
+    what = "repeats" if before == after else "decreases"
     hint = "For repeated measurements, "
     advice = Advice("name their label columns with ", "segments", ".")
     if is_stamp:
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
-    before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
-    what = "repeats" if before == after else "decreases"
+    elif before == after:
+        hint += "give their label columns as segments. If it is no real time, remove it and "
+        advice = GIVE_PERIOD
     raise UnreadableFile(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "
         f"row to row. {hint}",

@@ -120,6 +120,7 @@ RESERVED_KEYS = (
     "topics",
     "segments",
     "history",
+    "repeats",
     "started_at",
 )
 
@@ -185,6 +186,16 @@ def group_history_topics(recording: Recording) -> tuple[Topic, ...]:
     return group_into_topics(Recording(channels), "/history") if channels else ()
 
 
+def group_repeat_topics(recording: Recording) -> tuple[Topic, ...]:
+    """Group the numbers of the repeats of pooled samples into topics; empty if there are none."""
+    channels = tuple(
+        Channel(channel.name, channel.times, channel.repeats)
+        for channel in recording.channels
+        if channel.repeats is not None
+    )
+    return group_into_topics(Recording(channels), "/repeats") if channels else ()
+
+
 def _have_same_times(a: Channel, b: Channel) -> bool:
     return a.times is b.times or np.array_equal(a.times, b.times)
 
@@ -194,6 +205,7 @@ def build_manifest(
     topics: Sequence[Topic],
     metadata: Mapping[str, str],
     history: Sequence[Topic] = (),
+    repeats: Sequence[Topic] = (),
 ) -> dict[str, str]:
     """Build the content of the record `DATASET_RECORD`: all that the messages do not say.
 
@@ -211,12 +223,7 @@ def build_manifest(
         for c, field in zip(topic.channels, topic.fields, strict=True)
     ]
     entries.sort(key=lambda entry: order.index(entry["name"]))
-    histories = {
-        c.name: {"topic": topic.path, "field": field}
-        for topic in history
-        for c, field in zip(topic.channels, topic.fields, strict=True)
-    }
-    clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history)}
+    clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history, *repeats)}
     sampling, start = recording.sampling, recording.started_at
     return {
         "format": FORMAT_VERSION,
@@ -224,9 +231,19 @@ def build_manifest(
         "channels": json.dumps(entries),
         "topics": json.dumps(clocks),
         "segments": json.dumps([asdict(segment) for segment in recording.segments]),
-        "history": json.dumps(histories),
+        "history": json.dumps(_list_places(history)),
+        **({"repeats": json.dumps(_list_places(repeats))} if repeats else {}),
         **({} if start is None else {"started_at": start.isoformat()}),
         **metadata,
+    }
+
+
+def _list_places(topics: Sequence[Topic]) -> dict[str, dict[str, str]]:
+    """List topic and field of each channel."""
+    return {
+        channel.name: {"topic": topic.path, "field": field}
+        for topic in topics
+        for channel, field in zip(topic.channels, topic.fields, strict=True)
     }
 
 
@@ -243,12 +260,16 @@ class ChannelEntry:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """The checked record `DATASET_RECORD`; `history` has topic and field of it, by channel."""
+    """The checked record `DATASET_RECORD`.
+
+    `history` and `repeats` have topic and field of what belongs to a channel.
+    """
 
     channels: tuple[ChannelEntry, ...]
     clocks: Mapping[str, TopicClock]
     segments: tuple[Segment, ...]
     history: Mapping[str, tuple[str, str]]
+    repeats: Mapping[str, tuple[str, str]]
     started_at: datetime | None = None
 
 
@@ -268,15 +289,19 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         channels = tuple(_parse_channel(entry) for entry in json.loads(metadata["channels"]))
         clocks = json.loads(metadata["topics"])
         segments = tuple(_parse_segment(entry) for entry in json.loads(metadata["segments"]))
-        history = {
-            name: (entry["topic"], entry["field"])
-            for name, entry in json.loads(metadata["history"]).items()
-        }
+        history, repeats = (
+            {
+                name: (entry["topic"], entry["field"])
+                for name, entry in json.loads(metadata.get(key, "{}")).items()
+            }
+            for key in ("history", "repeats")
+        )
         manifest = Manifest(
             channels,
             {path: TopicClock.from_dict(entry) for path, entry in clocks.items()},
             segments,
             history,
+            repeats,
             datetime.fromisoformat(metadata["started_at"]) if "started_at" in metadata else None,
         )
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
@@ -286,10 +311,11 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         raise ValueError("its channels have no names, or the same name twice")
     if any(channel.topic not in manifest.clocks for channel in channels):
         raise ValueError("a channel names a topic that is not listed")
-    for name, (topic, field) in history.items():
-        is_text = isinstance(topic, str) and isinstance(field, str)
-        if name not in names or not is_text or topic not in manifest.clocks:
-            raise ValueError(f"the history of {name!r} has no channel, or is in no topic")
+    for what, places in (("history", history), ("repeats", repeats)):
+        for name, (topic, field) in places.items():
+            is_text = isinstance(topic, str) and isinstance(field, str)
+            if name not in names or not is_text or topic not in manifest.clocks:
+                raise ValueError(f"the {what} of {name!r} has no channel, or is in no topic")
     return manifest
 
 

@@ -86,7 +86,7 @@ def delete_item(
     StaleVersion
         If the item has changed since it was read.
     """
-    item = lock_item(session, kind, reference)
+    item = lock_item(session, kind, reference, is_deleted=True)
     check_version(item.row, if_match)
     dependents = find_dependents(session, item)
     if dependents and not cascade:
@@ -108,7 +108,7 @@ def find_dependents(session: Session, item: Item) -> list[Item]:
             if (kind, identity) in found or identity == item.id:
                 continue
             try:
-                child = lock_item(session, kind, identity)
+                child = lock_item(session, kind, identity, is_deleted=True)
             except RowNotFound:  # deleted before
                 continue
             found[kind, identity] = child

@@ -50,8 +50,13 @@ class Item:
         return self.rows[0]
 
 
-def lock_item(session: Session, kind: ItemKind, reference: str) -> Item:
+def lock_item(
+    session: Session, kind: ItemKind, reference: str, *, is_deleted: bool = False
+) -> Item:
     """Look up an item that nobody else can change until the session ends.
+
+    With a run that is to be deleted, its job is locked too. Else its job is only kept: a dispatcher
+    changes a run first and then its job, so it would wait for us, and we for it.
 
     Raises
     ------
@@ -65,7 +70,11 @@ def lock_item(session: Session, kind: ItemKind, reference: str) -> Item:
             return Item(kind, job.id, job.name, (job,))
         case "run":
             run = RunRepository(session).get(reference)
-            job = JobRepository(session).lock(run.job_id)
+            jobs = JobRepository(session)
+            if not is_deleted:
+                jobs.share_lock(run.job_id)
+                RunRepository(session).lock(reference)
+            job = (jobs.lock if is_deleted else jobs.get)(run.job_id)
             run = RunRepository(session).get(reference)
             return Item(kind, run.id, f"run {run.number + 1} of {job.name}", (run,))
         case "dataset":

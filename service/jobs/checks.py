@@ -19,6 +19,7 @@ from service.jobs.record_checks import (
     find_setting_conflicts,
     find_signal_faults,
     find_unit_faults,
+    find_weight_count_faults,
     list_record_lengths,
     override_by_request,
 )
@@ -26,6 +27,7 @@ from service.jobs.schemas import JobIn
 from service.models import models
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
+from sysid.core.settings import Weights
 from sysid.models.delays import check_delays, find_unused_settings
 from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter
@@ -67,6 +69,7 @@ class JobChecker:
         faults += self._find_term_count_faults(body, model)
         faults += _find_unused_parameters(tied, model_parameters, body["weights"])
         faults += self._find_repeated_recordings(body)
+        faults += self._find_weight_faults(body)
         faults += self._find_channel_faults(body, model)
         faults += self._find_length_faults(body, tied, model_parameters)
         faults += self._find_sample_faults(body, model, parameters)
@@ -123,15 +126,22 @@ class JobChecker:
 
         If datasets are missing, the named experiments are counted instead.
         """
-        datasets = [self.get_dataset(reference) for reference in body["datasets"]]
-        pieces = sum(
-            count_experiments(dataset) for dataset in datasets if isinstance(dataset, Dataset)
-        )
-        if not all(isinstance(dataset, Dataset) for dataset in datasets):
+        pieces, is_complete = self._count_experiments(body)
+        if not is_complete:
             pieces = max(
                 pieces, min(count_named_experiments(body["parameters"]), MAX_NAMED_EXPERIMENTS)
             )
         return (*model.parameters, *build_initial_parameters(model, pieces))
+
+    def _count_experiments(self, body: JobBody) -> tuple[int, bool]:
+        """Count the experiments of the datasets that exist; whether all do."""
+        datasets = [self.get_dataset(reference) for reference in body["datasets"]]
+        found = [dataset for dataset in datasets if isinstance(dataset, Dataset)]
+        return sum(map(count_experiments, found)), len(found) == len(datasets)
+
+    def _find_weight_faults(self, body: JobBody) -> list[FieldError]:
+        experiments, is_complete = self._count_experiments(body)
+        return list(find_weight_count_faults(body, experiments)) if is_complete else []
 
     def _count_samples(self, body: JobBody) -> int:
         """Count the samples of all estimation datasets. A missing dataset counts as very long."""
@@ -229,7 +239,7 @@ def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
 
 
 def _find_unused_parameters(
-    model: Model, parameters: tuple[Parameter, ...], weights: Mapping[str, float] | None
+    model: Model, parameters: tuple[Parameter, ...], weights: Weights | None
 ) -> list[FieldError]:
     """Report parameters that affect no output, and similar unused settings."""
     return [

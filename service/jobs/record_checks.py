@@ -12,6 +12,7 @@ from service.datasets.signal_channels import map_channels
 from service.jobs.to_core import to_algorithm, to_loss
 from sysid.core.errors import RecordTooShort, SysidError, suggest_name
 from sysid.data.records import find_shared_channels
+from sysid.language.delays import has_varying_delay
 from sysid.models.delays import check_record_length, compute_longest_delay, list_past_values
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter, override_parameters
@@ -130,8 +131,8 @@ def _check_longest_delay(
         if parameter.bounds == "delay" and parameter.is_free:
             lower, upper = spans[parameter.name]
             spans[parameter.name] = (lower, min(upper, max(lower, duration / 2)))
-    lagged = sorted(
-        list_past_values(model),
+    lagged = sorted(  # a lag that changes with an input is checked with the input's data
+        (past for past in list_past_values(model) if not has_varying_delay(past)),
         key=lambda past_value: -compute_longest_delay(model, past_value, spans, step),
     )
     try:
@@ -162,11 +163,24 @@ def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
             hint = suggest_name(name, inputs)
             yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
     for name, weight in (body["weights"] or {}).items():
+        numbers = weight if isinstance(weight, list) else [weight]
         if name not in outputs:
             hint = suggest_name(name, outputs)
             yield FieldError(f"/weights/{name}", f"the model has no output {name!r}{hint}")
-        elif not weight > 0:
-            yield FieldError(f"/weights/{name}", f"found {weight:g}; need a positive number")
+        elif not min(numbers, default=0.0) > 0:
+            detail = f"found {min(numbers, default=0.0):g}; need a positive number"
+            yield FieldError(f"/weights/{name}", detail)
+
+
+def find_weight_count_faults(body: JobBody, experiments: int) -> Iterator[FieldError]:
+    """Report lists of weights that have not one number for each experiment."""
+    for name, weight in (body["weights"] or {}).items():
+        if isinstance(weight, list) and len(weight) != experiments:
+            yield FieldError(
+                f"/weights/{name}",
+                f"found {len(weight)} weights; need one for each of the {experiments} "
+                "experiments, or one number",
+            )
 
 
 def find_setting_conflicts(body: JobBody) -> list[FieldError]:

@@ -28,6 +28,7 @@ from sysid.core.settings import (
     TopologyName,
 )
 from sysid.data.records import HoldSetting
+from sysid.identification.verdict import Trust
 from sysid.models.parameters import ParameterScale
 
 SEARCH, LOSS = GeneticAlgorithm(), Loss()
@@ -85,8 +86,8 @@ class ValidationIn(Body):
 class LossIn(Body):
     """Loss function: squares, or soft-l1 with a scale in the output's unit.
 
-    The noise model ar1 gives generalised least-squares estimates. auto selects ar1 if the residuals
-    are coloured and the model integrates (initial errors persist), else white.
+    The noise model ar1 gives generalised least-squares estimates. auto selects the one that
+    predicts left-out data better, if the residuals are coloured, else white.
     """
 
     kind: LossKind = Field(
@@ -373,9 +374,10 @@ class IdentificationIn(Body):
         default="simulation", description="from its own past (simulation) or from the measured past"
     )
     loss: LossIn = Field(default=LossIn(), description="loss function")
-    weights: dict[str, float] | None = Field(
+    weights: dict[str, float | list[float]] | None = Field(
         default=None,
-        description="weight of each output; by default one over its standard deviation",
+        description="weight of each output, or a list with one for each experiment; by default "
+        "by the estimated noise of each output in each experiment",
     )
     skip: int = Field(
         default=0, ge=0, description="samples at the start of each output that are not scored"
@@ -426,6 +428,11 @@ class JobIn(IdentificationIn):
     posterior: bool = Field(
         default=False, description="sample the posterior distribution of the free parameters"
     )
+    compare_orders: bool | None = Field(
+        default=None,
+        description="fit a process with dead time with one order more and one less, too; null: "
+        "in a job without a sweep",
+    )
 
     def to_normal_form(self) -> dict[str, Any]:
         """Return the body with every default written out, as it is stored and sent to workers."""
@@ -453,6 +460,21 @@ class ProgressOut(Answer):
     seconds_left: float | None = Field(
         default=None, description="estimated time to the end, s; null if unknown"
     )
+
+
+class OutcomeOut(Answer):
+    """Outcome of a job: that of its only run, or of the best one by RMS."""
+
+    run: str = Field(description="identifier of the run")
+    fit_estimation: float | None = Field(description="fit to the estimation data, %")
+    fit_validation: float | None = Field(
+        description="fit to the validation data, %; null without them"
+    )
+    trust: Trust = Field(
+        description="limited: the estimates hold under the condition that the verdict names"
+    )
+    verdict: str = Field(description="the verdict in words")
+    warnings: int = Field(description="number of its warnings")
 
 
 class JobOut(Answer):
@@ -488,6 +510,11 @@ class JobOut(Answer):
     progress: ProgressOut = Field(description="progress of its runs")
     rms_unit: str | None = Field(
         default=None, description="unit of the best RMS; σ for several weighted outputs"
+    )
+    outcome: OutcomeOut | None = Field(
+        default=None,
+        description="outcome so far; null without a result, and of a batch, whose runs see "
+        "different recordings",
     )
     request: Annotated[Any, DescribedBy(JobIn | None)] = Field(
         default=None, description="the request with every default; null in lists"

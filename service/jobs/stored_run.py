@@ -4,7 +4,7 @@ It is in `jobs` because a run's request is its job's. Everything that uses runs 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.orm import Session
@@ -125,7 +125,10 @@ class StoredRun:
         parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
         loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
-        return Problem.from_settings(self.model, records, fit_settings_of(body))
+        settings, noise = fit_settings_of(body), self.result.get("noise_deviations")
+        if noise is not None:
+            settings = replace(settings, deviations=tuple(map(tuple, noise)))
+        return Problem.from_settings(self.model, records, settings)
 
     def resimulate(
         self, session: Session, store: ObjectStore
@@ -144,7 +147,7 @@ class StoredRun:
 
         model, records = self.model_of_request, self.read_fit_records(session, store)
         substeps = self.result.get("substeps", model.solver.substeps)
-        estimates = [_to_estimate(document) for document in self.estimates]
+        estimates = [to_estimate(document) for document in self.estimates]
         settings = fit_settings_of(self.body)
         return records, resimulate_run(model, records, settings, estimates, substeps)
 
@@ -154,7 +157,8 @@ class StoredRun:
         return {name: change for name, change in self.body["parameters"].items() if name in names}
 
 
-def _to_estimate(document: Mapping[str, Any]) -> Estimate:
+def to_estimate(document: Mapping[str, Any]) -> Estimate:
+    """Convert an entry ``parameters`` of a result, without its errors."""
     value, lower, upper = (float(document[name]) for name in ("value", "lower", "upper"))
     return Estimate(
         document["name"], document["unit"], value, lower, upper, None, None, document["status"]

@@ -23,7 +23,8 @@ from service.jobs.job_links import (
     list_used_runs,
     store_job_links,
 )
-from service.jobs.schemas import JobIn, JobOut, JobPage, ProgressOut
+from service.jobs.outcomes import read_outcomes
+from service.jobs.schemas import JobIn, JobOut, JobPage, OutcomeOut, ProgressOut
 from service.jobs.stored_cells import (
     CELLS_AT_SUBMISSION,
     build_stored_cells,
@@ -203,6 +204,7 @@ def to_job_out(
     *,
     with_request: bool = False,
     rms_unit: str | None = None,
+    outcome: OutcomeOut | None = None,
     now: datetime | None = None,
 ) -> JobOut:
     """Build the answer for a job, as of `now` (by default the present time)."""
@@ -219,7 +221,18 @@ def to_job_out(
         ),
         request=job.spec if with_request else None,
         rms_unit=rms_unit,
+        outcome=outcome,
         seconds=measure_seconds(job, now or utc_now()),
+    )
+
+
+def describe_job(session: Session, job: Job) -> JobOut:
+    """Build the whole answer for one job, with its request and outcome."""
+    return to_job_out(
+        job,
+        with_request=True,
+        rms_unit=find_rms_unit(session, job.spec),
+        outcome=read_outcomes(session, [job]).get(job.id),
     )
 
 
@@ -241,7 +254,11 @@ def list_jobs(
     page = JobRepository(session).list_page(
         cursor=cursor, limit=limit, states=states, chosen=chosen
     )
-    items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in page.items]
+    outcomes = read_outcomes(session, page.items)
+    items = [
+        to_job_out(job, rms_unit=find_rms_unit(session, job.spec), outcome=outcomes.get(job.id))
+        for job in page.items
+    ]
     return JobPage(items=items, next=page.next)
 
 

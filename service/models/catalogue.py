@@ -10,6 +10,7 @@ from sysid.core.errors import SysidError
 from sysid.models.catalogue import load
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.models.unused import find_unused_names
 
 
 def list_catalogue() -> list[ModelOut]:
@@ -27,7 +28,10 @@ def check_model(document: Any) -> CheckOut:
     except SysidError as error:
         problems = [FaultOut(**fault.to_dict()) for fault in to_field_errors(error)]
         return CheckOut(valid=False, errors=problems)
-    return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
+    unused = [
+        FaultOut(pointer=fault.pointer, detail=fault.detail) for fault in find_unused_names(model)
+    ]
+    return CheckOut(valid=True, errors=[], warnings=unused, normal_form=dict(model.document))
 
 
 def to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:

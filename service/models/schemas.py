@@ -55,6 +55,9 @@ class CheckOut(Answer):
 
     valid: bool = Field(description="whether the document is a model")
     errors: list[FaultOut] = Field(description="every fault of the document")
+    warnings: list[FaultOut] = Field(
+        default=[], description="what is declared in a valid document but used nowhere"
+    )
     normal_form: Annotated[Any, DescribedBy(ModelDocumentOut | None)] = Field(
         default=None, description="document with every default; null if it has faults"
     )

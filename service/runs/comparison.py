@@ -1,6 +1,7 @@
 """Use case of a comparison: several model structures on the same data, side by side."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -38,10 +39,8 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
         If a run is missing, has no result, is named twice, or was fitted to other data than
         the first.
     """
-    candidates = _read_candidates(session, runs)
-    _check_same_data(candidates)
-    ordered = sorted(candidates, key=lambda stored: _rank_rms(stored.result.get("rms")))
-    titles = _build_titles(ordered)
+    ordered = load_compared_runs(session, runs)
+    titles = build_titles(ordered)
     parameters = list(_compare_parameters(ordered, titles))
     return ComparisonOut(
         unit=_find_common_unit(ordered),
@@ -50,6 +49,20 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
         notes=[parameter.note for parameter in parameters if parameter.differs]
         + list(_list_notes(ordered)),
     )
+
+
+def load_compared_runs(session: Session, runs: Sequence[str]) -> list[StoredRun]:
+    """Load runs that can be compared, the best RMS first.
+
+    Raises
+    ------
+    InvalidRequest
+        If a run is missing, has no result, is named twice, or was fitted to other data than
+        the first.
+    """
+    candidates = _read_candidates(session, runs)
+    _check_same_data(candidates)
+    return sorted(candidates, key=lambda stored: _rank_rms(stored.result.get("rms")))
 
 
 def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
@@ -107,13 +120,26 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
         raise InvalidRequest(faults)
 
 
-def _build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
-    """Build the title of each run: its model, with the run's number if models repeat."""
-    names = [stored.model.name for stored in ordered]
-    return {
-        stored.run.id: name if names.count(name) == 1 else f"{name}, run {stored.run.number + 1}"
-        for stored, name in zip(ordered, names, strict=True)
-    }
+def build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
+    """Build a title of each run, all different: the model, the job, then the number of the run.
+
+    Jobs of equal names differ by the ends of their identifiers.
+    """
+    titles = {stored.run.id: stored.model.name for stored in ordered}
+    jobs = {stored.job.id for stored in ordered}
+    forms: list[Callable[[StoredRun], str]] = [
+        lambda stored: f"{stored.model.name}, run {stored.run.number + 1}",
+        lambda stored: f"{stored.job.name}, run {stored.run.number + 1}",
+        lambda stored: f"{stored.job.name}, {stored.run.id[-6:]}",
+    ]
+    if len(jobs) > 1:
+        forms[0] = lambda stored: stored.job.name
+    for form in forms:
+        repeated = Counter(titles.values())
+        for stored in ordered:
+            if repeated[titles[stored.run.id]] > 1:
+                titles[stored.run.id] = form(stored)
+    return titles
 
 
 def _to_compared_run(stored: StoredRun, title: str) -> ComparedRunOut:
@@ -191,10 +217,11 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _describe_difference(
     name: str, unit: str, pair: Sequence[tuple[str, ResultDocument]], *, same_model: bool
 ) -> str:
-    values = ", ".join(
-        f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
-        for title, estimate in pair
-    )
+    texts = [
+        (plain_estimate(one["value"], one["stderr"], status=one["status"]), title)
+        for title, one in pair
+    ]
+    values = ", ".join(f"{text}{plain_unit(unit)} with {title}" for text, title in texts)
     return f"{name} depends on the {'run' if same_model else 'model'}: {values}"
 
 

@@ -184,9 +184,13 @@ def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) ->
     starts = {parameter.name for parameter in build_initial_parameters(model, len(records))}
     changes = {name: f for name, f in request["parameters"].items() if name in starts}
     fixed = {name: _fix_estimate(estimate) for name, estimate in values.items()}
+    weights = {
+        name: float(np.sqrt(np.mean(np.square(given))))
+        for name, given in (request["weights"] or {}).items()
+    }
     try:
         return Problem.build(
-            model, records, parameters={**changes, **fixed}, weights=request["weights"], skip=skip
+            model, records, parameters={**changes, **fixed}, weights=weights or None, skip=skip
         )
     except (InvalidRecord, RecordTooShort) as error:
         raise InvalidRequest.from_fault("/dataset", str(error)) from None
@@ -234,7 +238,10 @@ def _split_by_record(problem: "Problem") -> "Iterator[Problem]":
             first_name: changes[name] for first_name, name in names.items() if name in changes
         }
         yield problem.rebuild(
-            records=[record], parameters=fixed | starts, weights=problem.output_weights
+            records=[record],
+            parameters=fixed | starts,
+            weights=problem.output_weights,
+            deviations=None,
         )
 
 

@@ -49,7 +49,7 @@ def compute_profiles(
     with database.read_session() as session:
         stored = load_estimated_run(session, run_id, "profile")
         problem = stored.problem(session, store)
-    theta = _read_estimate(problem, stored)
+    theta = read_estimate(problem, stored)
     names = _choose_parameters(problem, body)
     work = problem.evaluator.n_measured * len(problem.free_parameters) * body.points * len(names)
     if work > MAX_WORK:
@@ -108,6 +108,7 @@ def _profile_parameters(
         )
 
 
-def _read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
+def read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
+    """Read the estimates (D,) of a run's free parameters."""
     values = {estimate["name"]: estimate["value"] for estimate in stored.estimates}
     return np.array([values[name] for name in problem.free_names])

@@ -125,7 +125,13 @@ def _build_series(
         number = fit.number - 1
         first = before.get((fit.number, fit.name), 0)
         scored = np.arange(first, first + fit.times.size) >= body["skip"]
-        weight = weights[fit.name]
+        given = weights[fit.name]
+        if not isinstance(given, list):
+            weight = given
+        elif fit.role == "estimation":
+            weight = given[number]
+        else:
+            weight = float(np.sqrt(np.mean(np.square(given))))
         yield make_residual_series(
             number,
             fit.name,
@@ -148,7 +154,7 @@ def _count_earlier_samples(
     return {(f.number, f.name): f.times.size for f in fits if f.role == "estimation"}
 
 
-def _compute_weights(body: JobBody, fits: Sequence[FittedOutput]) -> dict[str, float]:
+def _compute_weights(body: JobBody, fits: Sequence[FittedOutput]) -> dict[str, float | list[float]]:
     """Compute the output weights of the problem. They matter for a loss with a scale."""
     names = {fit.name for fit in fits}
     if len(names) == 1:

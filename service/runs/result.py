@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from service.core.documents import to_finite
-from sysid.identification.result import Identification, InputHold
+from service.jobs.results import to_verdict_document
+from sysid.identification.result import Identification, InputHold, OrderComparison
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import TEST_LEVEL, ResidualTest, ResidualTests
 from sysid.simulation.metrics import ChannelMetrics
@@ -83,6 +84,7 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
         else identification.uncertainty.noise_colour,
         "noise_model": identification.noise_model,
         "correlation_times": dict(identification.correlation_times),
+        "noise_deviations": identification.noise_deviations,
         "residual_tests": to_residual_document(identification.residual_tests),
         "onset_delays": to_onset_document(identification.onset_delays),
         "data_bounds": list(identification.data_bounds),
@@ -93,6 +95,9 @@ def to_result_document(identification: Identification, seconds: float) -> dict[s
         },
         "search": _to_search_document(identification),
         "posterior": _to_posterior_document(identification),
+        "order_comparison": _to_order_document(identification.order_comparison),
+        "delays": list(identification.delays),
+        "verdict": to_verdict_document(identification.verdict),
         "warnings": list(identification.warnings),
         "substeps": identification.substeps,
         "selection": [step._asdict() for step in identification.selection],
@@ -164,6 +169,25 @@ def _to_posterior_document(identification: Identification) -> dict[str, Any] | N
     }
 
 
+def _to_order_document(comparison: OrderComparison | None) -> dict[str, Any] | None:
+    """Convert the comparison of orders; None if there is none."""
+    if comparison is None:
+        return None
+    return {
+        **_read(
+            comparison, "model", "preferred_model", "delay", "unit", "delay_range", "noise_model"
+        ),
+        "fits": [
+            {
+                **_read(fit, "model", "order", "delay", "delay_stderr", "rms", "bic"),
+                "values": {name: to_finite(value) for name, value in fit.values.items()},
+                "is_open": fit in comparison.open_fits,
+            }
+            for fit in comparison.fits
+        ],
+    }
+
+
 def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
@@ -195,6 +219,8 @@ def _read(source: object, *names: str) -> dict[str, Any]:
 
 def _to_json(value: Any) -> Any:
     """Convert a value to JSON: arrays to lists, non-finite numbers to null."""
+    if value is None or isinstance(value, str | int):  # most values: the quickest way
+        return value
     if isinstance(value, float):
         return to_finite(value)
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and np.isfinite(value).all():

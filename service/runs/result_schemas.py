@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.core.wire import Answer, Finite
+from sysid.identification.verdict import Severity, Trust
 
 
 class EstimateOut(Answer):
@@ -211,6 +212,58 @@ class PosteriorOut(Answer):
     samples: list[list[float]] | None = Field(
         default=None, description="at most 1,000 samples, in the parameters' units; not in lists"
     )
+
+
+class OrderFitOut(Answer):
+    """A process of one order, fitted to the same samples."""
+
+    model: str = Field(description="its name in the catalogue")
+    order: int = Field(description="number of poles")
+    delay: Finite = Field(description="dead time, in the comparison's `unit`")
+    delay_stderr: Finite = Field(description="standard error of the dead time; null without one")
+    values: dict[str, Finite] = Field(description="all parameters of that model")
+    rms: Finite = Field(description="RMS error, in the unit of `rms`")
+    bic: Finite = Field(description="Schwarz's criterion; smaller is better")
+    is_open: bool = Field(description="whether its BIC is within 6 of the lowest: not ruled out")
+
+
+class OrderComparisonOut(Answer):
+    """A process with dead time, with one order less and one more."""
+
+    model: str = Field(description="the catalogue's name of the model's own order")
+    preferred_model: str | None = Field(
+        description="the one order that is not ruled out; null if there are several"
+    )
+    delay: str = Field(description="the parameter that is the dead time")
+    unit: str = Field(description="unit of the dead times")
+    delay_range: list[float] = Field(
+        description="smallest and largest dead time of the orders that are not ruled out, in `unit`"
+    )
+    noise_model: str = Field(description="noise model of the criteria: white or ar1")
+    fits: list[OrderFitOut] = Field(description="the orders, the lowest first")
+
+
+class ReasonOut(Answer):
+    """One finding about a result."""
+
+    severity: Severity = Field(
+        description="serious: do not rely on the estimates; caution: they hold under a condition; "
+        "note: worth knowing"
+    )
+    brief: str = Field(
+        description="a few words, as they follow “trustworthy, but” or “not trustworthy:”"
+    )
+    text: str = Field(description="what was found, and what helps")
+
+
+class VerdictOut(Answer):
+    """Whether the estimates can be relied on."""
+
+    trust: Trust = Field(
+        description="limited: the estimates hold under the condition that the text names"
+    )
+    text: str = Field(description="the verdict in words")
+    reasons: list[ReasonOut] = Field(description="what speaks against it, the most severe first")
 
 
 class SelectedTermOut(Answer):

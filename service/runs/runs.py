@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.json_pointer import build_run_body
 from service.core.states import JobState
-from service.jobs.results import is_free
+from service.jobs.results import is_free, read_verdict
 from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import WrittenProgress, read_written_progress
@@ -91,6 +91,7 @@ def to_run_out(run: Run, job: Job, written: WrittenProgress | None = None) -> Ru
         {
             **progress,
             **(run.result or {}),
+            "verdict": None if run.result is None else read_verdict(run.result),
             "id": run.id,
             "job": run.job_id,
             "number": run.number,

@@ -32,11 +32,13 @@ from service.runs.result_schemas import (
     KnownBeforeOut,
     MatrixOut,
     OnsetDelayOut,
+    OrderComparisonOut,
     PosteriorOut,
     ResidualTestOut,
     ResidualVerdictOut,
     SearchOut,
     SelectedTermOut,
+    VerdictOut,
 )
 
 
@@ -123,6 +125,11 @@ class RunOut(Answer):
     correlation_times: dict[str, float] | None = Field(
         default=None, description="correlation time of each output's noise, s"
     )
+    noise_deviations: list[list[float]] | None = Field(
+        default=None,
+        description="relative deviation of the noise by experiment and output, by which residuals "
+        "were divided; null if all count alike or weights were given",
+    )
     residual_tests: Annotated[Any, DescribedBy(ResidualVerdictOut | None)] = Field(
         default=None, description="tests of the residuals; empty if none were made"
     )
@@ -143,6 +150,16 @@ class RunOut(Answer):
     )
     posterior: Annotated[Any, DescribedBy(PosteriorOut | None)] = Field(
         default=None, description="samples of the posterior; null if not requested"
+    )
+    order_comparison: Annotated[Any, DescribedBy(OrderComparisonOut | None)] = Field(
+        default=None,
+        description="one order less and one more; null if not compared, or no process with delay",
+    )
+    delays: list[str] | None = Field(
+        default=None, description="free parameters that time lags depend on"
+    )
+    verdict: Annotated[Any, DescribedBy(VerdictOut | None)] = Field(
+        default=None, description="whether the estimates can be relied on, with the reasons"
     )
     warnings: list[str] = Field(default=[], description="what limits the result")
     substeps: int | None = Field(default=None, description="integration steps in one grid step")
@@ -186,6 +203,41 @@ class ResponseOut(Answer):
 
     id: str = Field(description="identifier of the run")
     experiments: list[ExperimentOut] = Field(description="records of the run")
+
+
+class BandOut(Answer):
+    """95 % bands of one output, in `unit`; null where the simulation diverged."""
+
+    name: str = Field(description="name of the output")
+    unit: str = Field(description="unit of all values")
+    samples: int = Field(description="samples before the reduction")
+    times: list[float] = Field(description="times, s")
+    simulated: list[float | None] = Field(description="output at the estimates")
+    confidence_lower: list[float | None] = Field(description="lower end for the output itself")
+    confidence_upper: list[float | None] = Field(description="upper end for the output itself")
+    prediction_lower: list[float | None] = Field(description="lower end for a new measurement")
+    prediction_upper: list[float | None] = Field(description="upper end for a new measurement")
+
+
+class BandExperimentOut(Answer):
+    """Bands of all outputs of one record."""
+
+    name: str = Field(description="name of the record")
+    outputs: list[BandOut] = Field(description="bands of each output")
+
+
+class BandsOut(Answer):
+    """95 % bands of the outputs on the records that the run was fitted to.
+
+    The confidence band holds the output without noise, the prediction band a new measurement, at
+    each time by itself.
+    """
+
+    id: str = Field(description="identifier of the run")
+    source: Literal["covariance", "posterior"] = Field(
+        description="covariance of the estimates, or samples of the posterior"
+    )
+    experiments: list[BandExperimentOut] = Field(description="records of the run")
 
 
 class CorrelationOut(ResidualTestOut):

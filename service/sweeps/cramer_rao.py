@@ -55,6 +55,21 @@ def _is_measured_record(reference: Mapping[str, Any]) -> bool:
     return reference.get("kind") == "estimate" and reference.get("sigma") == 0
 
 
+def scale_to_median(group: Mapping[str, Any]) -> float | None:
+    """Scale the bound of a group's RMS to one of the median over its runs.
+
+    With r directions of the parameters in the response, r RMS²/bound² of an efficient estimator
+    is χ² with r degrees of freedom. Its median is below r, so that of the runs may lie below a
+    bound of the RMS.
+    """
+    from scipy.special import chdtri  # its import takes longer than a command's start may
+
+    if group["rms_floor"] is None:
+        return None
+    r = sum(parameter["floor"] is not None for parameter in group["parameters"]) or 1
+    return float(group["rms_floor"] * (chdtri(r, 0.5) / r) ** 0.5)
+
+
 def scale_to_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:
     """Scale a bound to the σ of a group; None if its runs have several."""
     if per_sigma is None or sigma is None or sigma[0] != sigma[1]:

@@ -121,6 +121,11 @@ def _list_distinct(words: Any) -> list[str]:
     return list(dict.fromkeys(words)) or ["unknown"]
 
 
+def _describe_weight(weight: float | list[float]) -> str:
+    numbers = weight if isinstance(weight, list) else [weight]
+    return " and ".join(f"{number:g}" for number in numbers)
+
+
 def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
     loss, weights = body["loss"], body["weights"]
     scale = "" if loss["kind"] == "squares" else f" of scale {loss['scale']:g}"
@@ -128,9 +133,9 @@ def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
     yield (
         "weights",
         (
-            ", ".join(f"{name} {value:g}" for name, value in sorted(weights.items()))
+            ", ".join(f"{name} {_describe_weight(weights[name])}" for name in sorted(weights))
             if weights
-            else "by standard deviation"
+            else "by the noise"
         ),
     )
     yield "prediction", body["prediction"]

@@ -70,7 +70,7 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
     )
 
 
-_trends = ComputedValues(8)
+_trends = ComputedValues(64)
 
 
 def _find_reference_version(session: Session, job: Job) -> Hashable:

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from dataclasses import dataclass
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -10,7 +11,11 @@ from service.storage.errors import StorageError
 from service.storage.garbage import delete_orphans
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from service.upkeep.retention import delete_expired_jobs, purge_deleted_jobs
+from service.upkeep.retention import (
+    delete_expired_actions,
+    delete_expired_jobs,
+    purge_deleted_jobs,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +26,22 @@ COLLECT_SECONDS = 3600.0
 """Pause between two collections of objects, which list the whole store."""
 
 
+@dataclass(frozen=True, slots=True)
+class KeptDays:
+    """How many days things are kept; None: for ever.
+
+    Attributes
+    ----------
+    jobs : float or None
+        Ended jobs, in projects without a rule of their own.
+    audit : float or None
+        Entries of the audit log.
+    """
+
+    jobs: float | None = None
+    audit: float | None = None
+
+
 class Housekeeper:
     """Keeps the data in order in a separate thread until `stopping` is set."""
 
@@ -28,10 +49,10 @@ class Housekeeper:
         self,
         database: Database,
         store: ObjectStore,
-        keep_days: float | None,
+        keep: KeptDays,
         stopping: threading.Event,
     ) -> None:
-        self._database, self._store, self._keep_days = database, store, keep_days
+        self._database, self._store, self._keep = database, store, keep
         self._stopping = stopping
         self._collected_at = time.monotonic()
         self._thread = threading.Thread(target=self._run_loop, name="housekeeper", daemon=True)
@@ -45,10 +66,13 @@ class Housekeeper:
         self._thread.join(5.0)
 
     def run_pass(self) -> None:
-        """Delete expired jobs, remove the rows of deleted ones, and then their objects."""
-        deleted = delete_expired_jobs(self._database, self._keep_days)
+        """Delete what has expired, remove the rows of deleted jobs, and then their objects."""
+        deleted = delete_expired_jobs(self._database, self._keep.jobs)
         if deleted:
             _log.info("retention deleted %s", ", ".join(deleted))
+        n_entries = delete_expired_actions(self._database, self._keep.audit)
+        if n_entries:
+            _log.info("retention deleted %d entries of the audit log", n_entries)
         purge_deleted_jobs(self._database)
         # Deleted recordings and refused uploads leave objects too, also of an earlier process.
         if time.monotonic() - self._collected_at > COLLECT_SECONDS:

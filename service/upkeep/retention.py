@@ -1,4 +1,4 @@
-"""Delete ended jobs after their time, and remove what deleted jobs leave behind.
+"""Delete ended jobs and audit entries after their time, and remove what deleted jobs leave.
 
 Removal waits for `MINIMUM_AGE`, as that of objects does: a backup that is being written, or a run
 that is taken over, may still read what was just deleted.
@@ -6,6 +6,7 @@ that is taken over, may still read what was just deleted.
 
 from collections.abc import Sequence
 from datetime import datetime, timedelta
+from itertools import takewhile
 from typing import Any
 
 from sqlalchemy import delete, exists, null, or_, select, update
@@ -20,6 +21,7 @@ from service.storage.garbage import MINIMUM_AGE
 from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.statements import split_chunks
 from service.storage.tables import (
+    AuditEntry,
     Checkpoint,
     Dataset,
     Event,
@@ -70,6 +72,27 @@ def delete_expired_jobs(
                 break
             after = jobs[-1]
     return deleted
+
+
+def delete_expired_actions(
+    database: Database, days: float | None, now: datetime | None = None
+) -> int:
+    """Delete the entries of the audit log that are older than `days`; return their number.
+
+    They are read in the order of their numbers, which is that of time, up to the first that stays.
+    """
+    if days is None:
+        return 0
+    limit, n_deleted = (now or utc_now()) - timedelta(days=days), 0
+    while True:
+        oldest = select(AuditEntry.id, AuditEntry.at).order_by(AuditEntry.id).limit(ROWS_AT_ONCE)
+        with database.write_session() as session:
+            rows = session.execute(oldest).all()
+            expired = [number for number, _ in takewhile(lambda row: row.at < limit, rows)]
+            session.execute(delete(AuditEntry).where(AuditEntry.id.in_(expired)))
+        n_deleted += len(expired)
+        if len(expired) < ROWS_AT_ONCE:
+            return n_deleted
 
 
 def list_ended_jobs(session: Session, limit: datetime, after: str | None = None) -> Sequence[str]:

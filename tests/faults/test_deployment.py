@@ -42,13 +42,16 @@ def start_all(deployment: Deployment) -> list[str]:
 def test_the_commands_of_compose_carry_out_a_job_on_postgresql_s3_and_two_nodes(
     tmp_path: Path,
 ) -> None:
-    with rehearse_deployment(tmp_path) as deployment:
+    with rehearse_deployment(tmp_path) as deployment, httpx.Client(timeout=60) as asked:
+        key = deployment.run("web", "lagid", "key", "create", "me", "--scope", "admin")
         first, second = start_all(deployment)
+        assert httpx.get(f"{first}/v1/jobs").status_code == 401
+        asked.headers["Authorization"] = f"Bearer {key}"
         ready = f"{second}/readyz"
         deployment.wait_until(lambda: httpx.get(ready).status_code == 200, "a ready dispatcher")
         assert deployment.check_health("dispatcher")
         content = recording()
-        added = httpx.post(f"{first}/v1/datasets?name=steps", content=content, headers=CSV)
+        added = asked.post(f"{first}/v1/datasets?name=steps", content=content, headers=CSV)
         assert added.status_code == 201, added.text
         body = {
             "model": "fopdt",
@@ -57,16 +60,16 @@ def test_the_commands_of_compose_carry_out_a_job_on_postgresql_s3_and_two_nodes(
             "keep_signals": True,
             "parameters": {"T": {"upper": 10.0}, "L": {"upper": 2.0}},
         }
-        job = httpx.post(f"{first}/v1/jobs", json=body, headers={"X-Request-ID": "rehearsal-1"})
+        job = asked.post(f"{first}/v1/jobs", json=body, headers={"X-Request-ID": "rehearsal-1"})
         assert (job.status_code, job.headers["x-request-id"]) == (202, "rehearsal-1")
         at = f"{second}/v1/jobs/{job.json()['id']}"  # what one web process takes, the other shows
         open_states = ("queued", "running")
-        deployment.wait_until(lambda: httpx.get(at).json()["state"] not in open_states, "the end")
-        ended = httpx.get(at).json()
+        deployment.wait_until(lambda: asked.get(at).json()["state"] not in open_states, "the end")
+        ended = asked.get(at).json()
         progress = ended["progress"]
         assert (ended["state"], progress["finished"], progress["failed"]) == ("succeeded", 4, 0)
-        run = httpx.get(f"{at}/runs").json()["items"][0]["id"]
-        found = httpx.get(f"{second}/v1/runs/{run}").json()["parameters"]
+        run = asked.get(f"{at}/runs").json()["items"][0]["id"]
+        found = asked.get(f"{second}/v1/runs/{run}").json()["parameters"]
         values = {parameter["name"]: parameter["value"] for parameter in found}
         assert abs(values["L"] - 0.5) < 0.1
 
@@ -83,6 +86,6 @@ def test_the_commands_of_compose_carry_out_a_job_on_postgresql_s3_and_two_nodes(
         numbers = httpx.get(f"{deployment.metrics_url}/metrics").text
         assert 'lagid_runs_total{outcome="succeeded"} 4.0' in numbers
         assert "lagid_dispatcher_cores 1.0" in numbers
-        assert 'lagid_jobs{state="succeeded"} 1.0' in httpx.get(f"{first}/metrics").text
+        assert 'lagid_jobs{state="succeeded"} 1.0' in asked.get(f"{first}/metrics").text
         assert WORKER_HOST in deployment.read_log("ray-worker-0")
     assert all(child.returncode is not None for child in deployment.processes.values())

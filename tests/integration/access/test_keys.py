@@ -5,12 +5,13 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import update
 
 from service.access.tokens import hash_secret, parse_token
-from service.api import events
+from service.api import events, failure_delay
 from service.api.access_check import COOKIE
 from service.repositories.keys import note_use
 from service.storage.tables import ApiKey, WebSession
@@ -43,7 +44,8 @@ def test_a_request_without_a_key_is_told_how_to_send_one(guarded: Guarded, path:
 
 
 @pytest.mark.parametrize(
-    "path", ["/healthz", "/docs", "/openapi.json", "/sign-in", "/static/lagid.css"]
+    "path",
+    ["/healthz", "/docs", "/guides/README.md", "/openapi.json", "/sign-in", "/static/lagid.css"],
 )
 def test_what_belongs_to_no_project_needs_no_key(guarded: Guarded, path: str) -> None:
     assert guarded.ask("GET", path).status_code == 200
@@ -119,6 +121,16 @@ def test_no_cache_gives_an_answer_to_another_caller(guarded: Guarded) -> None:
     answer = guarded.ask("GET", "/v1/jobs", token)
     assert answer.headers["cache-control"] == "private, no-cache"
     assert guarded.ask("GET", "/", token, headers=PAGE).headers["cache-control"] == "no-store"
+    stored = guarded.ask("POST", "/v1/datasets", token, content=recording(n=30), headers=CSV)
+    content = f"/v1/datasets/{stored.json()['id']}/content"
+    read = guarded.ask("GET", content, token)
+    assert read.headers["cache-control"] == "private, no-cache"  # asked again with each use
+    again = {"If-None-Match": read.headers["etag"]}
+    unchanged = guarded.ask("GET", content, token, headers=again)
+    assert (unchanged.status_code, unchanged.content) == (304, b"")
+    assert unchanged.headers["cache-control"] == "private, no-cache"
+    change_key(guarded, token, revoked_at=datetime.now(UTC))
+    refused(guarded.ask("GET", content, token, headers=again), 401, "unauthorized")
 
 
 def test_access_says_who_asks(guarded: Guarded) -> None:
@@ -182,8 +194,8 @@ def test_only_digests_are_stored_and_nothing_is_logged(
         assert hidden not in caplog.text
 
 
-def sign_in(guarded: Guarded, token: str, **form: str) -> str:
-    answer = guarded.ask("POST", "/sign-in", data={"key": token, **form})
+def sign_in(guarded: Guarded, token: str, **arguments: Any) -> str:
+    answer = guarded.ask("POST", "/sign-in", data={"key": token}, **arguments)
     assert answer.status_code == 303, answer.text
     guarded.client.cookies.clear()
     return str(answer.cookies[COOKIE])
@@ -251,6 +263,61 @@ def test_a_wrong_key_at_the_form_is_told_there(guarded: Guarded) -> None:
     assert answer.status_code == 401
     assert "is unknown, has expired, or was revoked" in answer.text
     assert "set-cookie" not in answer.headers
+
+
+def read_actions(guarded: Guarded, token: str, *names: str) -> list[dict[str, Any]]:
+    """Entries of the audit log with these actions, the latest first."""
+    entries = guarded.ask("GET", "/v1/audit", token).json()["items"]
+    return [entry for entry in entries if entry["action"] in names]
+
+
+@pytest.mark.parametrize("way", ["header", "form"])
+def test_a_refused_key_is_in_the_log_and_in_the_audit_log_of_its_project(
+    guarded: Guarded, caplog: pytest.LogCaptureFixture, way: str
+) -> None:
+    def try_key(token: str, request_id: str) -> None:
+        headers = {"X-Request-ID": request_id}
+        if way == "header":
+            refused(guarded.ask("GET", "/v1/jobs", token, headers=headers), 401, "unauthorized")
+        else:
+            form = guarded.ask("POST", "/sign-in", data={"key": token}, headers=headers)
+            assert form.status_code == 401
+
+    project = guarded.add_project(f"guessed by {way}")
+    token, failures = guarded.add_key(project), guarded.parts.failures
+    failures._recorded_at, failures._n_unrecorded = -failure_delay.RECORD_SECONDS, 0
+    try_key(f"{token}0", "guess-1")
+    for number in range(3):
+        try_key(f"{token}0", f"flood-{number}")
+    (entry,) = read_actions(guarded, token, "key.refuse")
+    assert (entry["object_id"], entry["request_id"]) == (key_id(token), "guess-1")
+    assert entry["actor"] == "address:testclient"
+    assert f"refused a wrong key, the last from testclient; it names {key_id(token)}" in caplog.text
+    failures._recorded_at = -failure_delay.RECORD_SECONDS
+    try_key("no\tkey", "guess-2")
+    assert "refused 4 wrong keys, the last from testclient; it has not the form" in caplog.text
+    assert caplog.text.count("refused") == 2
+
+
+def test_a_sign_in_has_a_new_secret_and_ends_the_session_of_the_browser(guarded: Guarded) -> None:
+    token = guarded.add_key(guarded.add_project("again"))
+    chosen = {"Cookie": f"{COOKIE}=chosen-by-another"}
+    first = sign_in(guarded, token, headers={**chosen, "X-Request-ID": "in-1"})
+    assert first != "chosen-by-another"
+    refused(guarded.ask("GET", "/v1/jobs", headers=chosen), 401, "unauthorized")
+    old = {"Cookie": f"{COOKIE}={first}"}
+    second = sign_in(guarded, token, headers={**old, "X-Request-ID": "in-2"})
+    refused(guarded.ask("GET", "/v1/jobs", headers=old), 401, "unauthorized")
+    headers = {"Cookie": f"{COOKIE}={second}", "X-Request-ID": "out-1"}
+    left = guarded.ask("POST", "/sign-out", headers=headers)
+    assert "Max-Age=0" in left.headers["set-cookie"]
+    entries = read_actions(guarded, token, "session.sign-in", "session.sign-out")
+    assert [(entry["action"], entry["request_id"]) for entry in entries] == [
+        ("session.sign-out", "out-1"),
+        ("session.sign-in", "in-2"),
+        ("session.sign-out", "in-2"),
+        ("session.sign-in", "in-1"),
+    ]
 
 
 @pytest.mark.parametrize(

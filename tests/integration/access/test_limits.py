@@ -9,16 +9,20 @@ import pytest
 from service.core.errors import BudgetExceeded, QuotaExceeded
 from service.core.settings import Settings
 from service.core.states import JobState
-from service.jobs.submit import check_limits
+from service.dispatch.leases import HeldLeases
+from service.jobs.submit import check_limits, resume_job
+from service.queue.daily_limit import stop_overruns
+from service.queue.leases import JobProgress, Lease, LeaseQueue
+from service.repositories.audit import list_actions
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.projects import ProjectRepository
 from service.storage.columns import utc_now
 from service.storage.errors import RowConflict, RowNotFound
-from service.storage.sessions import Database, SessionOwner
+from service.storage.sessions import Database, SessionOwner, find_project
 from service.storage.tables import Job
 from tests.database import record_statements
-from tests.stored import new_dataset
+from tests.stored import claim, job_of, new_dataset, state_of, submit
 
 SETTINGS = Settings()
 
@@ -97,6 +101,68 @@ def test_evaluations_of_a_day_are_limited_until_the_first_job_is_a_day_old(
     with limited.write_session() as session:
         ProjectRepository(session).change_limits("limited", {"max_daily_evaluations": 111})
     add_job(limited)
+
+
+def start_job(database: Database, evaluations: int) -> Lease:
+    """A job that a dispatcher holds, after so many evaluations."""
+    submit(database)
+    held = claim(database)
+    assert held is not None
+    with database.write_session() as session:
+        LeaseQueue(session).write_progress(held.lease, JobProgress(evaluations))
+    return held.lease
+
+
+def test_jobs_that_use_up_the_day_are_stopped_and_go_on_a_day_later(
+    limited: Database, caplog: pytest.LogCaptureFixture
+) -> None:
+    held = start_job(limited, 99)
+    queued = submit(limited)
+    assert stop_overruns(limited) == []
+    with limited.write_session() as session:
+        LeaseQueue(session).write_progress(held, JobProgress(101))
+    others = submit(limited.open_for(SessionOwner()))
+    assert stop_overruns(limited) == [held.job_id, queued]
+    assert stop_overruns(limited) == []  # the dispatcher is asked once
+    assert "made 101 evaluations; 100 are allowed" in caplog.text
+    with limited.write_session() as session:
+        LeaseQueue(session).cancel_parcel(held)
+    for job_id in (held.job_id, queued):
+        job = job_of(limited, job_id)
+        assert job.state is JobState.CANCELLED
+        assert "101 evaluations; 100 are allowed. Resume the job" in str(job.error)
+    assert state_of(limited.open_for(SessionOwner()), others) is JobState.QUEUED
+    with limited.read_session() as session:
+        (entry,) = list_actions(session, find_project(session), limit=1).items
+        assert (entry.action, entry.actor, entry.object_id) == ("job.cancel", "daily limit", queued)
+    with pytest.raises(BudgetExceeded), limited.write_session() as session:
+        resume_job(session, held.job_id, SETTINGS)
+    with limited.write_session() as session:
+        for job_id in (held.job_id, queued):
+            session.get_one(Job, job_id).finished_at = utc_now() - timedelta(hours=25)
+    with limited.write_session() as session:
+        job = resume_job(session, held.job_id, SETTINGS)
+        assert (job.error, job.evaluations) == (None, 101)
+    assert stop_overruns(limited) == []  # what it made a day before counts no more
+    again = claim(limited)
+    assert again is not None
+    with limited.write_session() as session:
+        LeaseQueue(session).write_progress(again.lease, JobProgress(201))
+    assert stop_overruns(limited) == [held.job_id]
+
+
+def test_a_job_that_ends_before_it_is_stopped_ends_as_it_would(limited: Database) -> None:
+    held = start_job(limited, 100)
+    assert stop_overruns(limited) == [held.job_id]
+    with limited.write_session() as session:
+        LeaseQueue(session).finish_job(held, JobState.FAILED, "no result")
+    assert job_of(limited, held.job_id).error == "no result"
+
+
+def test_a_heartbeat_of_a_dispatcher_stops_what_goes_too_far(limited: Database) -> None:
+    held = start_job(limited, 100)
+    HeldLeases(limited, 10.0).renew_leases()
+    assert job_of(limited, held.job_id).cancel_requested
 
 
 def test_a_project_has_its_own_limit_of_open_jobs(limited: Database) -> None:

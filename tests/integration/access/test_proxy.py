@@ -86,6 +86,27 @@ def test_a_cookie_is_secure_where_a_proxy_speaks_https(
         assert ("Secure" in answer.headers["set-cookie"]) is secure
 
 
+@pytest.mark.parametrize(
+    ("address", "seen"), [("127.0.0.1", "203.0.113.5"), ("10.9.9.9", "10.9.9.9")]
+)
+def test_only_a_proxy_tells_from_where_a_wrong_key_came(
+    tmp_path: Path, address: str, seen: str
+) -> None:
+    with guard("sqlite", tmp_path) as guarded:
+        token = guarded.add_key()
+        guarded.client._transport.client = (address, 1)  # type: ignore[attr-defined]
+        headers = {
+            "X-Forwarded-For": "203.0.113.5",
+            "Forwarded": "for=203.0.113.6",
+            "X-Forwarded-Host": "evil.example",
+        }
+        form = guarded.ask("POST", "/sign-in", data={"key": f"{token}0"}, headers=headers)
+        assert form.status_code == 401
+        assert "evil.example" not in form.text
+        (entry, *_) = guarded.ask("GET", "/v1/audit", token).json()["items"]
+        assert (entry["action"], entry["actor"]) == ("key.refuse", f"address:{seen}")
+
+
 def test_on_loopback_nothing_is_asked(tmp_path: Path) -> None:
     with TestClient(create_app(settings_of(tmp_path))) as client:
         answer = client.get("/v1/access", headers={"Authorization": "Bearer lagid_1_2"}).json()

@@ -163,7 +163,8 @@ def _list_requests(guarded: Guarded, victim: Side) -> Iterator[tuple[str, APIRou
         arguments = [{}] if is_reading else _list_bodies(method, route.path, victim)
         if route.body_field is not None or "requestBody" in (route.openapi_extra or {}):
             assert arguments or route.path in ("/sign-in", "/keys"), f"no body for {route.path}"
-        known = {**victim.ids, **({"name": FIGURES} if "/figures/" in route.path else {})}
+        known = {**victim.ids, "path": ["README.md"]}
+        known |= {"name": FIGURES} if "/figures/" in route.path else {}
         names = re.findall(r"{(\w+)(?::path)?}", route.path)
         values = [known[name] for name in names]
         for chosen in product(*values):

@@ -78,7 +78,10 @@ def test_commands_send_the_key_of_the_environment(folder: Path) -> None:
         body.write_text("model: fopdt\ndatasets: [steps]\n")
         assert run_lagid("submit", body, **known).code == 0
         assert "fopdt" in run_lagid("jobs", "--url", url, "--key", key).stdout
-        assert "is unknown" in check_refusal(run_lagid("jobs", "--key", "lagid_1_2", LAGID_URL=url))
+        wrong = run_lagid("jobs", "--key", "lagid_1_2", LAGID_URL=url)
+        logged, told = wrong.stderr.splitlines()  # the server writes to the same stream here
+        assert "refused a wrong key, the last from 127.0.0.1; it names key_1" in logged
+        assert (wrong.code, "the API key is unknown" in told) == (1, True)
 
 
 def test_the_audit_log_is_listed(folder: Path) -> None:

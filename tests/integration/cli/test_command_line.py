@@ -21,6 +21,8 @@ from fastapi.responses import PlainTextResponse
 from service.api.app import create_app
 from service.client.embedded import find_free_port
 from service.storage.migrate import find_head_revision
+from sysid.core.errors import InvalidSettings
+from sysid.identification import identify
 from tests.commands import (
     LIMIT_SECONDS,
     PROGRAM,
@@ -216,6 +218,11 @@ def test_a_fault_of_a_model_has_its_column(tmp_path: Path) -> None:
     line = check_refusal(run_lagid("models", "check", path))
     assert "column" in line
     assert "'z'" in line
+    path.write_text(OWN.replace("K: {", "P: {lower: 0, upper: 1}, K: {") + "let: {spare: 2*T}\n")
+    checked = run_lagid("models", "check", path)
+    assert checked.code == 0
+    assert "/let/spare: warning: nothing uses 'spare'" in checked.stderr
+    assert "/parameters/P: warning: no equation" in checked.stderr
 
 
 @pytest.mark.slow
@@ -311,6 +318,24 @@ def test_identify_tells_all_that_cannot_be_read_first(data: Path) -> None:
     assert "LL" not in line
 
 
+def test_a_constant_output_is_told_once_and_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "idle.csv"
+    path.write_text("t,u,y\n" + "".join(f"{t},{int(t > 9)},20.5\n" for t in range(40)))
+    words = ("identify", path, "--model", "fopdt", "--set", "algorithm.generations=5")
+    note = "output 'y' is constant (20.5) at all 40 samples"
+    assert run_lagid(*words).stderr.count(note) == 1
+
+    def refuse(*_: object) -> None:
+        raise InvalidSettings("/seed", "no search in this test")
+
+    monkeypatch.setattr(identify, "begin_run", refuse)
+    ended = run_lagid(*words)
+    assert ended.code == 2
+    assert ended.stderr.index(note) < ended.stderr.index("no search in this test")
+
+
 def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Path) -> None:
     assert "there is no file" in check_refusal(
         run_lagid("identify", tmp_path / "x.csv", "--model", "fopdt")
@@ -343,6 +368,17 @@ def test_every_refusal_of_a_file_begins_with_its_name(
         assert line.startswith(f"lagid: {path}: {told}")
     folder = check_refusal(run_lagid("dataset", "add", tmp_path, LAGID_URL=server))
     assert folder == f"lagid: {tmp_path} is a folder; name a file"
+
+
+def test_several_recordings_are_stored_at_once(server: str, data: Path, tmp_path: Path) -> None:
+    copies = [tmp_path / f"tube {number}.csv" for number in (1, 2)]
+    for number, copy in enumerate(copies):
+        copy.write_bytes(data.read_bytes().replace(b"0.5", b"0.5%d" % number))
+    named = check_refusal(run_lagid("dataset", "add", *copies, "--name", "x", LAGID_URL=server), 2)
+    assert named == "lagid: --name names one recording; found 2 files"
+    stored = run_lagid("dataset", "add", *copies, LAGID_URL=server)
+    lines = [line for line in stored.stdout.splitlines() if line.startswith("ds_")]
+    assert [line.partition(":")[0].split()[1:] for line in lines] == [["tube", "1"], ["tube", "2"]]
 
 
 def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(

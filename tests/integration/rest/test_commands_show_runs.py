@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.api.app import create_app
 from service.cli.common import FieldOrigins
-from service.cli.main import app as program
+from service.cli.main import build_program
 from service.cli.tables import print_trend
 from service.client.calls import ProblemError
 from service.client.client import Client
@@ -85,7 +85,7 @@ class Again:
 
 
 def lagid(*words: str) -> Result:
-    return CliRunner().invoke(program, list(words))
+    return CliRunner().invoke(build_program(), list(words))
 
 
 def test_one_run_is_shown_with_estimates_units_intervals_and_fit(served: Served) -> None:
@@ -118,6 +118,25 @@ def test_a_batch_is_listed_by_its_labels_with_units_in_the_headings(served: Serv
         assert text in heading
     assert [row.split()[2] for row in rows[:2]] == ["5", "20"]
     assert served.data not in told.output
+
+
+def test_runs_of_a_job_are_chosen_and_sorted_as_by_rest(served: Served) -> None:
+    def list_numbers(*options: str) -> list[int]:
+        told = lagid("runs", served.job, *options, "--json")
+        assert told.exit_code == 0, told.output
+        return [run["number"] for run in json.loads(told.stdout)]
+
+    served.client.edit_run(served.runs[1], {"tags": ["suspect"]})
+    assert list_numbers("--tag", "suspect") == [1]
+    assert list_numbers("--label", "length_m=5") == [0]
+    assert list_numbers("--state", "failed") == []
+    assert list_numbers("--state", "succeeded", "--order", "number", "--descending") == [1, 0]
+    assert list_numbers("--tag", "suspect", "--label", "length_m=5") == []
+    told = lagid("runs", served.job, "--state", "succeeded", "--limit", "1")
+    assert told.output.splitlines()[-1] == "… and 1 more; --limit 0 lists all"
+    wrong = lagid("runs", served.job, "--order", "length")
+    assert (wrong.exit_code, wrong.output[:15]) == (1, "lagid: --order:")
+    assert lagid("runs", served.runs[0], "--tag", "suspect").exit_code == 2
 
 
 def test_the_list_of_jobs_has_the_counts_of_a_batch_and_no_rms_of_it(served: Served) -> None:

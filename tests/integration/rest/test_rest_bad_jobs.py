@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.cli.main import app as lagid
+from service.cli.main import build_program
 from tests.identified import identified
 from tests.rest import recording, refused, settings_of, store_csv
 
@@ -124,7 +124,9 @@ def test_the_command_line_says_the_same_in_one_line(
 ) -> None:
     path = tmp_path / "steps.csv"
     path.write_bytes(recording())
-    found = CliRunner().invoke(lagid, ["identify", str(path), "--model", "fopdt", *options])
+    found = CliRunner().invoke(
+        build_program(), ["identify", str(path), "--model", "fopdt", *options]
+    )
     assert found.exit_code != 0
     assert words in " ".join((found.output + str(found.exception or "")).split())
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli import reidentify
-from service.cli.main import app as lagid
+from service.cli.main import build_program
 from service.trends import trend as trends
 from tests.batches import BODY, LENGTHS, ServedBatch, identify_batch, serve_batch
 from tests.integration.rest.test_rest_reidentify import quantity, run_at, trend
@@ -168,7 +168,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
 
     monkeypatch.setattr(reidentify, "connect_client", connected)
     told = CliRunner().invoke(
-        lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
+        build_program(), ["reidentify", "--model", "tube", "--label", "length_m", *words]
     )
     assert told.exit_code == 2
     assert said in " ".join(told.output.split())

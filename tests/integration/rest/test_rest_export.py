@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.cli import runs as run_commands
-from service.cli.main import app as commands
+from service.cli.main import build_program
 from service.client.async_client import AsyncClient
 from service.client.calls import ProblemError
 from service.client.client import Client
@@ -165,15 +165,15 @@ def test_the_command_writes_a_file_or_to_stdout(
     monkeypatch.setattr(run_commands, "connect_client", lambda *_: nullcontext(client))
     told = export(served, served.run, format="python").text
     run = CliRunner().invoke
-    shown = run(commands, ["export", served.run, "--format", "python"])
+    shown = run(build_program(), ["export", served.run, "--format", "python"])
     assert (shown.exit_code, shown.stdout) == (0, told)
     file = tmp_path / "model.py"
-    done = run(commands, ["export", served.run, "--format", "python", "--output", str(file)])
+    done = run(build_program(), ["export", served.run, "--format", "python", "--output", str(file)])
     assert done.exit_code == 0, done.output
     assert file.read_text(encoding="utf-8") == told
-    failed = run(commands, ["export", served.run, "--output", str(tmp_path / "no" / "file")])
+    failed = run(build_program(), ["export", served.run, "--output", str(tmp_path / "no" / "file")])
     assert failed.exit_code == 2
-    assert run(commands, ["export", served.run, "--format", "pascal"]).exit_code == 2
+    assert run(build_program(), ["export", served.run, "--format", "pascal"]).exit_code == 2
 
 
 def test_the_page_of_a_finished_run_links_to_every_format(served: Served) -> None:

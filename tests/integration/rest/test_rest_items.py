@@ -164,6 +164,8 @@ def test_what_was_made_from_an_item_is_listed_and_deleted_on_request(own: TestCl
     assert [one["id"] for one in deleted.json()["deleted"]] == [data, child, job]
     for path in (f"datasets/{data}", f"jobs/{job}", f"runs/{run}", f"jobs/{job}/runs"):
         refused(own.get(f"/v1/{path}"), 404, "not-found")
+    for path in (f"datasets/{data}", f"jobs/{job}", f"runs/{run}"):
+        refused(own.delete(f"/v1/{path}"), 404, "not-found")  # as what was never there
     again = store_csv(own, recording())
     assert again != data  # the same file may come again
     own.delete(f"/v1/datasets/{again}").raise_for_status()

@@ -16,18 +16,18 @@ from tests.unit.sysid.identification.test_noise_model_choice import (
     STEP,
     TANK,
     N,
+    delayed,
     disturbed,
     plant,
     signal,
 )
-from tests.unit.sysid.identification.test_noise_model_choice import T as TIME_CONSTANT
 from tests.unit.sysid.residuals.test_coloured import coloured
 
 SMALL = {"population": 24, "generations": 20, "islands": 1}
 
 
 class Served(NamedTuple):
-    """An application with a recording of a tank and one of a lag, both disturbed.
+    """An application with a recording of a disturbed tank, and of a lag with a dead time.
 
     And of a tank that nothing disturbs, whose level is measured with white noise.
     """
@@ -46,7 +46,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         parts = parts_of(server)
         names = []
         quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
-        outputs = {"tank": disturbed(2), "lag": disturbed(2, 1.0 / TIME_CONSTANT), "quiet": quiet}
+        outputs = {"tank": disturbed(2), "lag": delayed(2), "quiet": quiet}
         for name, output in outputs.items():
             pairs = zip(signal(), output, strict=True)
             lines = [

@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
-from service.core.logs import ACCESS_LOGGER, JsonFormatter
+from service.core.logs import ACCESS_LOGGER, JsonFormatter, TextFormatter
 from service.queue.dispatchers import LEASE_SECONDS_KEY, STARTING_KEY, DispatcherRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import ObjectStoreFailed
@@ -99,7 +99,9 @@ def test_the_access_log_has_route_status_time_and_id(
     assert (line["method"], line["route"], line["status"]) == ("GET", "/v1/jobs/{job_id}", 404)
     assert (line["path"], line["request_id"]) == ("/v1/jobs/none\nforged", "r1")
     assert line["seconds"] >= 0
-    assert line["message"].startswith("GET /v1/jobs/none\\nforged 404 in ")
+    assert line["message"].startswith("GET /v1/jobs/none\nforged 404 in ")
+    (record,) = (r for r in caplog.records if r.name == ACCESS_LOGGER)
+    assert "GET /v1/jobs/none\\u000aforged 404 in " in TextFormatter().format(record)
 
 
 def test_requests_are_counted_by_template_and_status_never_by_path(server: TestClient) -> None:

@@ -12,6 +12,7 @@ from starlette.testclient import TestClient
 
 from service.api import content
 from service.api.app import create_app
+from service.api.store_probe import PROBE_SECONDS
 from service.datasets import datasets
 from service.formats import sandbox
 from service.storage.errors import ObjectStoreFailed
@@ -30,6 +31,29 @@ def test_a_database_that_is_away_is_a_part_that_is_down(
     answer = server.get(path)
     assert refused(answer, 503, "unavailable") == []
     assert answer.headers["retry-after"] == "1"
+
+
+def test_readiness_tells_a_stranger_no_address_and_writes_seldom(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        writes.append(1)
+        raise ObjectStoreFailed("the object store cannot write: bucket-7 at 10.0.0.9")
+
+    writes: list[int] = []
+    parts = parts_of(server)
+    monkeypatch.setattr(parts.database, "read_session", away)
+    monkeypatch.setattr(parts.store, "check_writable", refuse)
+    monkeypatch.setattr(parts.probe, "_tried_at", -PROBE_SECONDS)
+    answers = [server.get("/readyz") for _ in range(3)]
+    for answer in answers:
+        refused(answer, 503, "unavailable")
+        assert answer.json()["detail"] == "store: objects cannot be written; database: unreachable"
+    assert writes == [1]
+    monkeypatch.undo()
+    parts.probe._tried_at = -PROBE_SECONDS
+    faults = refused(server.get("/readyz"), 503, "unavailable")
+    assert [fault["pointer"] for fault in faults] == ["/dispatcher"]
 
 
 def test_a_full_disk_is_a_part_that_is_down(

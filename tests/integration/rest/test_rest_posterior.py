@@ -1,42 +1,23 @@
 """A posterior over REST: asked for with the job, in the result, as a figure, left out of lists."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
 
 import pytest
-from starlette.testclient import TestClient
 
-from service.api.app import create_app
-from tests.identified import identified
-from tests.rest import parts_of, recording, refused, settings_of, store_csv
+from tests.identified import ServedRun, identified, serve_run
+from tests.rest import parts_of, refused
 
 pytestmark = pytest.mark.slow
 
 
-class Served(NamedTuple):
-    server: TestClient
-    body: dict[str, Any]
-    job: str
-    run: str
-
-
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with TestClient(create_app(settings_of(tmp_path_factory.mktemp("posterior")))) as server:
-        body = {
-            "model": "fopdt",
-            "datasets": [store_csv(server, recording())],
-            "algorithm": {"population": 20, "generations": 60, "islands": 1},
-            "noise": {"sigma": 0.05},
-            "parameters": {"y0": {"fixed": 0.0}},
-            "hold": {"u": "zero"},
-            "posterior": True,
-        }
-        job, (run,) = identified(parts_of(server), body)
-        yield Served(server, body, job, run)
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedRun]:
+    changes = {"parameters": {"y0": {"fixed": 0.0}}, "posterior": True}
+    with serve_run(tmp_path_factory.mktemp("posterior"), **changes) as run:
+        yield run
 
 
-def test_a_run_has_the_posterior_of_its_free_parameters(served: Served) -> None:
+def test_a_run_has_the_posterior_of_its_free_parameters(served: ServedRun) -> None:
     result = served.server.get(f"/v1/runs/{served.run}").json()
     posterior = result["posterior"]
     assert posterior["converged"], posterior["reason"]
@@ -54,13 +35,13 @@ def test_a_run_has_the_posterior_of_its_free_parameters(served: Served) -> None:
     assert result["evaluations"] > posterior["evaluations"] > 10_000
 
 
-def test_a_list_of_runs_leaves_out_the_samples(served: Served) -> None:
+def test_a_list_of_runs_leaves_out_the_samples(served: ServedRun) -> None:
     (run,) = served.server.get(f"/v1/jobs/{served.job}/runs").json()["items"]
     assert run["posterior"]["converged"]
     assert "samples" not in run["posterior"]
 
 
-def test_the_corner_plot_comes_as_plotly_json_and_as_csv(served: Served) -> None:
+def test_the_corner_plot_comes_as_plotly_json_and_as_csv(served: ServedRun) -> None:
     path = f"/v1/runs/{served.run}/figures/posterior"
     kinds = [trace["type"] for trace in served.server.get(path).json()["data"]]
     assert kinds.count("contour") == 6  # pairs of K, T, L and the initial state
@@ -70,13 +51,13 @@ def test_the_corner_plot_comes_as_plotly_json_and_as_csv(served: Served) -> None
     assert sum(line.startswith("samples,") for line in lines) == 6 * 500
 
 
-def test_the_page_of_its_job_has_a_table_and_a_place_for_the_plot(served: Served) -> None:
+def test_the_page_of_its_job_has_a_table_and_a_place_for_the_plot(served: ServedRun) -> None:
     page = served.server.get(f"/jobs/{served.job}").text
     assert '<table class="posterior">' in page
     assert 'data-figure="posterior"' in page
 
 
-def test_a_job_without_the_field_has_none_and_is_another_job(served: Served) -> None:
+def test_a_job_without_the_field_has_none_and_is_another_job(served: ServedRun) -> None:
     _, (run,) = identified(parts_of(served.server), {**served.body, "posterior": False})
     result = served.server.get(f"/v1/runs/{run}").json()
     assert result["posterior"] is None
@@ -88,7 +69,7 @@ def test_a_job_without_the_field_has_none_and_is_another_job(served: Served) -> 
     assert first["evaluations"] - result["evaluations"] == first["posterior"]["evaluations"]
 
 
-def test_a_wrong_value_is_refused_with_its_place(served: Served) -> None:
+def test_a_wrong_value_is_refused_with_its_place(served: ServedRun) -> None:
     answer = served.server.post("/v1/jobs", json={**served.body, "posterior": "rough"})
     (fault,) = refused(answer, 422, "invalid")
     assert fault["pointer"] == "/posterior"

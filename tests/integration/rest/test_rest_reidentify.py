@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from service.cli import reidentify
 from service.cli import reidentify as reidentifying
-from service.cli.main import app as lagid
+from service.cli.main import build_program
 from service.client.client import Client
 from tests.batches import (
     BODY,
@@ -292,7 +292,7 @@ def test_figure_page_and_report_show_the_trend(served: ServedBatch) -> None:
     assert all(len(one["error_y"]["array"]) == 4 for one in points)
     assert json.dumps(figure, allow_nan=False)
     page = served.server.get(f"/jobs/{served.job}").text
-    assert "Trend over length_m" in page
+    assert "Trend over length [m]" in page
     assert "L = (0.0" in page
     report = served.server.get(f"/v1/jobs/{served.job}/report").text
     assert 'id="figure-trend"' in report
@@ -339,7 +339,7 @@ def test_the_command_uploads_prints_and_accepts(
         words.append(f"{x:g}={file}")
     out = tmp_path / "trend.json"
     told = command.invoke(
-        lagid, [*words, "--output", str(out), "--accept", "own", "--accept-run", "4"]
+        build_program(), [*words, "--output", str(out), "--accept", "own", "--accept-run", "4"]
     )
     assert told.exit_code == 0, told.output
     assert "L = (" in told.output
@@ -347,9 +347,9 @@ def test_the_command_uploads_prints_and_accepts(
     trend = json.loads(out.read_text())
     accepted = next(one["runs"][0] for one in trend["labels"] if one["x"] == 4)
     assert f"own: {accepted}" in told.output
-    shown = command.invoke(lagid, ["references", "show", "own"])
+    shown = command.invoke(build_program(), ["references", "show", "own"])
     assert accepted in shown.output
-    listed = command.invoke(lagid, ["references", "list", "--json"])
+    listed = command.invoke(build_program(), ["references", "list", "--json"])
     assert accepted in listed.output
 
 
@@ -367,6 +367,8 @@ def test_the_command_uploads_prints_and_accepts(
 def test_a_mistake_in_the_command_is_one_line(
     command: CliRunner, words: list[str], said: str
 ) -> None:
-    told = command.invoke(lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words])
+    told = command.invoke(
+        build_program(), ["reidentify", "--model", "tube", "--label", "length_m", *words]
+    )
     assert told.exit_code in (1, 2)
     assert said in " ".join(told.output.split())

@@ -247,7 +247,12 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
     [
         ({"control": {**CONTROL, "input": "P"}}, "/control/input", "no input 'P'; known are P_a"),
         (
-            {"control": {**CONTROL, "reference": {"kind": "expression", "expression": "foo(t)"}}},
+            {
+                "control": {
+                    **CONTROL,
+                    "reference": {"kind": "expression", "expression": "unknown(t)"},
+                }
+            },
             "/control/reference/expression",
             "tanh, where",
         ),

@@ -19,6 +19,7 @@ SERVICE = {
 COMMANDS = {
     "command line": "import service.cli.main",
     "identify": "identify()",
+    "search": "import sysid.identification.identify",
     "colour of a short record": "fit_short_record()",
 }
 
@@ -89,8 +90,11 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
         (
             "identify",
             {"sqlalchemy", "fastapi", "httpx", "asyncio", "mcap", "ray", "polars"}
-            | {"pandas", "plotly"},
+            | {"pandas", "plotly"}
+            | {f"service.cli.{group}" for group in ("access", "datasets", "jobs", "server")},
         ),
+        # It is loaded while the search runs.
+        ("search", {"scipy.special"}),
         # They took half a second, four fifths of what its first use in a process does.
         ("colour of a short record", {"scipy.signal"}),
     ],

@@ -1,5 +1,6 @@
 """Faults of a body are told at the option or in the file that the user wrote."""
 
+import json
 from typing import Any
 
 import httpx
@@ -7,10 +8,34 @@ import pytest
 import typer
 
 from service.cli import identify, runs, sweeps
-from service.cli.common import FieldOrigins, file_origins, report_faults
+from service.cli.common import (
+    FieldOrigins,
+    file_origins,
+    print_error,
+    print_json,
+    print_line,
+    print_table,
+    report_faults,
+)
 from service.client.calls import NotFinite, ProblemError
 from service.client.client import Client
 from service.core.errors import FieldError
+
+EVIL = "tube\x1b]0;root\x07\x9b2J\u202e\rgone"
+
+
+def test_a_terminal_obeys_nothing_in_names_of_others(capsys: pytest.CaptureFixture[str]) -> None:
+    print_line(f"job_1  {EVIL}")
+    print_table(("id", "name"), [("job_1", f"{EVIL}\nforged")], empty="none")
+    print_json({"name": EVIL})
+    print_error(f"there is no job {EVIL}")
+    printed = capsys.readouterr()
+    shown = printed.out + printed.err
+    assert all(sign == "\n" or sign.isprintable() for sign in shown)
+    assert shown.count("\\u001b]0;root") == 4
+    assert "\nforged" not in shown
+    document = printed.out[printed.out.index("{") :]
+    assert json.loads(document) == {"name": EVIL}
 
 
 @pytest.mark.parametrize(

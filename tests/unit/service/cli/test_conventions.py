@@ -11,11 +11,11 @@ import typer
 
 from service.cli import common, demo
 from service.cli.common import Listing, fetch_listing
-from service.cli.main import app
+from service.cli.main import build_program
 from sysid.identification import warmup
 from tests.commands import check_refusal, run_lagid
 
-PROGRAM: Any = typer.main.get_command(app)
+PROGRAM: Any = typer.main.get_command(build_program())
 
 
 def walk_commands(command: Any = PROGRAM, words: tuple[str, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -145,7 +145,7 @@ def test_a_shell_completes_commands_and_options() -> None:
     assert complete("lagid dataset dow") == ["download"]
     assert complete("lagid submit --wa") == ["--wait"]
     assert complete("lagid identify a.csv --model tube") == ["tube", "tube-second-order"]
-    assert complete("lagid reidentify --model fo") == ["fopdt"]
+    assert complete("lagid reidentify --model fo") == ["foipdt", "fopdt"]
     assert complete("lagid models show duffing-d") == ["duffing-delay"]
     shown = run_lagid("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     assert "_LAGID_COMPLETE=complete_bash" in shown.stdout

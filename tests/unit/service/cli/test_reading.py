@@ -41,7 +41,7 @@ def test_a_refusal_names_the_file_and_the_options(
     assert f"lagid: {path}: row 1: there is no time column; found u, y." in line
     assert "give the sampling period with --sample-time." in line
     path.write_text("t,u\n0,1\n0,2\n")
-    assert "name their label columns with --segments" in refuse(path, capsys)
+    assert "remove it and give the sampling period with --sample-time" in refuse(path, capsys)
     path.write_text("t,n,u\n0,1,1\n1,2,2\n2,3,3\n")
     assert "leave columns of times and signals out of --segments" in refuse(path, capsys, "n")
     path.write_text('{"t": []}')

@@ -1,7 +1,7 @@
 """The page of settings has every setting, as it is."""
 
 from service.core.settings import Settings
-from tests.settings_page import PAGE, format_default, write_page
+from tests.documents.settings import PAGE, format_default, write_page
 
 
 def test_the_page_of_settings_is_that_of_the_settings() -> None:

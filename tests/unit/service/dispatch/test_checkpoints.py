@@ -111,7 +111,7 @@ def test_changed_bytes_are_refused_or_give_a_state_of_the_same_shapes(data, stat
     except UnreadableCheckpoint:
         return
     for island, other in zip(back.islands, state.islands, strict=True):
-        assert [a.shape for a in island.arrays] == [a.shape for a in other.arrays]
+        assert [a.shape for a in island.arrays[:-1]] == [a.shape for a in other.arrays[:-1]]
 
 
 def test_a_state_of_another_model_or_population_fails_its_run(state: RunState) -> None:

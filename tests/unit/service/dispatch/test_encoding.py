@@ -4,6 +4,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from hashlib import sha256
 
 import pytest
@@ -12,6 +13,7 @@ from sqlalchemy.dialects import postgresql
 from service.dispatch.encoding import ResultEncoder, write_signals
 from service.formats.mcap import read_fitted_outputs
 from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, RowLayout, pack_rows
+from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base
 from sysid.identification.result import Identification
 from tests.runs import RECORDS, spec
@@ -95,6 +97,11 @@ def test_signals_are_left_out_if_they_are_not_kept(complete: list[CompleteRun]) 
     packed = encode(complete, keeps_signals=False)
     assert (packed.signals, packed.signals_sha256) == (b"", None)
     assert {cells["signals_sha256"] for cells in list_cells(packed)} == {None}
+
+
+def test_an_outcome_that_is_written_one_by_one_has_the_columns_of_a_packed_one() -> None:
+    names = {field.name for field in fields(RunOutcome)} - {"run_id", "state", "error"}
+    assert names == {*RESULT_ROWS.columns} - {"id", "estimates"}
 
 
 def test_rows_for_postgresql_are_tuples_of_its_binary_copy() -> None:

@@ -243,6 +243,13 @@ def test_a_history_stands_in_topics_of_its_own() -> None:
     np.testing.assert_array_equal(back.times, TIMES[:3] - 1)
 
 
+def test_the_repeats_of_pooled_samples_come_back() -> None:
+    channel = Channel("y", [0.0, 0.1, 0.1], [1.0, 2.0, 3.0], repeats=np.array([1.0, 3.0, 2.0]))
+    back = read_mcap(recorded(Recording((channel,)))).channel("y")
+    np.testing.assert_array_equal(back.repeats, [1.0, 3.0, 2.0])
+    np.testing.assert_array_equal(back.values, channel.values)
+
+
 def test_the_same_recording_gives_the_same_bytes() -> None:
     assert recorded(two_bases(), a="b") == recorded(two_bases(), a="b")
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import lagid
@@ -34,6 +35,7 @@ from tests.recorded_files import (
     compress,
     join_rows,
     stamp,
+    write_binary_sheet,
     write_experiment_sheet,
     write_mat,
     write_npz,
@@ -474,8 +476,10 @@ def test_a_sheet_is_found_below_a_preamble_and_beside_others(tmp_path: Path) -> 
         read_bytes(tmp_path, write_experiment_sheet()[:700])
 
 
-@pytest.mark.parametrize("write", [write_open_sheet, write_old_sheet])
-def test_an_open_document_and_an_old_excel_file_are_sheets_too(tmp_path: Path, write: Any) -> None:
+@pytest.mark.parametrize("write", [write_open_sheet, write_old_sheet, write_binary_sheet])
+def test_open_documents_and_old_and_binary_excel_files_are_sheets_too(
+    tmp_path: Path, write: Any
+) -> None:
     rows = zip(TIMES.tolist(), INPUT.tolist(), OUTPUT.tolist(), strict=True)
     content = write([["t", "u", "y"], *rows])
     check_experiment(read_bytes(tmp_path, content)[0])
@@ -501,6 +505,11 @@ def test_read_recording_warns_of_what_it_guessed(tmp_path: Path) -> None:
     [
         ({"source": None}, "found None; need the path of a file"),
         ({"source": 3}, "found 3; need the path of a file"),
+        (
+            {"source": pd.DataFrame({"t": [0]})},
+            "an object of type DataFrame of shape (1, 1);",
+        ),
+        ({"source": {"t": [0]}}, "A table is a recording already: give it to identify"),
         ({"sample_time": "0.1 s"}, "sample_time is '0.1 s'; need a positive number"),
         ({"sample_time": -1}, "sample_time is -1; need a positive number"),
         ({"segments": "run"}, "there is no label column 'run'"),

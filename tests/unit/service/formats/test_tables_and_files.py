@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from service.formats.recordings import read_recording
+from sysid.core.errors import UnreadableFile
 from sysid.data.records import Recording
 from sysid.data.table_rules import ReadingNote
 
@@ -77,12 +78,31 @@ def test_serial_dates_of_a_spreadsheet_are_dates() -> None:
     assert str(recording.started_at) == "2026-03-14 06:00:00"
 
 
-def test_an_index_that_counts_rows_is_left_out() -> None:
-    table = pd.DataFrame({"No": np.arange(40), "t": TIMES, "u": INPUT})
-    with pytest.warns(ReadingNote, match="No.* counts rows and was left out"):
+@pytest.mark.parametrize("name", ["No", "Index", "Sample", "Sample #", "record_number", "Scan No."])
+def test_an_index_that_counts_rows_is_left_out(name: str) -> None:
+    table = pd.DataFrame({name: np.arange(40) + 1, "t": TIMES, "u": INPUT})
+    with pytest.warns(ReadingNote, match="counts rows and was left out"):
         assert Recording(table).names == ("u",)
-    gap = pd.DataFrame({"No": np.arange(40) * 2, "t": TIMES, "u": INPUT})
-    assert assert_same(gap).names == ("No", "u")
+    with pytest.warns(ReadingNote, match="counts rows and was left out"):
+        assert read_recording(table.to_csv(index=False).encode()).names == ("u",)
+    gap = pd.DataFrame({name: np.arange(40) * 2, "t": TIMES, "u": INPUT})
+    assert assert_same(gap).names == (name, "u")
+
+
+def test_an_index_alone_is_no_time_and_is_told() -> None:
+    content = b"Sample,u,y\n1,0,0\n2,1,0\n3,1,1\n"
+    with pytest.raises(UnreadableFile, match=r"Column 'Sample' only counts rows.*sample_time\."):
+        read_recording(content)
+    with pytest.warns(ReadingNote, match="Sample.* counts rows and was left out"):
+        assert read_recording(content, sample_time=0.1).names == ("u", "y")
+
+
+def test_a_time_that_repeats_may_be_no_time() -> None:
+    content = b"t,u,y\n0,0,0\n1,1,0\n1,1,1\n"
+    with pytest.raises(UnreadableFile, match=r"repeats.*remove it and give .* sample_time"):
+        read_recording(content)
+    without = b"u,y\n0,0\n1,0\n1,1\n"
+    assert read_recording(without, sample_time=0.1).duration == 0.2
 
 
 def test_dates_are_rounded_once() -> None:

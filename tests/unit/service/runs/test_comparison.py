@@ -39,5 +39,10 @@ def test_values_are_cut_at_the_second_digit_of_their_error(
 
 def test_a_bound_is_not_rounded_to_the_error_of_its_estimate() -> None:
     assert plain_estimate(0.2, 835.0) == "0 ± 835"
-    assert plain_estimate(0.2, 835.0, is_bound=True) == "0.2 ± 835"
-    assert join_estimate(-0.2, 835.0, is_bound=True) == "−0.2 ± 835"
+    assert plain_estimate(0.2, 835.0, status="at bound") == "0.2 ± 835"
+    assert join_estimate(-0.2, 835.0, status="at bound") == "−0.2 ± 835"
+
+
+def test_an_estimate_of_a_search_that_did_not_settle_has_no_error() -> None:
+    assert plain_estimate(0.0937, 0.0072, status="not settled") == "0.0937"
+    assert join_estimate(-0.0937, 0.0072, status="not settled") == "−0.0937000"

@@ -1,0 +1,41 @@
+"""Outcome of jobs for their lists: fit, verdict and warnings of the run that stands for each."""
+
+from collections.abc import Mapping, Sequence
+
+from sqlalchemy.orm import Session
+
+from service.core.job_fields import DATASETS_PATH
+from service.jobs.results import VERDICT_PARTS, read_verdict
+from service.jobs.schemas import OutcomeOut
+from service.repositories.outcomes import read_outcome_rows
+from service.storage.tables import Job
+
+_PARTS = (*VERDICT_PARTS, "warnings")
+
+
+def read_outcomes(session: Session, jobs: Sequence[Job]) -> Mapping[str, OutcomeOut]:
+    """Read the outcome of each job that has a result, by its identifier.
+
+    It is that of the only run, or of the best one by RMS. The runs of a batch see different
+    recordings, so none of them stands for all, and a batch has no outcome.
+    """
+    alike = [job for job in jobs if not is_batch(job.spec)]
+    return {
+        row.job: OutcomeOut(
+            run=row.run,
+            fit_estimation=row.fit_estimation,
+            fit_validation=row.fit_validation,
+            trust=verdict["trust"],
+            verdict=verdict["text"],
+            warnings=len(row.parts["warnings"] or ()),
+        )
+        for row in read_outcome_rows(session, alike, _PARTS)
+        for verdict in [read_verdict(row.parts)]
+    }
+
+
+def is_batch(spec: Mapping[str, object]) -> bool:
+    """Test whether the runs of a job see different recordings."""
+    sweep = spec["sweep"]
+    assert isinstance(sweep, Mapping)
+    return any(str(axis["path"]).startswith(DATASETS_PATH) for axis in sweep["axes"])

@@ -1,0 +1,174 @@
+"""Use case: 95 % bands of a run's outputs, computed on request from its estimates.
+
+A result does not store the covariance of its estimates. It is computed again on the same records,
+with as many simulations as there are parameters, twice.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from math import nan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service.core.computed import ComputedValues
+from service.core.concurrency import simulation_limit
+from service.core.documents import to_finite
+from service.core.errors import Conflict, InvalidRequest, NotFound
+from service.jobs.stored_run import StoredRun, load_estimated_run, to_estimate
+from service.runs.profiles import read_estimate
+from service.runs.schemas import BandExperimentOut, BandOut, BandsOut
+from service.storage.errors import ObjectMissing, RowNotFound
+from service.storage.objects import ObjectStore
+from service.storage.sessions import release_connection
+from sysid.core.errors import SysidError
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+from sysid.figures.theme import thin_indices
+from sysid.simulation.metrics import ChannelMetrics
+
+if TYPE_CHECKING:
+    from sysid.identification.fit_problems import FitRecords
+    from sysid.simulation.problem import Problem
+    from sysid.uncertainty.output_bands import OutputBands
+
+MAX_WORK = 20_000_000  # measured values × parameters
+_CACHE_SIZE = 4  # runs: a zoom reads the same bands repeatedly
+_computed_bands = ComputedValues(_CACHE_SIZE)
+
+
+def load_bands(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> "tuple[tuple[OutputBands, ...], ...]":
+    """Compute the bands of each output of each record that a run was fitted to.
+
+    Raises
+    ------
+    Conflict
+        If the run has no standard errors, its records are gone, or the work is too much.
+    """
+    return _computed_bands.get(
+        stored.run.id,
+        partial(_compute_bands, session, store, stored),
+        is_final=True,
+        before_wait=partial(release_connection, session),
+    )
+
+
+def build_bands(session: Session, store: ObjectStore, run_id: str, max_points: int) -> BandsOut:
+    """Build the bands of a run, reduced so that extremes of the output stay visible.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    Conflict
+        If it has no estimates, or no bands.
+    """
+    stored = load_estimated_run(session, run_id, "compute bands from")
+    bands = load_bands(session, store, stored)
+    return BandsOut(
+        id=run_id,
+        source=bands[0][0].source,
+        experiments=[
+            BandExperimentOut(
+                name=f"record {number}", outputs=[_to_band_out(one, max_points) for one in outputs]
+            )
+            for number, outputs in enumerate(bands, 1)
+        ],
+    )
+
+
+def _compute_bands(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> "tuple[tuple[OutputBands, ...], ...]":
+    # These import the compiler, which most requests never need.
+    from sysid.identification.bands import (
+        compute_fit_bands,
+        estimate_noise,
+        list_whole_records,
+    )
+    from sysid.identification.generalised_least_squares import make_whitening
+    from sysid.uncertainty.analysis import analyse_estimate
+    from sysid.uncertainty.output_bands import ParameterSpread
+
+    run_id, result = stored.run.id, stored.result
+    try:
+        records = stored.read_fit_records(session, store)
+        problem = stored.problem(session, store)
+        release_connection(session)
+        _check_work(run_id, problem)
+        theta, degrees = read_estimate(problem, stored), float(problem.n_scored)
+        degrees -= theta.size
+        times = result.get("correlation_times") or {}
+        with simulation_limit.acquire():
+            whitening = make_whitening(problem, times) if any(times.values()) else None
+            uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
+            if uncertainty is None:
+                raise Conflict(f"run {run_id} has no standard errors, so there are no bands")
+            covariance, samples = uncertainty.covariance, _read_samples(stored)
+            return compute_fit_bands(
+                stored.model,
+                list_whole_records(records.estimation, _list_later_parts(records)),
+                [to_estimate(document) for document in stored.estimates],
+                _read_ties(stored.body),
+                ParameterSpread(problem.free_names, covariance, degrees, samples),
+                estimate_noise(map(_to_metrics, result["agreement"]["estimation"]), degrees),
+                stored.body["prediction"],
+            )
+    except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:
+        raise Conflict(f"the bands of run {run_id} cannot be computed: {error}") from error
+
+
+def _check_work(run_id: str, problem: "Problem") -> None:
+    work = problem.evaluator.n_measured * len(problem.free_parameters)
+    if work > MAX_WORK:
+        raise Conflict(
+            f"the bands of run {run_id} are too much work. Samples × parameters is {work:.3g}; "
+            f"need at most {MAX_WORK:.3g}. Use `compute_bands` of the Python library"
+        )
+
+
+def _list_later_parts(records: "FitRecords") -> list[Record]:
+    """List the last parts of the records that were used for validation, with whole inputs."""
+    if records.scored_from is None:
+        return []
+    pairs = zip(records.validation or (), records.validation_runs or (), strict=True)
+    return [replace(part, inputs=whole.inputs) for part, whole in pairs]
+
+
+def _read_ties(body: Mapping[str, Any]) -> dict[str, str]:
+    ties = {name: change.get("tied") for name, change in body["parameters"].items()}
+    return {name: tie for name, tie in ties.items() if tie is not None}
+
+
+def _read_samples(stored: StoredRun) -> FloatArray | None:
+    samples = (stored.result.get("posterior") or {}).get("samples")
+    return np.array(samples, dtype=np.float64) if samples else None
+
+
+def _to_metrics(document: Mapping[str, Any]) -> ChannelMetrics:
+    names = ("experiment", "output", "unit", "samples", "rms")
+    experiment, output, unit, samples, rms = (document[name] for name in names)
+    return ChannelMetrics(experiment, output, unit, samples, rms, fit_percent=nan)
+
+
+def _to_band_out(bands: "OutputBands", max_points: int) -> BandOut:
+    shown = thin_indices(bands.simulated, max_points)
+
+    def read(values: FloatArray) -> list[float | None]:
+        return [to_finite(value) for value in values[shown].tolist()]
+
+    return BandOut(
+        name=bands.output,
+        unit=bands.unit,
+        samples=bands.times.size,
+        times=bands.times[shown].tolist(),
+        simulated=read(bands.simulated),
+        confidence_lower=read(bands.confidence[:, 0]),
+        confidence_upper=read(bands.confidence[:, 1]),
+        prediction_lower=read(bands.prediction[:, 0]),
+        prediction_upper=read(bands.prediction[:, 1]),
+    )
