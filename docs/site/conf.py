@@ -1,0 +1,45 @@
+"""The documentation site: ``make docs`` builds it in build/docs."""
+
+import sys
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from lagid import __version__  # noqa: E402 - of this checkout
+from tests.documents.reference import follow_top_level, write_reference  # noqa: E402
+
+write_reference(ROOT / "docs" / "reference")
+
+project = "lagid"
+author = "The maintainers of lagid"
+release = __version__
+root_doc = "index"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["README.md", "site", "notebooks", "openapi.json"]
+source_suffix = {".md": "markdown"}
+suppress_warnings = ["toc.not_included"]
+html_theme = "furo"
+html_title = f"lagid {__version__}"
+html_show_sphinx = False
+html_copy_source = False
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 4
+copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
+autodoc_typehints = "description"
+autodoc_member_order = "groupwise"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+linkcheck_anchors = False
+
+
+def setup(app: Sphinx) -> None:
+    """Let links to pages of the top level of the repository lead to their copies."""
+
+    def follow(_: Sphinx, page: str, source: list[str]) -> None:
+        source[0] = follow_top_level(source[0], "/reference/")
+
+    app.connect("source-read", follow)
