@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs
 COLLECTED := $(VENV)/.collected
 FAST   := not slow and not ray and not postgres and not browser and not data
 TEST_PROCESSES ?= 3
@@ -10,7 +11,7 @@ TEST_PROCESSES ?= 3
 export MYPY_CACHE_DIR ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/lagid/mypy
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format docs openapi bench bench-full mutants night real-data clean
+.PHONY: help demo paper serve test suite warm check check-code check-unit check-laws format docs site openapi bench bench-full mutants night real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -19,7 +20,7 @@ help:
 	@echo "make test        set up, run the whole test suite"
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
 	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
-	@echo "make docs        write the pages that the program makes: docs/settings.md"
+	@echo "make docs        run the tutorials, write their outputs, build the documentation in build/docs"
 	@echo "make openapi     write docs/openapi.json and the client's types after a change of the interface"
 	@echo "make mutants     the gate's tests against faults made by hand, about an hour"
 	@echo "make night       all long tests with new seeds, mutants, robustness, torture: hours, one table"
@@ -32,6 +33,10 @@ $(READY): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --config-settings editable_mode=compat -e .
 	@git config core.hooksPath .ci/hooks 2>/dev/null || true  # subjects of at most 72 characters
+	@touch $@
+
+$(DOCS_READY): $(READY) docs/site/requirements.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r docs/site/requirements.txt
 	@touch $@
 
 demo: $(READY)
@@ -86,8 +91,14 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: $(READY)
-	$(BIN)/python -m tests.settings_page
+docs: $(DOCS_READY) warm
+	$(BIN)/python -m tests.documents.settings
+	$(BIN)/python -m tests.documents.tutorials
+	@$(MAKE) --no-print-directory site
+
+# The site alone, from the pages as they are; a link that leads nowhere is an error.
+site: $(DOCS_READY)
+	$(BIN)/python -m sphinx -q -W --keep-going -c docs/site -b html docs build/docs
 
 BENCHES := kernels search peers latency silverbox noise_sweep memory mcap
 FULL    := $(BENCHES) robustness efficiency scaling

@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 from email.message import Message
-from importlib.metadata import PackageNotFoundError, metadata
+from importlib.metadata import PackageNotFoundError, distribution, metadata
 from typing import Any, cast
 
 from benchmarks.table import Row, Skipped, parser, report
@@ -34,12 +34,18 @@ def list_licences(package: Message) -> list[str]:
     return [text for text in (*written, *classifiers) if text]
 
 
+def read_licence_file(name: str) -> list[str]:
+    """Read the first line of the licence file of a package that says nothing else."""
+    text = distribution(name).read_text("licenses/LICENSE") or ""
+    return text.strip().split("\n")[:1]
+
+
 def find_licence_faults(names: list[str]) -> tuple[list[str], list[str]]:
     """Find packages without a permissive licence, and packages that are not installed here."""
     faults, absent = [], []
     for name in names:
         try:
-            licences = list_licences(cast("Message", metadata(name)))
+            licences = list_licences(cast("Message", metadata(name))) or read_licence_file(name)
         except PackageNotFoundError:
             absent.append(name)
             continue

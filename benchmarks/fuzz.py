@@ -80,6 +80,33 @@ EQUATIONS += [
     "-" * 900,
 ]
 EQUATIONS += ["+".join(f"u(t - L*{n}.5)" for n in range(200)), "x(t-L)(t-L)", "h*k", "max()", "x;1"]
+EQUATIONS += [
+    "rate - x/T",
+    "rate(t - L) - rate*x",
+    "u(t - late) - x",
+    "table(u, [-1, 0, 2], [0, L, 5]) - x/T",
+    "pchip(x, [0, 1e-300, 1, 1e300], [0, L, T, -1e300])",
+    "table(x, [0, 0], [1, 2])",
+    "pchip(u, [" + ", ".join(map(str, range(128))) + "], [" + ", ".join(["L"] * 128) + "])",
+    "table(table(x, [0, 1], [2, 3]), [0, x], [[1], 2])",
+    "u(t - L/(0.1 + abs(u))) - x",
+    "u(t - L/u) - x",
+    "u(t - u) - x(t - u)",
+    "u(t - L/x(t - u(t - L)))",
+    "mod(x, u) - clip(x, T, -T)*floor(1e300*x)",
+    "erf(x)*sinh(900*u) - cosh(x)/log10(L) + atan2(u, x)",
+    "if(x > 0, 1, sat(x'))",
+    "x² + 0,5^x ? [1, 2]",
+]
+NAMES_OF_LET: list[Any] = [
+    {"rate": "L*exp(-x/T)", "late": "L/2"},
+    {"rate": "late*u", "late": "rate"},
+    {"rate": "u(t - L/(1 + u**2))", "late": "x"},
+    {"rate": "table(u, [0, 1], [late, T])", "late": "clip(L, 0.1, 1)"},
+    {f"a{n}": f"a{n + 1}*a{n + 1}" for n in range(60)} | {"a60": "x", "rate": "a0", "late": "1"},
+    {"rate": None, "L": "1", "x": [], "1": "sin"},
+    [],
+]
 
 
 @dataclass
@@ -234,6 +261,8 @@ class Requests:
         model["name"] = self._draw.choice(["own", "tank", f"m{self._draw.randrange(50)}"])
         if self._draw.random() < 0.6:
             model["equations"]["x"] = self._draw.choice(EQUATIONS)
+        if self._draw.random() < 0.6:
+            model["let"] = copy.deepcopy(self._draw.choice(NAMES_OF_LET))
         if self._draw.random() < 0.2:
             states = [f"s{n}" for n in range(self._draw.choice([3, 12, 64]))]
             tie = " + ".join(f"{name}*L" for name in states[:12])

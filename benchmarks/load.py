@@ -223,13 +223,15 @@ def _list_columns(connection: Any, table: str) -> list[Any]:
 
 
 @contextmanager
-def serve(filled: Filled, processes: int, postmaster: int | None) -> Iterator[Served]:
+def serve(
+    url: str, folder: Path, processes: int = 1, postmaster: int | None = None
+) -> Iterator[Served]:
     """Run web processes without a dispatcher for the length of the block."""
     ports = [find_free_port() for _ in range(processes)]
     environment = {
         **os.environ,
-        "LAGID_DATA_DIR": str(filled.folder),
-        "LAGID_DATABASE_URL": filled.url,
+        "LAGID_DATA_DIR": str(folder),
+        "LAGID_DATABASE_URL": url,
         "LAGID_MAX_OPEN_JOBS": "1000000",
         "LAGID_MAX_STREAMS": "1000",
         "PYTHONPATH": str(Path.cwd()),
@@ -238,7 +240,7 @@ def serve(filled: Filled, processes: int, postmaster: int | None) -> Iterator[Se
     try:
         for port in ports:
             command = build_child_command("service.cli.main", "serve", "--no-dispatcher")
-            with (filled.folder / f"web-{port}.log").open("ab") as log:
+            with (folder / f"web-{port}.log").open("ab") as log:
                 children.append(
                     subprocess.Popen(
                         [*command, "--port", str(port)], env=environment, stdout=log, stderr=log
@@ -266,7 +268,7 @@ def measure_old_job(kind: str, served: Served, filled: Filled) -> list[Row]:
     """Measure the first request after the end of a sweep that no dispatcher has summarised."""
     with httpx.Client(base_url=served.urls[0], timeout=TIMEOUT) as client:
         client.get(f"/v1/jobs/{filled.small}/summary")
-        spent = _cost_of(served, client, f"/v1/jobs/{filled.large}/summary", 200)
+        spent = measure_request(served, client, f"/v1/jobs/{filled.large}/summary", 200)
     return [Row(f"{kind}: summary of a sweep without a stored one", spent, "s CPU")]
 
 
@@ -293,7 +295,7 @@ def measure_reads(kind: str, served: Served, filled: Filled) -> list[Row]:
         client.get(f"/jobs/{filled.small}")  # templates and models are loaded once
         client.get(f"/v1/jobs/{filled.small}/summary")
         for name, (path, status) in paths.items():
-            spent = [_cost_of(served, client, path, status) for _ in range(4)]
+            spent = [measure_request(served, client, path, status) for _ in range(4)]
             first, again = spent[0], min(spent[1:])
             bars = (None, None) if name in SHOWN_ONLY else (READ_SECONDS, CACHED_SECONDS)
             rows.append(Row(f"{kind}: {name}, first", first, "s CPU", bars[0]))
@@ -301,7 +303,8 @@ def measure_reads(kind: str, served: Served, filled: Filled) -> list[Row]:
     return rows
 
 
-def _cost_of(served: Served, client: httpx.Client, path: str, status: int) -> float:
+def measure_request(served: Served, client: httpx.Client, path: str, status: int) -> float:
+    """CPU time in s of a request; of a CSV file, that of its first part."""
     before = served.measure_cpu()
     with client.stream("GET", path) as answer:
         assert answer.status_code == status, (path, answer.status_code)
@@ -472,12 +475,12 @@ def measure_database(
     try:
         runs, jobs = (20_000, 20_000) if few else (100_000, 100_000)
         filled = fill(database, url, folder, runs, jobs)
-        with serve(filled, 1, postmaster) as served:
+        with serve(url, folder, 1, postmaster) as served:
             rows = measure_old_job(kind, served, filled)
-        with serve(filled, 1, postmaster) as served:
+        with serve(url, folder, 1, postmaster) as served:
             rows += measure_reads(kind, served, filled)
             rows += measure_streams(kind, database, served, filled, 500, 500)
-        with serve(filled, 2, postmaster) as served:
+        with serve(url, folder, 2, postmaster) as served:
             rows += measure_submissions(kind, served, filled, 200 if few else 1000)
         print(markdown(f"{kind}: {runs} runs, {jobs} old jobs", rows, []), flush=True)
     finally:

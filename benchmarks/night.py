@@ -61,6 +61,7 @@ def list_parts(seed: int) -> dict[str, Part]:
         "efficiency": program("benchmarks.efficiency"),
         "traps": program("benchmarks.traps"),
         "coverage": program("benchmarks.coverage", "--jobs", "2"),
+        "noise models": program("benchmarks.noise_models", "--jobs", "2"),
         "torture": program("benchmarks.torture", "--seed", str(seed)),
         "fuzz": program("benchmarks.fuzz", "--seed", str(seed)),
         "attacks": program("benchmarks.attacks"),

@@ -1,8 +1,14 @@
 """Jobs that are carried out in this process: queue, workers' code and ledger, without Ray."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+from starlette.testclient import TestClient
+
+from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.dispatch.cramer_rao import build_bounds_maker
 from service.dispatch.encoding import describe_program
@@ -12,8 +18,34 @@ from service.jobs import submit
 from service.jobs.schemas import JobIn
 from service.queue.leases import LeaseQueue, ProgramOfJob
 from service.repositories.runs import RunRepository
+from tests.rest import parts_of, recording, settings_of, store_csv
 from workers.inline_executor import InlineExecutor
 from workers.scheduler import Scheduler
+
+
+class ServedRun(NamedTuple):
+    """A server with one job, and its only run."""
+
+    server: TestClient
+    body: dict[str, Any]
+    job: str
+    run: str
+
+
+@contextmanager
+def serve_run(folder: Path, **changes: Any) -> Iterator[ServedRun]:
+    """Serve one run of `fopdt` on a held input with noise; `changes` are fields of its job."""
+    with TestClient(create_app(settings_of(folder))) as server:
+        body = {
+            "model": "fopdt",
+            "datasets": [store_csv(server, recording())],
+            "algorithm": {"population": 20, "generations": 60, "islands": 1},
+            "noise": {"sigma": 0.05},
+            "hold": {"u": "zero"},
+            **changes,
+        }
+        job, (run,) = identified(parts_of(server), body)
+        yield ServedRun(server, body, job, run)
 
 
 def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[str, list[str]]:
@@ -39,7 +71,7 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     feeder.add_job(job, source, recorder)
     for _ in range(steps):
         if feeder.run_step(0.05):
-            recorder.write_results()
+            recorder.write_all()
             recorder.finish_job(None if floors is None else list(floors())[-1])
             break
     with parts.database.read_session() as session:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from sysid.core.types import FloatArray
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
@@ -29,6 +30,11 @@ _OPERATORS: Mapping[str, Callable[[Any, Any], Any]] = {
     "or": lambda a, b: a or b,
 }
 
+
+def _pchip(at: float, x: FloatArray, y: FloatArray) -> float:
+    return float(PchipInterpolator(x, y)(np.clip(at, x[0], x[-1])))
+
+
 FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "sin": math.sin,
     "cos": math.cos,
@@ -43,6 +49,16 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "where": lambda c, a, b: a if c else b,
     "tanh": math.tanh,
     "atan": math.atan,
+    "atan2": math.atan2,
+    "sinh": math.sinh,
+    "cosh": math.cosh,
+    "log10": math.log10,
+    "erf": math.erf,
+    "floor": lambda x: float(math.floor(x)),
+    "mod": lambda x, y: x % y,
+    "table": lambda at, *points: float(np.interp(at, *np.reshape(points, (2, -1)))),
+    "pchip": lambda at, *points: _pchip(at, *np.reshape(points, (2, -1))),
+    "clip": lambda x, lower, upper: min(max(x, lower), upper),
 }
 
 

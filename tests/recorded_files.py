@@ -169,6 +169,49 @@ def write_old_sheet(rows: Sequence[Sequence[object]]) -> bytes:
     return head + struct.pack("<109I", n + 1, *[free] * 108) + book + folder + table
 
 
+def write_binary_sheet(rows: Sequence[Sequence[object]]) -> bytes:
+    """A binary Excel file (.xlsb): BIFF12 records in a ZIP archive."""
+
+    def write_number(number: int) -> bytes:
+        return bytes([number]) if number < 128 else bytes([number & 127 | 128, number >> 7])
+
+    def record(kind: int, content: bytes = b"") -> bytes:
+        return write_number(kind) + write_number(len(content)) + content
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode("utf-16-le")
+
+    def write(column: int, value: object) -> bytes:
+        place = struct.pack("<2I", column, 0)
+        if isinstance(value, str):
+            return record(6, place + text(value))
+        return record(5, place + struct.pack("<d", value))
+
+    book = record(131) + record(143)
+    book += record(156, struct.pack("<2I", 0, 1) + text("r1") + text("Data"))
+    book += record(144) + record(132)
+    size = struct.pack("<4I", 0, len(rows) - 1, 0, max(map(len, rows)) - 1)
+    sheet = record(129) + record(148, size) + record(145)
+    for number, row in enumerate(rows):
+        sheet += record(0, struct.pack("<I", number) + bytes(13))
+        sheet += b"".join(write(column, value) for column, value in enumerate(row))
+    sheet += record(146) + record(130)
+    links = "http://schemas.openxmlformats.org/package/2006/relationships"
+    link = f'<Relationship Id="r1" Type="{_LINKS}/worksheet" Target="worksheets/s1.bin"/>'
+    types = "http://schemas.openxmlformats.org/package/2006/content-types"
+    parts = {
+        "[Content_Types].xml": f'<Types xmlns="{types}"/>',
+        "xl/workbook.bin": book,
+        "xl/_rels/workbook.bin.rels": f'<Relationships xmlns="{links}">{link}</Relationships>',
+        "xl/worksheets/s1.bin": sheet,
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for part, content in parts.items():
+            archive.writestr(part, content)
+    return buffer.getvalue()
+
+
 def write_npz(**arrays: object) -> bytes:
     """Arrays as a NumPy file."""
     buffer = io.BytesIO()

@@ -4,10 +4,12 @@ The twin of a kernel walks the expression tree for one individual, one sample at
 floats. It shares with the kernel how records are laid out, and nothing else.
 """
 
+import math
 from collections.abc import Mapping
 from math import floor
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
@@ -35,7 +37,23 @@ _FUNCTIONS = {
     "max": np.maximum,
     "tanh": np.tanh,
     "atan": np.arctan,
+    "atan2": np.arctan2,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "log10": np.log10,
+    "erf": np.vectorize(math.erf),
+    "floor": np.floor,
+    "mod": np.mod,
+    "clip": np.clip,
+    "table": lambda at, *points: np.interp(at, *np.reshape(points, (2, -1))),
+    "pchip": lambda at, *points: _pchip(at, *np.reshape(points, (2, -1))),
 }
+
+
+def _pchip(at: float, x: FloatArray, y: FloatArray) -> float:
+    return float(PchipInterpolator(x, y)(np.clip(at, x[0], x[-1])))
+
+
 _OPERATORS = {
     "+": np.add,
     "-": np.subtract,
@@ -215,8 +233,8 @@ class Twin:
                 return place
         return place * self.step
 
-    def _lag(self, past: PastValue) -> float:
-        lag = self._value(past.delay, 0, 0.0, {}, 0) if past.delay is not None else 0.0
+    def _lag(self, past: PastValue, m: int, c: float) -> float:
+        lag = self._value(past.delay, m, c, {}, 0) if past.delay is not None else 0.0
         lag = max(lag, 0.0) if self.difference else max(lag, 0.0) / self.step
         return float(floor(lag + 0.5)) if self.model.solver.interpolation == "nearest" else lag
 
@@ -229,7 +247,7 @@ class Twin:
         if semi and self.names.index(past.name) < equation:
             c = 1.0  # already updated: as it is at the end of the step
         place = c - past.offset
-        at = place - self._lag(past)
+        at = place - self._lag(past, m, c)
         now = self.past[past.name][m]
         rise = values.get(past.name, now) - now
         if at > 0 and self._has_slopes():
@@ -278,7 +296,7 @@ class Twin:
             return float(
                 fine.values[fine.start_index + m * fine.points_per_step + _inside(fine, c)]
             )
-        at = fine.start_index + start + (place - self._lag(past)) * fine.points_per_step
+        at = fine.start_index + start + (place - self._lag(past, m, c)) * fine.points_per_step
         i = floor(at)
         return float(fine.values[i] + (at - i) * (fine.values[i + 1] - fine.values[i]))
 

@@ -20,9 +20,14 @@ from tests.sources import list_modules
 
 PRODUCT = ("lagid", "sysid", "workers", "service", "migrations")
 # Modules that have another name than their distribution.
-MODULES = {"pyyaml": "yaml", "protobuf": "google", "python-multipart": "python_multipart"}
-# Starlette needs it for forms. Of Plotly its file is sent to browsers.
-NOT_IMPORTED = {"python_multipart", "plotly"}
+MODULES = {
+    "pyyaml": "yaml",
+    "markdown-it-py": "markdown_it",
+    "protobuf": "google",
+    "python-multipart": "python_multipart",
+}
+# Starlette needs it for forms. Of Plotly and Swagger UI files are sent to browsers.
+NOT_IMPORTED = {"python_multipart", "plotly", "swagger_ui_py"}
 
 
 def read_requirements(*extra_names: str) -> set[str]:

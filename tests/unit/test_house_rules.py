@@ -24,7 +24,14 @@ def _tracked() -> list[Path]:
 
 def test_the_top_level_has_nothing_but_the_house() -> None:
     folders = {"service", "workers", "sysid", "lagid", "migrations", "tests", "docker", "docs"}
-    files = {"pyproject.toml", "requirements.lock", "alembic.ini", "Makefile", "LICENSE"}
+    files = {
+        "pyproject.toml",
+        "requirements.lock",
+        "alembic.ini",
+        "Makefile",
+        "LICENSE",
+        "CITATION.cff",
+    }
     others = {"benchmarks", ".ci", ".gitignore", ".dockerignore"}
     entries = {path.relative_to(ROOT).parts[0] for path in _tracked()}
     assert {one for one in entries if not one.endswith(".md")} <= folders | files | others
@@ -103,7 +110,7 @@ def test_every_package_on_disk_is_listed_for_installation() -> None:
         for part in PRODUCT
         for init in (ROOT / part).rglob("__init__.py")
     }
-    assert names == on_disk
+    assert names - {"service.guides"} == on_disk  # that one is the folder `docs`
 
 
 def users_of(text: str) -> list[str]:

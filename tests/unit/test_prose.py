@@ -14,7 +14,7 @@ PROGRAMS = (ROOT / "sysid/export/c.py", ROOT / "sysid/export/python.py")  # text
 DOCUMENTS = sorted(
     path
     for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
-    if "notes" not in path.parts
+    if not {"notes", "reference"} & set(path.parts)  # the reference is made from other texts
 )
 
 
