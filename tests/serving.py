@@ -1,5 +1,6 @@
 """The web application on a port of loopback, in a thread of the tests' process."""
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -8,15 +9,29 @@ from contextlib import contextmanager
 import uvicorn
 from fastapi import FastAPI
 
-STOP_LIMIT_SECONDS = 20.0
+STOP_LIMIT_SECONDS = 180.0
+REQUESTS_LIMIT_SECONDS = 10
+"""How long a stopping server waits for requests that run, and for streams."""
 
 
 @contextmanager
-def serve_in_thread(app: FastAPI) -> Iterator[str]:
-    """Serve the application for the length of the block, at the address that is given."""
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
+def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterator[str]:
+    """Serve the application for the length of the block, at the address that is given.
+
+    With a bound socket at its port; the server closes that socket. The server has ended when
+    the block is left: another one at the same port must not share its connections with this one.
+    """
+    config = uvicorn.Config(
+        app,
+        host="127.0.0.1",
+        port=0,
+        log_level="error",
+        ws="none",
+        timeout_graceful_shutdown=REQUESTS_LIMIT_SECONDS,
+    )
     server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, name="server")
+    sockets = None if bound is None else [bound]
+    thread = threading.Thread(target=server.run, args=(sockets,), name="server")
     thread.start()
     try:
         while not server.started:
@@ -29,3 +44,4 @@ def serve_in_thread(app: FastAPI) -> Iterator[str]:
             app.state.parts.stopping.set()
         server.should_exit = True
         thread.join(timeout=STOP_LIMIT_SECONDS)
+        assert not thread.is_alive(), "the server did not stop"

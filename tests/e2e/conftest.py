@@ -2,15 +2,12 @@
 
 import re
 import socket
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import uvicorn
 from playwright.sync_api import (
     Browser,
     BrowserContext,
@@ -25,6 +22,7 @@ from service.api.dependencies import Parts
 from tests.e2e.filled import Filled, copy_filled
 from tests.needs import report_missing
 from tests.rest import settings_of
+from tests.serving import serve_in_thread
 
 CHROMIUM = Path("/usr/bin/chromium")
 ARGUMENTS = [
@@ -99,21 +97,8 @@ def serve_folder(
 ) -> Iterator[Server]:
     """The service over a data folder, at a bound socket, which it closes, or a port of its own."""
     app = create_app(settings_of(folder, poll_seconds=0.05, **changes))
-    config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, args=([bound] if bound else None,))
-    thread.start()
-    try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.01)
-        port = server.servers[0].sockets[0].getsockname()[1]
-        yield Server(f"http://127.0.0.1:{port}", app.state.parts)
-    finally:
-        if hasattr(app.state, "parts"):
-            app.state.parts.stopping.set()
-        server.should_exit = True
-        thread.join(timeout=20)
+    with serve_in_thread(app, bound) as url:
+        yield Server(url, app.state.parts)
 
 
 @pytest.fixture(scope="session")
