@@ -52,10 +52,11 @@ def test_bands_surround_the_simulated_output_over_the_whole_record(served: Serve
     assert outer[1] == pytest.approx(np.hypot(inner[1], 1.98 * noise), rel=0.02)
 
 
-def test_fewer_points_are_read_on_request(served: ServedRun) -> None:
-    path, query = f"/v1/runs/{served.run}/bands", {"max_points": 10}
+@pytest.mark.parametrize("most", [2, 3, 4, 10])
+def test_fewer_points_are_read_on_request(served: ServedRun, most: int) -> None:
+    path, query = f"/v1/runs/{served.run}/bands", {"max_points": most}
     [output] = served.server.get(path, params=query).json()["experiments"][0]["outputs"]
-    assert len(output["times"]) <= 10 < output["samples"]
+    assert 2 <= len(output["times"]) <= most < output["samples"]
     assert len(output["prediction_upper"]) == len(output["times"])
 
 
