@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.pages import figure_data
 from service.runs import bands
 from tests.identified import ServedRun, identified, serve_run
 from tests.rest import parts_of, recording, refused, store_csv
@@ -105,6 +106,12 @@ def test_bands_that_cannot_be_computed_say_why_and_the_figure_does_without(
     figure = served.server.get(f"/v1/runs/{run}/figures/response").json()
     assert [trace["name"] for trace in figure["data"][:2]] == ["measured", "identified"]
     refused(served.server.get("/v1/runs/run_none/bands"), 404, "not-found")
+    computed: list[object] = []  # several runs over each other are drawn without bands
+    monkeypatch.setattr(figure_data, "load_bands", lambda *given: computed.append(given))
+    query = f"run={served.run}&run={run}"
+    compared = served.server.get(f"/pages/compare/response?{query}").json()
+    assert len([trace for trace in compared["data"] if trace.get("mode") == "lines"]) > 2
+    assert computed == []
 
 
 def test_records_count_by_their_noise_when_a_run_is_opened_again(served: ServedRun) -> None:
