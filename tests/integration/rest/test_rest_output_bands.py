@@ -1,5 +1,6 @@
 """Bands of a run's outputs, and the order of its process: as documents, in figure and page."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -102,7 +103,11 @@ def test_bands_that_cannot_be_computed_say_why_and_the_figure_does_without(
     _, (run,) = identified(parts_of(served.server), {**served.body, "seed": 7})
     answer = served.server.get(f"/v1/runs/{run}/bands")
     refused(answer, 409, "conflict")
-    assert "too much work. Samples × parameters is 1.2e+03; need at most 10" in answer.text
+    [told] = re.findall(r"too much work. Steps × parameters is (\S+); need at most 10", answer.text)
+    result = served.server.get(f"/v1/runs/{run}").json()
+    samples, free = result["criteria"]["samples"], result["criteria"]["parameters"]
+    assert result["substeps"] > 1  # each of which is simulated
+    assert float(told) == pytest.approx(samples * result["substeps"] * free, rel=0.02)
     figure = served.server.get(f"/v1/runs/{run}/figures/response").json()
     assert [trace["name"] for trace in figure["data"][:2]] == ["measured", "identified"]
     refused(served.server.get("/v1/runs/run_none/bands"), 404, "not-found")
