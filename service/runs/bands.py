@@ -90,7 +90,7 @@ def _compute_bands(
         estimate_noise,
         list_whole_records,
     )
-    from sysid.identification.generalised_least_squares import make_whitening
+    from sysid.residuals.series import make_whitening
     from sysid.uncertainty.analysis import analyse_estimate
     from sysid.uncertainty.output_bands import ParameterSpread
 

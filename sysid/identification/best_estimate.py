@@ -23,7 +23,6 @@ from sysid.identification.deadline import Deadline
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
-    make_whitening,
 )
 from sysid.identification.integration_step import (
     HalfStep,
@@ -61,6 +60,7 @@ from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.residuals.residual_tests import run_residual_tests
+from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening
 from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings

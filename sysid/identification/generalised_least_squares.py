@@ -12,7 +12,7 @@ disturbances, neighbours are equal to many digits. Their correlation then leads 
 differences, in which rounding and sensor noise outweigh all else; τ does not. The first-order noise
 is a working correlation: if it is not the true one, the estimates stay valid but lose some
 efficiency. The covariance is that of the whitened residuals, by a sandwich if these are coloured
-(Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.coloured`).
+(Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.sandwich`).
 
 If switches make the loss rough, the minimum near that of least squares need not be the lowest. So
 points are drawn along the covariance of least squares, and the lowest of them are starts as well.
@@ -31,8 +31,8 @@ from numpy.fft import irfft, rfft
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import space_residuals
-from sysid.residuals.coloured import ResidualPart, is_coloured, iterate_parts
-from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.residuals.series import ResidualPart, is_coloured, iterate_parts, make_whitening
+from sysid.residuals.whitening import Whitening
 from sysid.search.least_squares import (
     N_TRIED,
     LeastSquaresSolution,
@@ -86,18 +86,6 @@ class GeneralisedEstimate(NamedTuple):
     least_squares_theta: FloatArray | None = None
     least_squares_error: float = 0.0
     error: float = 0.0
-
-
-def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
-    """Make the whitening of a problem's scored samples."""
-    coefficients = [
-        compute_ar1_coefficient(part.times, correlation_times.get(part.output, 0.0))
-        for part in iterate_parts(problem)
-    ]
-    return Whitening(
-        np.concatenate([np.zeros(0), *coefficients]),
-        sum(time > 0 for time in correlation_times.values()),
-    )
 
 
 def fit_generalised_least_squares(
@@ -184,7 +172,9 @@ def _draw_starts(
     moves = moves * random.standard_normal((_N_DRAWN, place.size)) @ factor_covariance(covariance).T
     theta = from_unit(evaluator, place[None]) + moves
     places = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
-    totals = _sum_squares(whitening.whiten(search.compute_residuals(places)))
+    with np.errstate(all="ignore"):  # diverged simulations
+        totals = np.sum(np.square(whitening.whiten(search.compute_residuals(places))), axis=1)
+    totals = np.where(np.isfinite(totals), totals, np.inf)
     return [places[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
 
 
@@ -261,7 +251,7 @@ def _find_decay_lag(correlation: FloatArray) -> float:
 class WhitenedLeastSquares:
     """Least squares of whitened residuals over unit coordinates, counting simulations."""
 
-    def __init__(self, problem: Problem, budget: int) -> None:
+    def __init__(self, problem: Problem, budget: int = 2**62) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
         self.is_cut = False  # whether a search ended early because the budget was spent
         self.ends, self.rms = (
@@ -282,10 +272,7 @@ class WhitenedLeastSquares:
     def compute_residuals(self, places: FloatArray) -> FloatArray:
         """Compute weighted residuals (P, n) at points (P, D)."""
         self.evaluations += places.shape[0]
-        predicted = self.problem.predict(from_unit(self.problem.evaluator, places))
-        scored = self._scored
-        measured = scored.evaluator.measured[scored.rows]
-        return np.asarray(scored.weight * (predicted[:, scored.rows] - measured))
+        return self.problem.compute_residuals(from_unit(self.problem.evaluator, places))
 
     def compute_slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
         """Compute the slopes (n, D) of the residuals."""
@@ -315,10 +302,3 @@ class WhitenedLeastSquares:
         solution = solve_least_squares(scored, place, 0.0, steps=steps, at_once=at_once)
         self.evaluations += solution.evaluations
         return solution
-
-
-def _sum_squares(errors: FloatArray) -> FloatArray:
-    """Sum the squares (P,) of residuals (P, n); inf where one is not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        totals = np.einsum("pn,pn->p", errors, errors)
-    return np.where(np.isfinite(totals), totals, np.inf)

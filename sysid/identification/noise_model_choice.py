@@ -17,16 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.settings import NoiseModel
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     WhitenedLeastSquares,
     estimate_correlation_times,
-    make_whitening,
     select_coloured_outputs,
 )
-from sysid.residuals.coloured import iterate_parts
+from sysid.residuals.series import iterate_parts, make_whitening
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.analysis import Analysis
@@ -106,7 +105,7 @@ def _number_blocks(problem: Problem, division: int) -> IntArray:
     return numbers
 
 
-def _leave_out(problem: Problem, rows: FloatArray) -> Problem:
+def _leave_out(problem: Problem, rows: BoolArray) -> Problem:
     """Leave scored samples out of the residuals of least squares."""
     weight = problem.evaluator.weight.copy()
     weight[problem.scored_rows[rows]] = 0.0

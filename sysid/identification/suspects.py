@@ -22,7 +22,7 @@ from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
-from sysid.residuals.coloured import ResidualPart, iterate_parts
+from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 

@@ -23,7 +23,7 @@ import numpy as np
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import ExchangeGroups, order_exchangeable
-from sysid.residuals.coloured import CHI_SQUARE_95
+from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.analysis import Analysis

@@ -11,7 +11,7 @@ from scipy import signal
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.generalised_least_squares import make_whitening
+from sysid.residuals.series import make_whitening
 from sysid.models.parse import parse_model
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
