@@ -135,6 +135,28 @@ def compare_orders(
     ), spent
 
 
+def mark_order_dependent(
+    estimates: tuple[Estimate, ...], comparison: OrderComparison | None
+) -> tuple[Estimate, ...]:
+    """Mark an identified dead time whose interval does not hold that of the preferred order.
+
+    Its standard error assumes the model's order, and the data contradict that.
+    """
+    if comparison is None or comparison.preferred_model in (None, comparison.model):
+        return estimates
+    [best] = comparison.open_fits
+    reason = f"it is {_write_delay(comparison, best)}, which the data prefer"
+    return tuple(
+        replace(estimate, status="order-dependent", reason=reason)
+        if estimate.name == comparison.delay
+        and estimate.status == "identified"
+        and estimate.interval95 is not None
+        and not estimate.interval95[0] <= best.delay <= estimate.interval95[1]
+        else estimate
+        for estimate in estimates
+    )
+
+
 def warn_other_order(comparison: OrderComparison | None, model: str) -> list[str]:
     """Warn if the data prefer another order, or if the dead time depends on an open one.
 

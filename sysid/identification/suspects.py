@@ -122,7 +122,9 @@ class _LinearFit:
             for part in iterate_parts(self._problem)
             for values in self._list_past_inputs(part)
         ]
-        gain = self._compute_gain(np.column_stack(regressors), len(regressors))
+        gain = 0.0  # no input moves
+        if regressors:
+            gain = self._compute_gain(np.column_stack(regressors), len(regressors))
         return Suspect(DYNAMICS, gain, "Try a model of another order")
 
     def _list_past_inputs(self, part: ResidualPart) -> Iterator[FloatArray]:

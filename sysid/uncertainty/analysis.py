@@ -193,6 +193,7 @@ def _analyse_sensitivities(
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     blocks = find_unidentified(directions)
     names = problem.free_names
+    degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
@@ -207,12 +208,12 @@ def _analyse_sensitivities(
             for block in blocks
             for g in express_combinations(block, names, theta, scale, physical)
         ),
+        degrees=float(np.min(degrees)),
     )
     combined = {name for group in uncertainty.groups for name in group.members}
     statuses = _classify_parameters(
         place, blocks, is_pulled, np.array([name in combined for name in names])
     )
-    degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     statistics = LocalStatistics(
         theta,
         statuses,
@@ -243,7 +244,7 @@ def _analyse_sensitivities(
         active_bounds,
         linear,
         decomposition=decomposition,
-        likelihood=LikelihoodModel(error, columns, middle, float(np.min(degrees)), whitening),
+        likelihood=LikelihoodModel(error, columns, middle, uncertainty.degrees, whitening),
     )
 
 
