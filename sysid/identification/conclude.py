@@ -199,7 +199,7 @@ def _build_identification(
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
             *explain_noise_model_choice(problem, noise),
-            *(() if posterior is None else describe_posterior(posterior)),
+            *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,

@@ -178,8 +178,8 @@ def _warn_few_repeats(problem: Problem, analysis: Analysis) -> list[str]:
         else "one of which alone tells of a parameter"
     )
     return [
-        f"the samples are pooled from {repeats} repeats, {cause}. The standard errors ignore what "
-        "the samples of a repeat have in common, so they may be too small."
+        f"the samples are pooled from {repeats} repeats, {cause}. The standard errors are those of "
+        "one record. They ignore what the samples of a repeat have in common, and may be far off."
     ]
 
 

@@ -415,9 +415,7 @@ def _compute_cross_term(
         common = float(errors[0] @ errors[1]) / errors[0].size
         return np.asarray(common * (slopes[0].T @ slopes[1]))
     transformed = []
-    for part, error, slope, has_colour in zip(
-        pair.parts, errors, slopes, have_colour, strict=True
-    ):
+    for part, error, slope, has_colour in zip(pair.parts, errors, slopes, have_colour, strict=True):
         spaced = space_residuals(part.times, error)
         root = estimate_spectrum_root(spaced)[0] if has_colour else _make_white_root(spaced)
         transformed.append(_transform_sensitivities(spaced, slope, root))

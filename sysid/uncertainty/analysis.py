@@ -420,9 +420,7 @@ def _compute_degrees_of_freedom(
     )
 
 
-def _classify_noise_colour(
-    colour: Sandwich | None, whitening: Whitening | None
-) -> NoiseColour:
+def _classify_noise_colour(colour: Sandwich | None, whitening: Whitening | None) -> NoiseColour:
     if colour is None or colour.is_white:
         return "white" if whitening is None else "first-order"
     if colour.is_clustered:

@@ -72,12 +72,14 @@ def fit_unequal_noise(
         left -= count
         series = [error[part.rows] for part in parts]
         rms = sqrt(float(error @ error) / error.size)
+        shows_noise = varies | [values @ values > rms**2 * values.size for values in series]
         if fit is None and (
             rms <= _NO_NOISE * problem.output_scale
-            or not have_unequal_variances([series[i] for i in np.flatnonzero(varies)])
+            or not have_unequal_variances([series[i] for i in np.flatnonzero(shows_noise)])
         ):
             return None
-        variances = _estimate_variances(series, [columns[part.rows] for part in parts], varies)
+        used = count_used_degrees([columns[part.rows] for part in parts])
+        variances = _estimate_variances(series, used, shows_noise)
         plain = error * problem.plain_weight[rows] / problem.evaluator.weight[rows]
         ratios = _compute_ratios(series, variances, float(plain @ plain))
         if np.ptp(np.log(ratios)) <= _TOLERANCE or (is_late is not None and is_late()):
@@ -91,18 +93,18 @@ def fit_unequal_noise(
 
 
 def _estimate_variances(
-    series: Sequence[FloatArray], columns: Sequence[FloatArray], varies: BoolArray
+    series: Sequence[FloatArray], used: FloatArray, shows_noise: BoolArray
 ) -> FloatArray:
-    """Estimate the variance of each residual series, which has slopes (n, D).
+    """Estimate the variance of each residual series; `used` are degrees of freedom.
 
-    The parameters take degrees of freedom from each series. A short series has the common variance.
-    So has one whose measured values are all equal, such as a sensor at rest: it shows no noise.
+    A short series has the common variance. So has one that shows no noise: a sensor at rest, whose
+    measured values are all equal, and which the model follows.
     """
     sizes = np.array([values.size for values in series])
     powers = np.array([float(values @ values) for values in series])
-    left = np.maximum(sizes - count_used_degrees(columns), 1.0)
+    left = np.maximum(sizes - used, 1.0)
     common = np.sum(powers) / np.sum(left)
-    return np.where(varies & (sizes >= MIN_SAMPLES), powers / left, common)
+    return np.where(shows_noise & (sizes >= MIN_SAMPLES), powers / left, common)
 
 
 def _compute_ratios(

@@ -87,9 +87,7 @@ def test_of_independent_outputs_nothing_is_taken_for_common() -> None:
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
     seeds = draw_seeds(gate=30, night=300)
     drawn = ([noise(seed, one).ravel() for seed in seeds] for one in (0.0, 0.9))
-    free, common = (
-        [estimate_sandwich(problem, e, columns) is None for e in one] for one in drawn
-    )
+    free, common = ([estimate_sandwich(problem, e, columns) is None for e in one] for one in drawn)
     assert sum(free) >= bound_count(len(seeds), 0.99)[0]
     assert not any(common)
 
