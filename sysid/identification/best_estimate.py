@@ -51,6 +51,7 @@ from sysid.identification.minima import (
 from sysid.identification.noise_model_choice import (
     PredictionErrors,
     compare_on_blocks,
+    explain_noise_model_choice,
     may_be_ar1,
 )
 from sysid.identification.search_evidence import is_explained
@@ -341,9 +342,7 @@ class _EstimateSearch:
         if errors is None or not (errors.speak_for_ar1 and estimate.is_complete):
             self.analysis = before
             return None
-        return estimate._replace(
-            least_squares_theta=theta, least_squares_error=errors.white, error=errors.ar1
-        )
+        return estimate._replace(note=explain_noise_model_choice(self.problem, theta, errors))
 
     def _use_noise_model(self) -> GeneralisedEstimate:
         """Estimate under first-order noise, and analyse, if the residuals are not white."""

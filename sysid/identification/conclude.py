@@ -23,7 +23,7 @@ from sysid.identification.input_hold import (
 )
 from sysid.identification.integration_step import explain_finer_step
 from sysid.identification.minima import mark_ambiguous
-from sysid.identification.noise_model_choice import explain_noise_model_choice, resolve_noise_model
+from sysid.identification.noise_model_choice import resolve_noise_model
 from sysid.identification.process_order import (
     compare_orders,
     mark_order_dependent,
@@ -198,7 +198,7 @@ def _build_identification(
             *unstable,
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
-            *explain_noise_model_choice(problem, noise),
+            *filter(None, [noise.note]),
             *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,

@@ -1,46 +1,37 @@
 """Sandwich covariance of estimates whose residuals are not one white noise.
 
-s²(SᵀS)⁻¹ assumes white residuals of one variance. Residuals of measured records are seldom so, and
-then it is too small. The sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ replaces it, with Ω = SᵀRS and the covariance R
-of the residuals (output errors: Ljung 1999, sec. 9.3). R has a block for each series, one output of
-one experiment, and blocks between outputs that share their noise.
+s²(SᵀS)⁻¹ assumes white residuals of one variance. For others it is mostly too small. The sandwich
+(SᵀS)⁻¹ Ω (SᵀS)⁻¹ replaces it, with Ω = SᵀRS and the covariance R of the residuals (Ljung 1999, sec.
+9.3). R has a block for each series, and blocks between outputs that share their noise.
 
 colour
     R of a coloured series comes from a Parzen window whose width follows the colour, after
-    prewhitening by an autoregression (Andrews and Monahan 1992). Short records use a noise model
-    instead (`sysid.residuals.restricted_likelihood`). The autoregression is of first order, or of
-    the order of Akaike's criterion (Burg's method; den Haan and Levin 1997): for slow noise plus
-    white noise, the correlation of neighbours says too little. All this applies to free runs only.
-    One step ahead the sensitivities depend on measured outputs, and so on the noise.
-
-    Coloured samples carry less information than white ones. With first-order noise of pole a > 0, n
-    samples of a mean count as n(1 - a)/(1 + a) (Bayley and Hammersley 1946). This number sets the
-    degrees of freedom. If a is too near 1, the record is short compared with its drift, and the
-    errors are a lower bound.
+    prewhitening by an autoregression (Andrews and Monahan 1992) of first order, or of the order of
+    Akaike's criterion (Burg; den Haan and Levin 1997): for slow noise plus white noise, the
+    correlation of neighbours says too little. Short records use a noise model
+    (`sysid.residuals.restricted_likelihood`). This is for free runs only: one step ahead the
+    sensitivities depend on the noise. With first-order noise of pole a > 0, n samples of a mean
+    count as n(1 - a)/(1 + a) (Bayley and Hammersley 1946), which sets the degrees of freedom. If a
+    is too near 1, the residuals drift over the record, and the errors are a lower bound.
 unequal variances
-    If the variances of series clearly differ, or if the weights were estimated from the residuals
-    (`sysid.uncertainty.unequal_noise`), each series has its own. An interval then has the degrees
-    of freedom of the series that determine it (Satterthwaite 1946).
+    If those of series clearly differ, or were estimated (`sysid.uncertainty.unequal_noise`), an
+    interval has the degrees of freedom of the series that determine it (Satterthwaite 1946).
 correlated outputs
-    A disturbance of two sensors appears in both residuals and would count twice. If outputs of an
-    experiment are clearly correlated at the same times, Ω gets their cross terms (Zellner 1962; the
-    estimate keeps its weights). For coloured residuals the coherence is assumed equal at all
-    frequencies, so the variance of a difference of outputs is never negative. Equal residuals count
-    once: Σe² varies like that of n²/Σ r² of n independent ones, with the sum over all pairs.
+    If outputs of an experiment are clearly correlated at the same times, Ω gets their cross terms
+    (Zellner 1962). The coherence is taken as equal at all frequencies, so the variance of a
+    difference of outputs is never negative. Equal residuals count once: Σe² varies like that of
+    n²/Σ r² of n independent ones, with the sum over all pairs.
 repeats
-    What samples pooled from repeats have in common belongs to their repeat: a pressure that was a
-    little higher, a valve that opened later. So Ω sums the scores of whole repeats, u = Sᵀe of
-    each, and assumes nothing about the noise inside a repeat (Liang and Zeger 1986). With few
-    repeats the estimate follows each of them. So each score is that of the residuals which the
-    repeat would have if it had been left out: (I - MA)⁻¹u with its M = SᵀS and A = (SᵀS)⁻¹ of all,
-    the jackknife (Bell and McCaffrey 2002, CR3). A record that was not pooled is one repeat. An
-    interval has one degree of freedom less than the effective number of repeats (Carter, Schnepel
-    and Steigerwald 2017).
+    What samples pooled from repeats have in common belongs to their repeat, such as its supply
+    pressure. So Ω sums the scores u = Sᵀe of whole repeats (Liang and Zeger 1986). The estimate
+    follows each of few repeats. So a score is that of the residuals which the repeat would have if
+    it had been left out: (I - MA)⁻¹u with its M = SᵀS and A = (SᵀS)⁻¹ of all, the jackknife (Bell
+    and McCaffrey 2002, CR3). A record that was not pooled is one repeat. An interval has one degree
+    of freedom less than the effective number of repeats (Carter, Schnepel, Steigerwald 2017).
 """
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations, groupby
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -68,12 +59,9 @@ from sysid.residuals.series import (
 )
 from sysid.simulation.problem import Problem
 
-CHI_SQUARE_95 = 3.841458820694124
-"""95 % quantile of χ² with one degree of freedom."""
+CHI_SQUARE_95 = 3.841458820694124  # 95 % quantile of χ² with one degree of freedom
 
-MIN_REPEATS = 5
-"""With fewer repeats, or fewer than two more than parameters, their spread says too little."""
-
+MIN_REPEATS = 5  # and two more than parameters: fewer say too little of their spread
 _CORRELATION_LEVEL = 1e-3  # of the test for correlation between outputs
 _MAX_RECURSION_ORDER = 25  # past values of the autoregression
 _MIN_WIDENING = 1e-3  # of the variance with white residuals: less is rounding
@@ -123,13 +111,10 @@ class Sandwich(NamedTuple):
         power, norm : float
             Mean square of the residuals; sum of squares of that combination.
         """
-        variance_ratio = max(
-            float(direction @ self.middle @ direction) / (power * norm), _MIN_WIDENING
-        )
-        quantile_ratio = (
-            float(student_quantile(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
-        )
-        return float(variance_ratio * quantile_ratio * self.equivalent_samples / self.degrees)
+        variance = max(float(direction @ self.middle @ direction) / (power * norm), _MIN_WIDENING)
+        quantile = float(student_quantile(self.compute_degrees(direction), 0.975))
+        ratio = variance * (quantile**2 / CHI_SQUARE_95)
+        return float(ratio * self.equivalent_samples / self.degrees)
 
 
 def estimate_sandwich(
@@ -169,7 +154,7 @@ def estimate_sandwich(
     else:
         return None
     whole = whole._replace(is_white=not any(are_coloured))
-    return _add_cross_terms(whole, pairs, influence, columns) if pairs else whole
+    return _add_cross_terms(whole, pairs, are_coloured, influence, columns) if pairs else whole
 
 
 def count_repeats(problem: Problem) -> int:
@@ -285,9 +270,8 @@ def estimate_spectrum_root(spaced: SpacedResiduals) -> tuple[FloatArray, float]:
     kernel = np.concatenate([[1.0], -weights])
     filtered = np.convolve(spaced.values, kernel)
     innovations = np.where(are_neighbours, filtered[1 : spaced.values.size], 0.0)
-    root = smooth_spectrum_root(
-        innovations, are_neighbours, room=2 * innovations.size
-    )  # the autoregression rings on
+    room = 2 * innovations.size  # the autoregression rings on
+    root = smooth_spectrum_root(innovations, are_neighbours, room)
     root /= np.abs(rfft(kernel, 2 * (root.size - 1)))
     return root, pole
 
@@ -338,7 +322,8 @@ def _transform_sensitivities(
 class _CorrelatedPair(NamedTuple):
     """Two series at the times that they share, their rows, their correlation and its p-value."""
 
-    parts: tuple[ResidualPart, ResidualPart]
+    series: tuple[int, int]
+    times: FloatArray
     rows: tuple[IntArray, IntArray]
     correlation: float
     chance: float
@@ -351,23 +336,22 @@ def _find_correlated_pairs(
 
     All pairs of such an experiment count: a part of them might form an impossible covariance.
     """
-    for _, group in groupby(parts, key=attrgetter("experiment")):
-        correlated = [
-            _correlate_parts(first, second, influence) for first, second in combinations(group, 2)
-        ]
+    for _, group in groupby(range(len(parts)), key=lambda i: parts[i].experiment):
+        correlated = [_correlate_series(parts, pair, influence) for pair in combinations(group, 2)]
         pairs = [pair for pair in correlated if pair is not None]
         if any(pair.chance < _CORRELATION_LEVEL / len(pairs) for pair in pairs):
             yield from pairs
 
 
-def _correlate_parts(
-    part_a: ResidualPart, part_b: ResidualPart, influence: FloatArray
+def _correlate_series(
+    parts: Sequence[ResidualPart], series: tuple[int, int], influence: FloatArray
 ) -> _CorrelatedPair | None:
     """Correlate two series (n,) at their common times; None if these are few, or a series is 0.
 
     For series with poles p and q the variance of a correlation is (1 + pq)/(1 - pq)/n (Bartlett
     1935).
     """
+    part_a, part_b = (parts[i] for i in series)
     times, i, j = np.intersect1d(part_a.times, part_b.times, return_indices=True)
     rows = part_a.rows.start + i, part_b.rows.start + j
     a, b = influence[rows[0]], influence[rows[1]]
@@ -378,19 +362,28 @@ def _correlate_parts(
     poles = max(float((a[1:] @ a[:-1]) * (b[1:] @ b[:-1]) / size**2), 0.0)
     widening = (1.0 + poles) / (1.0 - poles)
     chance = float(chi_square_tail(1, correlation**2 * a.size / widening))
-    shared = part_a._replace(times=times), part_b._replace(times=times)
-    return _CorrelatedPair(shared, rows, correlation, chance)
+    return _CorrelatedPair(series, times, rows, correlation, chance)
 
 
 def _add_cross_terms(
-    whole: Sandwich, pairs: Sequence[_CorrelatedPair], influence: FloatArray, columns: FloatArray
+    whole: Sandwich,
+    pairs: Sequence[_CorrelatedPair],
+    are_coloured: Sequence[bool],
+    influence: FloatArray,
+    columns: FloatArray,
 ) -> Sandwich:
-    """Add the cross terms of correlated outputs; equal residuals count once."""
+    """Add SᵢᵀE[eᵢeⱼᵀ]Sⱼ of correlated outputs; equal residuals count once."""
     middle, double_counted = whole.middle, 0.0
     for pair in pairs:
-        term = _compute_cross_term(pair, influence, columns, whole.is_white)
+        transformed = []
+        for i, rows in zip(pair.series, pair.rows, strict=True):
+            spaced = space_residuals(pair.times, influence[rows])
+            has_colour = are_coloured[i]
+            root = estimate_spectrum_root(spaced)[0] if has_colour else _make_white_root(spaced)
+            transformed.append(_transform_sensitivities(spaced, columns[rows], root))
+        term = pair.correlation * (transformed[0] @ transformed[1].conj().T).real
         middle = middle + term + term.T
-        double_counted += 2.0 * pair.rows[0].size * pair.correlation**2
+        double_counted += 2.0 * pair.times.size * pair.correlation**2
     size, vectors = np.linalg.eigh(middle)
     if size[0] < 0.0:  # if outputs with missing samples nearly cancel
         middle = (vectors * np.maximum(size, 0.0)) @ vectors.T
@@ -400,23 +393,3 @@ def _add_cross_terms(
         equivalent_samples=whole.equivalent_samples * share,
         series=tuple((one, max(share * degrees, 1.0)) for one, degrees in whole.series),
     )
-
-
-def _compute_cross_term(
-    pair: _CorrelatedPair, influence: FloatArray, columns: FloatArray, is_white: bool
-) -> FloatArray:
-    """Compute SᵢᵀE[eᵢeⱼᵀ]Sⱼ (D, D)."""
-    errors, slopes = ([values[rows] for rows in pair.rows] for values in (influence, columns))
-    have_colour = [
-        not is_white and is_coloured(part, error)
-        for part, error in zip(pair.parts, errors, strict=True)
-    ]
-    if not any(have_colour):
-        common = float(errors[0] @ errors[1]) / errors[0].size
-        return np.asarray(common * (slopes[0].T @ slopes[1]))
-    transformed = []
-    for part, error, slope, has_colour in zip(pair.parts, errors, slopes, have_colour, strict=True):
-        spaced = space_residuals(part.times, error)
-        root = estimate_spectrum_root(spaced)[0] if has_colour else _make_white_root(spaced)
-        transformed.append(_transform_sensitivities(spaced, slope, root))
-    return np.asarray(pair.correlation * (transformed[0] @ transformed[1].conj().T).real)

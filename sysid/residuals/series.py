@@ -13,8 +13,8 @@ from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.residuals.autocorrelation import (
     MIN_SAMPLES,
     ROUNDING_SHARE,
-    SpacedResiduals,
     compute_whiteness,
+    keep_in_order,
     space_residuals,
 )
 from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
@@ -26,9 +26,7 @@ _SIGNIFICANCE = 1e-3
 It is that of χ². With 25 lags of a short record the statistic varies more. So white residuals of 50
 to 100 samples are taken for coloured in 1 % of the cases (decision 19)."""
 
-SHORT_RECORD = 400
-"""Samples: in shorter records many lags hide the first one."""
-
+SHORT_RECORD = 400  # samples: in shorter records many lags hide the first one
 _EVEN_TOLERANCE = 1e-3  # of a period: steps that differ by less are equal
 
 
@@ -74,16 +72,12 @@ def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> 
 
 def is_coloured(part: ResidualPart, values: FloatArray) -> bool:
     """Return whether the residuals (n,) of a series are clearly not white."""
-    steps = np.diff(part.times)
-    if steps.size and np.ptp(steps) > _EVEN_TOLERANCE * steps[0]:
-        spaced = space_residuals(part.times, values)
-    else:
-        present = np.ones(values.size, dtype=np.bool_)
-        spaced = SpacedResiduals(part.times, values, present, 1.0, is_regular=True)
-    n = np.count_nonzero(spaced.present)
+    n, steps = values.size, np.diff(part.times)
     is_rounding = float(np.sqrt(values @ values / n)) <= ROUNDING_SHARE * part.largest_value
     if n < MIN_SAMPLES or is_rounding:
         return False
+    is_even = np.ptp(steps) <= _EVEN_TOLERANCE * steps[0]
+    spaced = keep_in_order(values) if is_even else space_residuals(part.times, values)
     whiteness = compute_whiteness(spaced)
     chance = float(chi_square_tail(spaced.n_lags, whiteness.statistic))
     if n < SHORT_RECORD and whiteness.values[0] > 0:

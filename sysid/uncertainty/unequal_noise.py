@@ -79,9 +79,8 @@ def fit_unequal_noise(
         ):
             return None
         used = count_used_degrees([columns[part.rows] for part in parts])
-        variances = _estimate_variances(series, used, shows_noise)
         plain = error * problem.plain_weight[rows] / problem.evaluator.weight[rows]
-        ratios = _compute_ratios(series, variances, float(plain @ plain))
+        ratios = _estimate_ratios(series, used, shows_noise, float(plain @ plain))
         if np.ptp(np.log(ratios)) <= _TOLERANCE or (is_late is not None and is_late()):
             break
         problem = _divide_weights(problem, parts, ratios)
@@ -92,27 +91,19 @@ def fit_unequal_noise(
     return fit
 
 
-def _estimate_variances(
-    series: Sequence[FloatArray], used: FloatArray, shows_noise: BoolArray
+def _estimate_ratios(
+    series: Sequence[FloatArray], used: FloatArray, shows_noise: BoolArray, total: float
 ) -> FloatArray:
-    """Estimate the variance of each residual series; `used` are degrees of freedom.
+    """Estimate the deviation of each series relative to its present one; Σe² becomes `total`.
 
-    A short series has the common variance. So has one that shows no noise: a sensor at rest, whose
-    measured values are all equal, and which the model follows.
+    The parameters take the degrees of freedom `used` from each series. A short series has the
+    common variance. So has one that shows no noise: a sensor at rest, which the model follows.
     """
     sizes = np.array([values.size for values in series])
     powers = np.array([float(values @ values) for values in series])
     left = np.maximum(sizes - used, 1.0)
-    common = np.sum(powers) / np.sum(left)
-    return np.where(shows_noise & (sizes >= MIN_SAMPLES), powers / left, common)
-
-
-def _compute_ratios(
-    series: Sequence[FloatArray], variances: FloatArray, total: float
-) -> FloatArray:
-    """Compute the deviation of each series relative to its present one; Σe² becomes `total`."""
-    powers = np.array([float(values @ values) for values in series])
-    deviations = np.sqrt(variances)
+    own = shows_noise & (sizes >= MIN_SAMPLES)
+    deviations = np.sqrt(np.where(own, powers / left, np.sum(powers) / np.sum(left)))
     deviations = np.maximum(deviations, _LEAST_DEVIATION * np.max(deviations))
     return np.asarray(deviations * np.sqrt(np.sum(powers / deviations**2) / total))
 
