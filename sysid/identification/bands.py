@@ -97,6 +97,7 @@ def list_whole_records(records: Sequence[Record], later: Sequence[Record]) -> li
                     channel,
                     times=np.concatenate([channel.times, after.times]),
                     values=np.concatenate([channel.values, after.values]),
+                    repeats=None,
                 )
                 for channel, after in zip(record.outputs, rest.outputs, strict=True)
             ),

@@ -140,7 +140,7 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
-        analysis = replace(analysis, estimates=mark_order_dependent(analysis.estimates, orders))
+        analysis = replace(analysis, estimates=mark_order_dependent(analysis, orders))
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in found.minima if minimum.is_compatible]

@@ -40,7 +40,7 @@ from sysid.residuals.whitening import Whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
-from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
+from sysid.uncertainty.analysis import Analysis, analyse_estimate, compute_criteria
 from sysid.uncertainty.estimates import Estimate
 
 _SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
@@ -136,13 +136,18 @@ def compare_orders(
 
 
 def mark_order_dependent(
-    estimates: tuple[Estimate, ...], comparison: OrderComparison | None
+    analysis: Analysis, comparison: OrderComparison | None
 ) -> tuple[Estimate, ...]:
     """Mark an identified dead time whose interval does not hold that of the preferred order.
 
-    Its standard error assumes the model's order, and the data contradict that.
+    Its standard error assumes the model's order, and the data contradict that. If errors are by
+    repeat, nothing is marked: the criterion takes samples as independent, and says too much.
     """
-    if comparison is None or comparison.preferred_model in (None, comparison.model):
+    estimates, uncertainty = analysis.estimates, analysis.uncertainty
+    is_clustered = uncertainty is not None and uncertainty.noise_colour == "clustered"
+    if comparison is None or is_clustered:
+        return estimates
+    if comparison.preferred_model in (None, comparison.model):
         return estimates
     [best] = comparison.open_fits
     reason = f"it is {_write_delay(comparison, best)}, which the data prefer"

@@ -17,7 +17,8 @@ from sysid.identification.identify import identify
 from sysid.identification.process_order import mark_order_dependent, warn_other_order
 from sysid.identification.result import Identification, OrderComparison, OrderFit
 from sysid.identification.summary import describe_order
-from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.estimates import Criteria, Estimate, NoiseColour, Uncertainty
 
 PERIOD, COUNT, FINE = 0.2, 300, 50
 QUICK = GeneticAlgorithm(generations=60)
@@ -189,6 +190,15 @@ def write_fits(*bics: float) -> OrderComparison:
     return OrderComparison("sopdt", "L", "s", "white", fits)
 
 
+def analyse(estimate: Estimate, colour: NoiseColour = "white") -> Analysis:
+    """An analysis with one estimate under noise of this colour."""
+    nothing = np.zeros((1, 1))
+    uncertainty = Uncertainty(
+        ("L",), nothing, nothing, nothing, 1.0, np.ones(1), 0.0, noise_colour=colour
+    )
+    return Analysis((estimate,), uncertainty, 0.0, 0, Criteria(0.0, 0.0, 0.0, 9, 1))
+
+
 def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     open_orders = write_fits(16.1, 10.0, 16.0)
     assert [fit.model for fit in open_orders.open_fits] == ["sopdt", "topdt"]
@@ -208,9 +218,10 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     at_bound = replace(lag, status="at bound")
     prefers_first = write_fits(10.0, 16.1, 30.0)
     for one, orders in ((lag, open_orders), (wide, prefers_first), (at_bound, prefers_first)):
-        assert mark_order_dependent((one,), orders) == (one,)
-    [marked] = mark_order_dependent((lag,), prefers_first)
+        assert mark_order_dependent(analyse(one), orders) == (one,)
+    [marked] = mark_order_dependent(analyse(lag), prefers_first)
     assert marked.status == "order-dependent"
+    assert mark_order_dependent(analyse(lag, "clustered"), prefers_first) == (lag,)
     assert describe_order(write_fits(16.1, 10.0, 16.1)) == (
         "order: the data prefer sopdt to fopdt and topdt; L is 1.400 ± 0.010 s with sopdt"
     )

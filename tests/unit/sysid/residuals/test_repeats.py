@@ -144,6 +144,12 @@ def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -
     assert interval[1] <= 1.5
 
 
+def test_bands_cover_pooled_samples_that_were_kept_for_validation() -> None:
+    record = pool(draw_repeats(8, 3))
+    [bands] = identify(LINE, record, validation_fraction=0.3).compute_bands()
+    np.testing.assert_array_equal(bands.times, record.outputs[0].times)
+
+
 def test_pooled_samples_keep_the_number_of_their_repeat_when_they_are_cut() -> None:
     channel = pool(draw_repeats(4, 4)).outputs[0]
     assert channel.repeats is not None
