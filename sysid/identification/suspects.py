@@ -205,6 +205,8 @@ class _LinearFit:
                 continue
             free = np.ones(self._error.size, dtype=np.bool_)
             free[part.rows] = ~at_limit
+            if np.count_nonzero(free) <= self._basis.shape[1]:
+                continue
             move = np.linalg.lstsq(self._basis[free], self._error[free], rcond=None)[0]
             left = self._error - self._basis @ move
             if np.mean(side * left[~free] > 0) < _ONE_SIDED:
