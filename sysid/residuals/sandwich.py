@@ -375,13 +375,16 @@ def _add_cross_terms(
     """Add SᵢᵀE[eᵢeⱼᵀ]Sⱼ of correlated outputs; equal residuals count once."""
     middle, double_counted = whole.middle, 0.0
     for pair in pairs:
-        transformed = []
-        for i, rows in zip(pair.series, pair.rows, strict=True):
-            spaced = space_residuals(pair.times, influence[rows])
-            has_colour = are_coloured[i]
-            root = estimate_spectrum_root(spaced)[0] if has_colour else _make_white_root(spaced)
-            transformed.append(_transform_sensitivities(spaced, columns[rows], root))
-        term = pair.correlation * (transformed[0] @ transformed[1].conj().T).real
+        errors, slopes = ([values[rows] for rows in pair.rows] for values in (influence, columns))
+        colours = [are_coloured[i] for i in pair.series]
+        term = float(errors[0] @ errors[1]) / pair.times.size * (slopes[0].T @ slopes[1])
+        if any(colours):
+            transformed = []
+            for error, slope, has_colour in zip(errors, slopes, colours, strict=True):
+                spaced = space_residuals(pair.times, error)
+                root = estimate_spectrum_root(spaced)[0] if has_colour else _make_white_root(spaced)
+                transformed.append(_transform_sensitivities(spaced, slope, root))
+            term = pair.correlation * (transformed[0] @ transformed[1].conj().T).real
         middle = middle + term + term.T
         double_counted += 2.0 * pair.times.size * pair.correlation**2
     size, vectors = np.linalg.eigh(middle)

@@ -144,6 +144,16 @@ def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -
     assert interval[1] <= 1.5
 
 
+def test_the_posterior_has_the_errors_of_whole_repeats() -> None:
+    found = identify(LINE, pool(draw_repeats(12, 1)), posterior=True)
+    assert found.posterior is not None
+    for sampled in found.posterior.parameters:
+        interval = found[sampled.name].interval95
+        assert interval is not None
+        assert np.ptp(sampled.interval95) == pytest.approx(np.ptp(interval), rel=0.1)
+    assert not any("by the posterior" in text for text in found.warnings)
+
+
 def test_bands_cover_pooled_samples_that_were_kept_for_validation() -> None:
     record = pool(draw_repeats(8, 3))
     [bands] = identify(LINE, record, validation_fraction=0.3).compute_bands()
