@@ -70,7 +70,7 @@ from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import keep_in_bounds
+from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -175,6 +175,7 @@ def find_best_estimate(
     noise = search.apply_noise_model(validation, is_settled=not changes)
     minima = search.collect_minima(recorded)
     marked = mark_changing(search.analysis.estimates, half, limit)
+    marked = mark_poor_intervals(search.problem.free_parameters, marked)
     analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
 

@@ -201,7 +201,7 @@ def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
     return replace(
         estimate,
         stderr=stderr,
-        interval95=(max(lower, estimate.lower), min(upper, estimate.upper)),
+        interval95=(lower, upper),
         reason=f"its error is that of the integration: half the step moves it by {move:.1g}"
         f"{format_unit(estimate.unit)}, and the record has no noise",
     )
