@@ -440,18 +440,25 @@ def indent_lines(lines: Sequence[str], levels: int = 1) -> list[str]:
     return [textwrap.indent(line, "    " * levels) for line in lines]
 
 
+_CALLED_HELPERS = {
+    "lately": ("past",),
+    "past": ("sample",),
+    "clip": ("least", "greatest"),
+    "pchip": ("table",),
+    "table": ("table_interval",),
+}
+"""Helpers that helpers call, each caller before those that it calls; a language may have fewer."""
+
+
 def list_needed_helpers(
     helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
 ) -> list[str]:
     """List the texts of used helpers and those they call, each before its caller."""
     wanted = set(used)
     wanted |= {name.removesuffix("_on_grid") for name in wanted}
-    if "lately" in wanted:
-        wanted.add("past")
-    if "past" in wanted:
-        wanted.add("sample")
-    if "clip" in wanted:
-        wanted |= {"least", "greatest"}
+    for caller, called in _CALLED_HELPERS.items():
+        if caller in wanted:
+            wanted |= set(called)
     variants = _find_variants(identified)
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 

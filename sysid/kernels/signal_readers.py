@@ -41,7 +41,7 @@ class SignalReaders:
                 continue
             history = states.get_history(past[0])
             if one_step or cubic:
-                self._add_reader(past, places, DirectReader(lanes, history, delay, cubic))
+                self._add_reader(past, places, DirectReader(lanes, history, delay, places, cubic))
                 continue
             for chain in _group_state_places(places):
                 reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))

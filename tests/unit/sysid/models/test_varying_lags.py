@@ -103,6 +103,12 @@ def test_what_a_varying_lag_may_not_read_is_named(equation: str, part: str) -> N
         piped(equations={"x": equation}, let={"late": "u(t - V/q)", "state": "2*x"})
 
 
+def test_the_column_of_a_varying_lag_of_a_name_is_that_of_the_name() -> None:
+    with pytest.raises(InvalidModel) as caught:
+        piped(equations={"x": "-x/T + late(t - T)"}, let={"late": "u(t - V/q)"})
+    assert [fault.column for fault in caught.value.faults] == [8]
+
+
 def test_a_polynomial_a_loop_and_a_transfer_function_need_constant_lags() -> None:
     polynomial = {
         "name": "p",
