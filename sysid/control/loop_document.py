@@ -221,6 +221,9 @@ class LoopDocumentBuilder:
             "equations": equations,
             "outputs": {k: {"expression": e, "unit": unit} for k, (e, unit) in outputs.items()},
             "initial": initial,
+            "history": {
+                one.state: format_expression(one.expression, self.clock) for one in model.histories
+            },
             "solver": dict(model.document["solver"]) | self._choose_substeps(),
         }
 
@@ -285,8 +288,7 @@ def choose_free_name(name: str, taken: set[str]) -> str:
 
 def _to_declaration(parameter: Parameter) -> dict[str, Any]:
     fields = {
-        name: getattr(parameter, name)
-        for name in ("lower", "upper", "unit", "scale", "fixed")
+        name: getattr(parameter, name) for name in ("lower", "upper", "unit", "scale", "fixed")
     }
     return {name: value for name, value in fields.items() if value is not None}
 

@@ -148,8 +148,17 @@ class GeneratedProgram:
         return self.prefix + self.start_names[model.states[state].name]
 
     def write_history(self, state: str) -> str:
-        """Write the value of a state before the start."""
-        zero = self.identified.model.solver.history == "zero"
+        """Write the value of a state before the start.
+
+        Of a history function only the last step may be needed, by a cubic through four samples.
+        """
+        model = self.identified.model
+        history = model.find_history(state)
+        is_read = model.solver.interpolation == "cubic" and not reads_cubics(model)
+        if history is not None and is_read:
+            scope = HistoryScope(self, f"(-{self.step_variable})")
+            return write_expression(history, self.language, scope)
+        zero = model.solver.history == "zero"
         return "0.0" if zero else f"{self.array_names[state]}[0]"
 
     def list_arrays(self, state: str) -> tuple[str, ...]:
@@ -301,6 +310,24 @@ class LoopScope(ExportScope):
             return self._write_present_state(past.name)
         if self.stage == "recursion":
             return self._write_earlier_state(past)
+        history = program.identified.model.find_history(past.name)
+        value = self._write_delayed_state(past)
+        if history is None or past.delay is None:
+            return value
+        delay, position = program.name_delay(past.delay), self._write_state_position(past.name)
+        time = f"(({position} - {delay})*{program.step_variable})"
+        before = write_expression(history, program.language, HistoryScope(program, time))
+        return program.language.write_choice(f"{position} < {delay}", before, value)
+
+    def _write_state_position(self, name: str) -> str:
+        """Write the place in steps from which a delay of a state counts."""
+        if self.stage == "slope":
+            return "step + part"
+        is_later = self.stage == "update" and self._is_updated(name)
+        return "step + 1" if is_later else self.program.loop_variable
+
+    def _write_delayed_state(self, past: PastValue) -> str:
+        program = self.program
         every, before = program.list_arrays(past.name), program.write_history(past.name)
         delay = self._write_state_delay(past)
         if self.stage == "slope":
@@ -374,6 +401,17 @@ class StartScope(DelayScope):
     def write_past_value(self, past: PastValue) -> str:
         """Write the first value of an input."""
         return f"{self.program.input_names[past.name]}[0]"
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryScope(DelayScope):
+    """Scope of a history function: parameters, and a time before the start."""
+
+    time: str
+
+    def write_symbol(self, symbol: Symbol) -> str:
+        """Write the time, or a parameter."""
+        return self.time if symbol.kind == "time" else DelayScope.write_symbol(self, symbol)
 
 
 def write_delay_steps(

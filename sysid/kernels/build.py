@@ -68,6 +68,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
         [parameter.name for parameter in model.parameters],
         model.equations,
         starts,
+        model.histories,
         model.order,
         model.memory,
         replace(model.solver, step=None),

@@ -83,6 +83,12 @@ class SignalReaders:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
 
+    def get_state_delay(self, past: PastValue) -> IrValue:
+        """Return the delay of a delayed state, in integration steps, however long."""
+        if past.delay is None:
+            raise AssertionError(f"{past.name} is read without delay")
+        return self._delays.to_steps(past.delay)
+
     def read_varying_input(
         self, past: PastValue, halves: int, time_step: TimeStep, scope: Environment
     ) -> IrValue:

@@ -1,8 +1,9 @@
 """Ties between parameters, such as ``b = 2*a``; substituted into the equations before compiling.
 
-A tie is an expression of other parameters, the model's constants and its intermediate names, in
-the language of the equations. Such a name may not read signals. The other parameters may be free, fixed or tied themselves, as long as the ties are not
-circular. A resolved tie contains only parameters that are not tied.
+A tie is an expression of other parameters, constants and intermediate names, in the language of
+the equations. Such a name may not read signals. The other parameters may be free, fixed or tied
+themselves, as long as the ties are not circular. A resolved tie contains only parameters that are
+not tied.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from sysid.models.documents import DocumentReader
 from sysid.models.intermediates import read_intermediates
 from sysid.models.model import DerivedInitial, Model
 from sysid.models.parameters import Parameter
+from sysid.models.sections import get_interval
 
 Ties = Mapping[str, Expression]
 """Expression of each tied parameter, in free and fixed ones."""
@@ -67,6 +69,10 @@ def apply_ties(model: Model, ties: Ties) -> Model:
             else start
             for start in model.initial
         ),
+        histories=tuple(
+            replace(history, expression=_substitute_ties(history.expression, ties))
+            for history in model.histories
+        ),
     )
 
 
@@ -91,8 +97,12 @@ def _build_scope(model: Model, parameters: Sequence[Parameter]) -> Scope:
         return scope
     states, inputs = (tuple(one.name for one in group) for group in (model.states, model.inputs))
     form: EquationForm = "differential" if model.form == "differential" else "difference"
-    whole = replace(scope, form=form, states=states, inputs=inputs)
-    return replace(scope, intermediates=read_intermediates(DocumentReader(), let, whole))
+    declared = {p.name: get_interval(p) for p in model.parameters}  # lags are checked in these
+    whole = replace(scope, form=form, states=states, inputs=inputs, parameters=declared)
+    reader = DocumentReader()
+    intermediates = read_intermediates(reader, let, whole)
+    reader.raise_faults()
+    return replace(scope, intermediates=intermediates)
 
 
 def _parse_tie(scope: Scope, name: str, text: str) -> Expression:
