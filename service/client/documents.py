@@ -217,6 +217,8 @@ class CheckDocument(TypedDict):
     """what is declared in a valid document but used nowhere"""
     normal_form: NotRequired[ModelDocumentDocument | None]
     """document with every default; null if it has faults"""
+    equations: NotRequired[list[EquationDocument]]
+    """equations, intermediate names, outputs; empty if it has faults"""
 
 
 class CoefficientDocument(TypedDict):
@@ -480,6 +482,15 @@ class DriftDocument(TypedDict):
     """magnitude of z beyond which the estimate is flagged as drifted"""
     drifted: bool
     """whether |z| exceeds the limit"""
+
+
+class EquationDocument(TypedDict):
+    """An equation as a reader writes it."""
+
+    text: str
+    """the equation as text, such as `dx/dt = (u - x)/T`"""
+    mathml: str
+    """the same as a `<math>` element, which a browser shows"""
 
 
 class ErrorReferenceDocument(TypedDict):
@@ -1067,6 +1078,8 @@ class ModelDocument(TypedDict):
     """tags of users"""
     document: NotRequired[ModelDocumentDocument | None]
     """document of the model; null in lists"""
+    equations: NotRequired[list[EquationDocument]]
+    """equations, intermediate names, outputs; empty in lists"""
 
 
 class ModelPageDocument(TypedDict):

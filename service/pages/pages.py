@@ -28,6 +28,7 @@ from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
 from service.pages.render import render_template
+from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
 from service.pages.views import (
     JobView,
@@ -330,7 +331,7 @@ def load_full_run(session: Session, stored: StoredRun) -> RunView:
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
         "posterior": posterior_height(len((result.get("posterior") or {}).get("parameters", ()))),
     }
-    return to_run_view(run, stored.rms_unit(session), heights)
+    return to_run_view(run, stored.rms_unit(session), heights, to_model_view(model))
 
 
 def _residuals_height(result: Mapping[str, Any]) -> int:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import lagid
-from sysid.models.catalogue.load import catalogue, copy_catalogue_document
+from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
+from sysid.models.equation_display import format_equations
 from tests.repository import ROOT
 
 Document = Mapping[str, Any]
@@ -149,14 +150,8 @@ def _describe_catalogue() -> Iterator[str]:
         yield f"\n## {name}: {document['title']}\n\n{document.get('description', '').strip()}\n"
         if source := document.get("source"):
             yield f"\nSource: {source}\n"
-        if equations := document.get("equations"):
-            sides = "differential" in document["form"]
-            lines = [
-                f"{f'd{state}/dt' if sides else f'{state}(k)'} = {text}"
-                for state, text in equations.items()
-            ]
-            lines += [f"{name} = {text}" for name, text in document["outputs"].items()]
-            yield "\n```text\n" + "\n".join(lines) + "\n```\n"
+        for equation in format_equations(load_model(name)):
+            yield f'\n<div class="equation">{equation.mathml}</div>\n'
         if parameters := document.get("parameters"):
             yield "\n| parameter | unit | from | to | meaning |\n|---|---|--:|--:|---|\n"
             for parameter, given in parameters.items():

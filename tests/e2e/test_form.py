@@ -177,7 +177,8 @@ def test_a_part_of_the_recording_is_chosen_in_its_plot(own_site: Site, page: Pag
     plot = page.locator("[data-preview]")
     expect(plot.locator(".scatterlayer .trace")).to_have_count(2)
     assert page.locator("table.jobs tbody tr").count() == 5  # the form's model filters no list
-    expect(page.locator("#about-model")).to_contain_text("dx/dt = (K·u(t − L) − x)/T")
+    math = page.get_by_role("math", name="dx/dt = (K*u(t - L) - x)/T")
+    expect(math.locator("mfrac")).to_have_count(2)
     expect(page.get_by_label("upper of L")).to_have_attribute("placeholder", re.compile(r"^\d"))
     expect(page.locator("#parameters tr").first).to_contain_text("static gain")
     plot.evaluate("plot => Plotly.relayout(plot, {'xaxis.range[0]': 6, 'xaxis.range[1]': 12})")

@@ -142,7 +142,7 @@ async function showListedModel(changes) {
   field('equations').value = text;
   field('equations').readOnly = true;
   document.getElementById('yaml').open = false;
-  applyModel(model.document, changes);
+  applyModel(model.document, model.equations, changes);
   showVerdict({ valid: true });
 }
 
@@ -160,7 +160,7 @@ async function checkModel(changes) {
     ask(address('/v1/models:check'), { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
   if (!result) return null;
   showVerdict(result);
-  if (result.valid) applyModel(result.normal_form, changes);
+  if (result.valid) applyModel(result.normal_form, result.equations, changes);
   return result.valid;
 }
 
@@ -178,11 +178,11 @@ function showVerdict(result) {
   place.replaceChildren(makeElement('span', ...verdict), ...(list.children.length ? [list] : []));
 }
 
-function applyModel(model, changes) {
+function applyModel(model, equations, changes) {
   const same = JSON.stringify(state.model) === JSON.stringify(model);
   state.model = model;
   if (same && !changes) return;
-  describeModel(model);
+  describeModel(model, equations);
   fillTable(model, changes ?? readOverrides());
   mapChannels();
 }
