@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import lagid
+from service.pages.guides import list_notebooks, make_notebook
 from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
 from sysid.models.equation_display import format_equations
 from tests.repository import ROOT
@@ -27,7 +28,7 @@ LIBRARY = ("identify", "simulate", "read_recording", "load_model", "catalogue")
 
 
 def write_reference(folder: Path) -> None:
-    """Write all pages into a folder, and those of the top level of the repository."""
+    """Write all pages into a folder, those of the top level of the repository, and notebooks."""
     folder.mkdir(exist_ok=True)
     contract = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))
     pages = {
@@ -40,6 +41,10 @@ def write_reference(folder: Path) -> None:
     pages |= {name.lower(): _copy_page(name) for name in PROJECT}
     for name, text in pages.items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
+    for path in list_notebooks():
+        target = folder / "notebooks" / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(make_notebook(path) or "", encoding="utf-8")
 
 
 def _copy_page(name: str) -> str:

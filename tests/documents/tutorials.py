@@ -145,13 +145,18 @@ def _list_commands(source: str) -> Iterator[str]:
     yield from re.findall(r"^\$ (?:.*\\\n)*.*\n", source, re.M)
 
 
+def find_free_port() -> int:
+    """Find a port for a service of a page."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
 class _Shell:
     """Runs commands of a page; what they start behind ``&`` ends with the page."""
 
     def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
+        self._port = find_free_port()
         self._url = f"http://127.0.0.1:{self._port}"
         self._before = dict(os.environ)
         os.environ["LAGID_URL"] = self._url
