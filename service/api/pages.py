@@ -25,6 +25,7 @@ from service.pages import render as assets
 from service.pages.bounds import propose_bounds
 from service.pages.figures import ComparisonChoice, load_comparison_figure
 from service.pages.simulate import simulate_page as simulate
+from sysid.trends.trend import OutlierRule
 
 router = APIRouter()
 
@@ -87,10 +88,13 @@ def job_page(
     session: ReadSession,
     cursor: Cursor = None,
     cell: CellFilter = None,
+    outliers: OutlierRule = "exclude",
 ) -> Response:
     """Show a job with its runs, or the grid of its cells and the runs of the chosen cell."""
     url = str(request.base_url)
-    return HtmlPage(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
+    return HtmlPage(
+        pages.job_page(session, job_id, url, cursor=cursor, cell=cell or [], outliers=outliers)
+    )
 
 
 @router.get("/runs/{run_id}", **HIDDEN)

@@ -1266,7 +1266,7 @@ class PointDocument(TypedDict):
     status: str
     """status of the estimate"""
     is_used: bool
-    """whether the laws are fitted to it"""
+    """whether the laws are fitted to it; an outlier leaves them by default"""
     studentised: NotRequired[float | None]
     """deleted residual"""
     p_value: NotRequired[float | None]
@@ -1898,6 +1898,8 @@ class TrendDocument(TypedDict):
     """identifier of the job"""
     x: str
     """name of the label"""
+    outliers: Literal["exclude", "include"]
+    """whether the laws leave outliers out"""
     reference: NotRequired[str | None]
     """run that the batch is compared with"""
     reference_x: NotRequired[float | None]

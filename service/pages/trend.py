@@ -20,6 +20,7 @@ from service.trends.text import (
 )
 from service.trends.trend import compute_trend, has_trend
 from sysid.core.text import format_number
+from sysid.trends.trend import OutlierRule
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,8 @@ class TrendView:
     """
 
     x: str
+    outliers: OutlierRule
+    has_outliers: bool
     headings: Sequence[str]
     rows: Sequence[PlaceRow]
     laws: Sequence[tuple[str, str, str, bool]]
@@ -44,12 +47,12 @@ class TrendView:
     height: int
 
 
-def load_trend(session: Session, job: Job) -> TrendOut | None:
+def load_trend(session: Session, job: Job, outliers: OutlierRule = "exclude") -> TrendOut | None:
     """Load the trend of a job; None if it requests none, or has too many runs for one."""
     if not has_trend(job):
         return None
     try:
-        return compute_trend(session, job.id)
+        return compute_trend(session, job.id, outliers)
     except InvalidRequest:
         return None
 
@@ -82,6 +85,8 @@ def to_trend_view(trend: TrendOut) -> TrendView:
     tables = build_tables(document, TYPESET)
     return TrendView(
         x=trend.x,
+        outliers=trend.outliers,
+        has_outliers=any(p.is_outlier for quantity in trend.quantities for p in quantity.points),
         headings=tables.headings,
         rows=tables.rows,
         laws=[

@@ -168,14 +168,11 @@ def _format_apply(node: Apply) -> str:
             return _format_cases(node)
         case Apply("sqrt", (argument,)):
             return f"<msqrt>{_format(argument)}</msqrt>"
-        case Apply(("abs" | "floor") as name, (argument,)):
-            opening, closing = _FENCES[name]
-            fence = '<mo stretchy="true" form="{}">{}</mo>'
-            return _group(
-                fence.format("prefix", opening)
-                + _format(argument)
-                + fence.format("postfix", closing)
-            )
+        case Apply(("abs" | "floor") as fence, (argument,)):
+            opening, closing = _FENCES[fence]
+            bar = '<mo stretchy="true" form="{}">{}</mo>'
+            ends = bar.format("prefix", opening), bar.format("postfix", closing)
+            return _group(ends[0] + _format(argument) + ends[1])
     name = _FUNCTION_NAMES.get(node.name, node.name)
     head = f"<mi>{name}</mi>" if node.name in FUNCTIONS else format_name(node.name)
     return f"{head}<mo>\u2061</mo>{_fence(_join(node.arguments))}"
