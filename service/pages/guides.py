@@ -99,6 +99,7 @@ def _render(text: str, path: str) -> str:
             token.attrs["id"] = _name_anchor(content.content)
         _keep_inside(token.children or [], path)
     html = str(parser.renderer.render(tokens, parser.options, {}))
+    html = html.replace("<pre>", '<pre tabindex="0">')  # wide output is scrolled with keys, too
     return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)  # an empty heading is none
 
 
