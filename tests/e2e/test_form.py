@@ -190,7 +190,7 @@ def test_a_part_of_the_recording_is_chosen_in_its_plot_and_its_mean_subtracted(
     page.get_by_role("button", name="Identify").click()
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text("need more than the start")
     page.get_by_label("to [s]").fill("15")
-    page.get_by_label("subtract", exact=True).select_option("the mean")
+    page.get_by_role("combobox", name="subtract").select_option("the mean")
     page.get_by_role("group", name="Channels from which").get_by_label("P1").uncheck()
     page.get_by_label("validation data").select_option("recording tube 40 m")
     page.get_by_role("button", name="Identify").click()

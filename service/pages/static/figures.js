@@ -68,10 +68,10 @@ function offerImages(plot) {
   }
 }
 
-/** Draw every plot in light colours, fit all to a sheet, and print. */
+/** Draw every plot in light colours for the width of a sheet, and print. */
 async function printAll() {
   document.body.classList.add('printing');
-  await Promise.all(listPlots().filter((plot) => dark.matches || !seen.has(plot)).map((plot) => {
+  await Promise.all(listPlots().map((plot) => {
     seen.add(plot);
     return draw(plot);
   }));
@@ -169,8 +169,7 @@ addEventListener('keydown', (event) => {
 });
 addEventListener('afterprint', () => {
   document.body.classList.remove('printing');
-  fitPlots();
-  if (dark.matches) redraw();
+  redraw().then(fitPlots);
 });
 
 export function start() {
