@@ -8,6 +8,7 @@ from fastapi.responses import (
     HTMLResponse,
     JSONResponse,
     PlainTextResponse,
+    RedirectResponse,
     Response,
 )
 
@@ -17,6 +18,7 @@ from service.api.html import HtmlPage
 from service.api.items import DatasetFormDep, JobFormDep, parse_form
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
+from service.core.root_path import to_address
 from service.core.states import JobState
 from service.pages import guides, pages
 from service.pages import render as assets
@@ -46,6 +48,8 @@ def guide_page(path: str) -> Response:
     """Show a page of the documentation, or one of its files."""
     if file := guides.find_file(path):
         return FileResponse(file, headers={"Cache-Control": "no-cache"})
+    if guides.is_folder(path):  # its links are relative
+        return RedirectResponse(to_address(f"/guides/{path}/"))
     return HtmlPage(pages.guide_page(path))
 
 
