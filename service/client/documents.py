@@ -1820,6 +1820,21 @@ class StopInDocument(TypedDict):
     """further confirmations of the best individual; null: never stop for them"""
 
 
+class SubtractedDocument(TypedDict):
+    """What `detrend` subtracted from a channel: `value` + `slope`·(t − `time`)."""
+
+    channel: str
+    """name of the channel at that step"""
+    unit: str
+    """unit of the value; `slope` is in this unit per second"""
+    time: float
+    """time of the first sample, s"""
+    value: float
+    """value at that time: the mean, or the start of the line"""
+    slope: float
+    """slope of the line; 0 for a mean"""
+
+
 class SummaryDocument(TypedDict):
     """Aggregates over the runs of a job."""
 

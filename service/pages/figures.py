@@ -89,7 +89,7 @@ def load_run_figure(
         _check_experiment(choice.experiment, len(tested.experiments))
         return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
     if name == "posterior":
-        return plot_posterior(*read_corner_parameters(stored))
+        return plot_posterior(*read_corner_parameters(stored), is_narrow=choice.columns == 1)
     data = read_run_figure_data(session, stored)
     if name == "history":
         return plotly.plot_history(data, choice.abscissa)

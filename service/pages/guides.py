@@ -137,6 +137,8 @@ def _render(text: str, path: str) -> str:
             token.attrs["id"] = _name_anchor(content.content)
         _keep_inside(token.children or [], path)
     html = str(parser.renderer.render(tokens, parser.options, {}))
+    # What is wider than the page is scrolled with keys, too.
+    html = re.sub("<(pre|table)>", r'<\1 tabindex="0">', html)
     return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)  # an empty heading is none
 
 

@@ -28,7 +28,7 @@ class TrendView:
     """View of a trend; `laws` are (text, AIC, Birge ratio, whether chosen).
 
     The form suggests to accept the run at the reference's label under its name. In a batch without
-    a reference it suggests the middle run, which is the nearest to all others.
+    a reference it suggests the middle run without an outlier, which is the nearest to all others.
     """
 
     x: str
@@ -106,6 +106,8 @@ def to_trend_view(trend: TrendOut) -> TrendView:
 
 def _suggest_run(trend: TrendOut) -> str:
     runs = {point.x: point.runs[0] for point in trend.labels if point.runs}
-    middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
+    outliers = {p.x for quantity in trend.quantities for p in quantity.points if p.is_outlier}
+    usual = [run for x, run in runs.items() if x not in outliers]
+    middle = usual[len(usual) // 2 : len(usual) // 2 + 1]
     at_reference = None if trend.reference_x is None else runs.get(trend.reference_x)
     return at_reference or next(iter(middle), "")

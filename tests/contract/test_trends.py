@@ -106,6 +106,8 @@ def test_an_outlier_moves_neither_its_own_law_nor_what_a_reference_expects(place
     for text, query in zip(pages, ("", "?outliers=include"), strict=True):
         assert f'/figures/trend{query}" style' in text
         assert f'/jobs/{first}{query}#trend" aria-current="true"' in text
+        assert f'<option value="{runs[5.0]}">' in text
+        assert f'<option value="{runs[4.0]}" selected>' in text
     job, _ = batch(place, None, runs[2.0], lengths)
     assert drifts(trend(place, job), "trend")["L", 5.0].expected == pytest.approx(0.5)
 

@@ -179,7 +179,7 @@ def _describe_model(name: str) -> Iterator[str]:
     if source := document.get("source"):
         yield f"\nSource: {source}\n"
     for equation in format_equations(load_model(name)):
-        yield f'\n<div class="equation">{equation.mathml}</div>\n'
+        yield f'\n<div class="equation" tabindex="0">{equation.mathml}</div>\n'
     if HAS_BROWSER:
         yield f"\n![Response of {name}](pictures/{name}.svg)\n"
         yield f"\n*With {describe_case(name)}.*\n"

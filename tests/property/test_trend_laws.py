@@ -209,6 +209,7 @@ def test_the_laws_are_those_of_the_points_without_the_outliers() -> None:
     assert (found.band, found.predictions) == (alone.band, alone.predictions)
     assert [found.influences[i] for i in rest] == list(alone.influences)
     assert [i for i, one in enumerate(found.influences) if one.is_outlier] == [2, 7]
+    assert fit_trend(x[1:], y[1:], stderr[1:]).excluded == (1,)  # one of nine, the worse
     counted = fit_trend(x, y, stderr, outliers="include")
     assert counted.excluded == ()
     assert counted.best_law is not None
