@@ -12,6 +12,7 @@ from service.pages import render as assets
 from service.pages import report
 from service.pages.figures import (
     FigureChoice,
+    TrendChoice,
     load_dataset_figure,
     load_noise_figure,
     load_run_figure,
@@ -47,7 +48,9 @@ def draw_summary_figure(job_id: str, session: ReadSession, choice: FigureQuery) 
 
 
 @router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], **FIGURE)
-def draw_trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
+def draw_trend_figure(
+    job_id: str, session: ReadSession, choice: Annotated[TrendChoice, Query()]
+) -> Response:
     """Draw estimates over a batch's label as Plotly JSON, or export the numbers as CSV."""
     return figure_response(load_trend_figure(session, job_id, choice), "trend", choice)
 

@@ -21,6 +21,7 @@ from service.sweeps import summary, table
 from service.sweeps.schemas import SummaryOut
 from service.trends import trend
 from service.trends.schemas import TrendOut
+from sysid.trends.trend import OutlierRule
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
 
@@ -159,9 +160,15 @@ def read_summary(
 
 
 @router.get("/{job_id}/trend")
-def read_trend(job_id: str, session: ReadSession) -> TrendOut:
+def read_trend(
+    job_id: str,
+    session: ReadSession,
+    outliers: Annotated[
+        OutlierRule, Query(description="whether the laws leave outliers out or count them")
+    ] = "exclude",
+) -> TrendOut:
     """Fit the estimates over a label: law, band, predictions, outliers and drift."""
-    return trend.compute_trend(session, job_id)
+    return trend.compute_trend(session, job_id, outliers)
 
 
 def set_location(job: JobOut, response: Response) -> JobOut:

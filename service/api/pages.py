@@ -25,6 +25,7 @@ from service.pages import render as assets
 from service.pages.bounds import propose_bounds
 from service.pages.figures import ComparisonChoice, load_comparison_figure
 from service.pages.simulate import simulate_page as simulate
+from sysid.trends.trend import OutlierRule
 
 router = APIRouter()
 
@@ -44,9 +45,11 @@ def reference_page() -> Response:
 
 @router.get("/guides/{path:path}", **HIDDEN)
 def guide_page(path: str) -> Response:
-    """Show a page of the documentation, or one of its files."""
+    """Show a page of the documentation, one of its files, or a page as a notebook."""
     if file := guides.find_file(path):
         return FileResponse(file, headers={"Cache-Control": "no-cache"})
+    if notebook := guides.make_notebook(path):
+        return Response(notebook, media_type="application/x-ipynb+json")
     if guides.is_folder(path):  # its links are relative
         return RedirectResponse(to_address(f"/guides/{path}/"))
     return HtmlPage(pages.guide_page(path))
@@ -85,10 +88,13 @@ def job_page(
     session: ReadSession,
     cursor: Cursor = None,
     cell: CellFilter = None,
+    outliers: OutlierRule = "exclude",
 ) -> Response:
     """Show a job with its runs, or the grid of its cells and the runs of the chosen cell."""
     url = str(request.base_url)
-    return HtmlPage(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
+    return HtmlPage(
+        pages.job_page(session, job_id, url, cursor=cursor, cell=cell or [], outliers=outliers)
+    )
 
 
 @router.get("/runs/{run_id}", **HIDDEN)

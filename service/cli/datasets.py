@@ -54,6 +54,7 @@ from service.cli.items import (
     read_filters,
 )
 from service.client.calls import DEFAULT_URL
+from service.core.text import format_subtracted
 from sysid.core.errors import suggest_name
 from sysid.core.text import append_unit
 
@@ -316,6 +317,8 @@ def _print_dataset(stored: Mapping[str, Any], as_json: bool) -> None:
         f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
         f"{started}{history}channels {_format_channels(stored)}"
     )
+    for trend in stored["details"].get("subtracted") or ():
+        print_note(f"subtracted from {format_subtracted(trend)}")
     for warning in stored["warnings"]:
         print_note(warning)
 

@@ -95,6 +95,9 @@ Accept = Annotated[
 AcceptRun = Annotated[
     str | None, typer.Option(metavar="X", help="Value of the label of the run to accept.")
 ]
+KeepOutliers = Annotated[
+    bool, typer.Option("--keep-outliers", help="Let the laws of the trend count outliers.")
+]
 TrendFile = Annotated[
     Path | None,
     typer.Option(
@@ -122,6 +125,7 @@ def reidentify(
     accept: Accept = None,
     accept_run: AcceptRun = None,
     output: TrendFile = None,
+    keep_outliers: KeepOutliers = False,
     force: Force = False,
     url: Url = DEFAULT_URL,
     key: Key = None,
@@ -153,7 +157,7 @@ def reidentify(
             (print_json if as_json else print_job)(job)
             return
         ended = follow_job(client, job["id"], quiet=as_json)
-        _print_outcome(client, ended, output, as_json=as_json)
+        _print_outcome(client, ended, output, keep_outliers=keep_outliers, as_json=as_json)
         if accept is not None:
             _accept_run(client, ended, accept, label, chosen, quiet=as_json)
 
@@ -177,9 +181,14 @@ def _field_origins(experiments: list[str]) -> FieldOrigins:
 
 
 def _print_outcome(
-    client: "Client", job: Mapping[str, Any], output: Path | None, *, as_json: bool
+    client: "Client",
+    job: Mapping[str, Any],
+    output: Path | None,
+    *,
+    keep_outliers: bool,
+    as_json: bool,
 ) -> None:
-    trend = client.trend(job["id"])
+    trend = client.trend(job["id"], "include" if keep_outliers else None)
     if as_json:
         print_json(trend)
     else:

@@ -392,9 +392,12 @@ class Client:
         """Fetch quantiles over the values of axes or labels, by default over all axes but seeds."""
         return self._fetch(calls.SUMMARY(job, by=by))
 
-    def trend(self, job: str) -> "documents.TrendDocument":
-        """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift."""
-        return self._fetch(calls.TREND(job))
+    def trend(self, job: str, outliers: str | None = None) -> "documents.TrendDocument":
+        """Fetch the trend of a batch over its label: law, band, predictions, outliers, drift.
+
+        Its laws leave outliers out, or count them with ``outliers="include"``.
+        """
+        return self._fetch(calls.TREND(job, outliers=outliers))
 
     def summary_figure(self, job: str, **options: Any) -> "documents.FigureDocument":
         """Draw errors against the noise, as Plotly JSON; `options` are those of the interface."""

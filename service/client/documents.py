@@ -217,6 +217,8 @@ class CheckDocument(TypedDict):
     """what is declared in a valid document but used nowhere"""
     normal_form: NotRequired[ModelDocumentDocument | None]
     """document with every default; null if it has faults"""
+    equations: NotRequired[list[EquationDocument]]
+    """equations, intermediate names, outputs; empty if it has faults"""
 
 
 class CoefficientDocument(TypedDict):
@@ -480,6 +482,15 @@ class DriftDocument(TypedDict):
     """magnitude of z beyond which the estimate is flagged as drifted"""
     drifted: bool
     """whether |z| exceeds the limit"""
+
+
+class EquationDocument(TypedDict):
+    """An equation as a reader writes it."""
+
+    text: str
+    """the equation as text, such as `dx/dt = (u - x)/T`"""
+    mathml: str
+    """the same as a `<math>` element, which a browser shows"""
 
 
 class ErrorReferenceDocument(TypedDict):
@@ -1067,6 +1078,8 @@ class ModelDocument(TypedDict):
     """tags of users"""
     document: NotRequired[ModelDocumentDocument | None]
     """document of the model; null in lists"""
+    equations: NotRequired[list[EquationDocument]]
+    """equations, intermediate names, outputs; empty in lists"""
 
 
 class ModelPageDocument(TypedDict):
@@ -1253,7 +1266,7 @@ class PointDocument(TypedDict):
     status: str
     """status of the estimate"""
     is_used: bool
-    """whether the laws are fitted to it"""
+    """whether the laws are fitted to it; an outlier leaves them by default"""
     studentised: NotRequired[float | None]
     """deleted residual"""
     p_value: NotRequired[float | None]
@@ -1807,6 +1820,21 @@ class StopInDocument(TypedDict):
     """further confirmations of the best individual; null: never stop for them"""
 
 
+class SubtractedDocument(TypedDict):
+    """What `detrend` subtracted from a channel: `value` + `slope`·(t − `time`)."""
+
+    channel: str
+    """name of the channel at that step"""
+    unit: str
+    """unit of the value; `slope` is in this unit per second"""
+    time: float
+    """time of the first sample, s"""
+    value: float
+    """value at that time: the mean, or the start of the line"""
+    slope: float
+    """slope of the line; 0 for a mean"""
+
+
 class SummaryDocument(TypedDict):
     """Aggregates over the runs of a job."""
 
@@ -1885,6 +1913,8 @@ class TrendDocument(TypedDict):
     """identifier of the job"""
     x: str
     """name of the label"""
+    outliers: Literal["exclude", "include"]
+    """whether the laws leave outliers out"""
     reference: NotRequired[str | None]
     """run that the batch is compared with"""
     reference_x: NotRequired[float | None]

@@ -8,8 +8,9 @@ import math
 import re
 from collections.abc import Mapping
 from datetime import datetime
+from typing import Any
 
-from sysid.core.text import DASH, format_number, format_unit
+from sysid.core.text import DASH, format_number, format_unit, plain_unit
 from sysid.core.units import is_known_unit
 
 _THIN_SPACE = "\u202f"  # narrow no-break space: groups digits and joins a number to its unit
@@ -66,6 +67,28 @@ def format_labels(labels: Mapping[str, object]) -> str:
     return ", ".join(f"{name} = {format_value(value)}" for name, value in labels.items())
 
 
+def format_subtracted(trend: Mapping[str, Any]) -> str:
+    """Format what was subtracted from a channel: its mean, or its straight line.
+
+    Parameters
+    ----------
+    trend : mapping
+        An entry of ``details.subtracted`` of a dataset.
+
+    Examples
+    --------
+    >>> format_subtracted({"channel": "y", "unit": "V", "time": 1.0, "value": 2.5, "slope": -0.2})
+    'y: 2.5 V - 0.2 V/s*(t - 1 s)'
+    """
+    unit, slope = trend["unit"], trend["slope"]
+    text = f"{trend['channel']}: {trend['value']:.5g}{plain_unit(unit)}"
+    if slope == 0:
+        return text
+    per_second = plain_unit("1/s" if unit in ("1", "") else f"{unit}/s")
+    line = f"{abs(slope):.5g}{per_second}*(t - {trend['time']:g} s)"
+    return f"{text} {'-' if slope < 0 else '+'} {line}"
+
+
 def name_label(name: str) -> str:
     """Name a label with its unit, if its name ends with one.
 
@@ -97,6 +120,7 @@ TEMPLATE_FILTERS = {
     "duration": format_duration,
     "age": format_age,
     "label_name": name_label,
+    "subtracted": format_subtracted,
 }
 
 

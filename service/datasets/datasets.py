@@ -151,11 +151,9 @@ def derive_dataset(
         existing = DatasetRepository(session).find_by_source(_hash_derivation(parent, body))
     if existing is not None:
         return StoredDataset(existing, is_new=False)
-    from sysid.data.derivations import (
-        derive_recording as derived,  # brings SciPy's signal processing
-    )
+    from sysid.data.derivations import apply_steps  # brings SciPy's signal processing
 
-    recording = derived(load_recording(store, parent.sha256), body.steps)
+    recording, subtracted = apply_steps(load_recording(store, parent.sha256), body.steps)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
         database,
@@ -164,7 +162,12 @@ def derive_dataset(
         name=body.name or f"{parent.name} ({steps})",
         kind="derive",
         key=_hash_derivation(parent, body),
-        details={"steps": body.steps, "warnings": [], "known_before": _measure_history(recording)},
+        details={
+            "steps": body.steps,
+            "subtracted": [trend._asdict() for trend in subtracted],
+            "warnings": [],
+            "known_before": _measure_history(recording),
+        },
         parents=[parent.id],
     )
 

@@ -159,6 +159,16 @@ class SegmentOut(Answer):
     labels: Labels = Field(description="values of the label columns")
 
 
+class SubtractedOut(Answer):
+    """What `detrend` subtracted from a channel: `value` + `slope`·(t − `time`)."""
+
+    channel: str = Field(description="name of the channel at that step")
+    unit: str = Field(description="unit of the value; `slope` is in this unit per second")
+    time: float = Field(description="time of the first sample, s")
+    value: float = Field(description="value at that time: the mean, or the start of the line")
+    slope: float = Field(description="slope of the line; 0 for a mean")
+
+
 class DatasetDetailsOut(Answer):
     """How a dataset was made: the file, the simulation, or the steps."""
 
@@ -166,6 +176,9 @@ class DatasetDetailsOut(Answer):
 
     source: Any = Field(default=None, description="file that was read, and how")
     steps: list[dict[str, Any]] | None = Field(default=None, description="steps of a derivation")
+    subtracted: list[SubtractedOut] | None = Field(
+        default=None, description="what the steps `detrend` subtracted, in their order"
+    )
     known_before: float | None = Field(
         default=None, description="recorded time before the start, s"
     )

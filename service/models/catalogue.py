@@ -5,9 +5,10 @@ from typing import Any
 
 from service.core.errors import to_field_errors
 from service.core.wire import FaultOut
-from service.models.schemas import CheckOut, ModelOut
+from service.models.schemas import CheckOut, EquationOut, ModelOut
 from sysid.core.errors import SysidError
 from sysid.models.catalogue import load
+from sysid.models.equation_display import format_equations
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.models.unused import find_unused_names
@@ -31,7 +32,13 @@ def check_model(document: Any) -> CheckOut:
     unused = [
         FaultOut(pointer=fault.pointer, detail=fault.detail) for fault in find_unused_names(model)
     ]
-    return CheckOut(valid=True, errors=[], warnings=unused, normal_form=dict(model.document))
+    return CheckOut(
+        valid=True,
+        errors=[],
+        warnings=unused,
+        normal_form=dict(model.document),
+        equations=list_equations(model),
+    )
 
 
 def to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
@@ -56,4 +63,10 @@ def to_model_out(model: Model, version: int, document: Mapping[str, Any] | None)
         note=None,
         tags=[],
         document=document,
+        equations=[] if document is None else list_equations(model),
     )
+
+
+def list_equations(model: Model) -> list[EquationOut]:
+    """List the equations of a model as a page shows them."""
+    return [EquationOut.from_source(equation) for equation in format_equations(model)]

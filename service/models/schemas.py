@@ -28,6 +28,13 @@ class ModelDocumentOut(Answer):
     title: str | None = Field(default=None, description="what it describes, in a few words")
 
 
+class EquationOut(Answer):
+    """An equation as a reader writes it."""
+
+    text: str = Field(description="the equation as text, such as `dx/dt = (u - x)/T`")
+    mathml: str = Field(description="the same as a `<math>` element, which a browser shows")
+
+
 class ModelOut(Answer):
     """A model: built in (`version` 0) or stored by a user."""
 
@@ -43,6 +50,9 @@ class ModelOut(Answer):
     tags: list[str] = Field(default=[], description="tags of users")
     document: Annotated[Any, DescribedBy(ModelDocumentOut | None)] = Field(
         default=None, description="document of the model; null in lists"
+    )
+    equations: list[EquationOut] = Field(
+        default=[], description="equations, intermediate names, outputs; empty in lists"
     )
 
 
@@ -60,4 +70,7 @@ class CheckOut(Answer):
     )
     normal_form: Annotated[Any, DescribedBy(ModelDocumentOut | None)] = Field(
         default=None, description="document with every default; null if it has faults"
+    )
+    equations: list[EquationOut] = Field(
+        default=[], description="equations, intermediate names, outputs; empty if it has faults"
     )

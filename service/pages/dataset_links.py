@@ -20,14 +20,14 @@ MAX_LISTED_DATASETS = 100
 
 
 def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
-    """List the datasets of a job, each with its role, label, name and parents."""
+    """List the datasets of a job: role, label, name, what was subtracted, and parents."""
     lineage = LineageRepository(session)
     return [
         {
             "role": role,
             "label": label,
             "id": dataset_id,
-            "name": _dataset_name(session, dataset_id),
+            **_describe_dataset(session, dataset_id),
             "parents": [
                 e.parent for e in lineage.list_ancestors(dataset_id) if e.child == dataset_id
             ],
@@ -58,8 +58,9 @@ def _iterate_datasets(spec: Document) -> Iterator[tuple[str, str, str]]:
         yield "validation", "", dataset
 
 
-def _dataset_name(session: Session, dataset_id: str) -> str:
+def _describe_dataset(session: Session, dataset_id: str) -> dict[str, Any]:
     try:
-        return DatasetRepository(session).get(dataset_id).name
+        dataset = DatasetRepository(session).get(dataset_id)
     except RowNotFound:
-        return "deleted"
+        return {"name": "deleted", "subtracted": []}
+    return {"name": dataset.name, "subtracted": dataset.details.get("subtracted") or []}

@@ -30,6 +30,7 @@ from sysid.figures.plotly import Abscissa, Figure
 from sysid.figures.posterior import plot_posterior
 from sysid.figures.theme import Theme
 from sysid.identification.figures import FigureName
+from sysid.trends.trend import OutlierRule
 
 
 class FigureChoice(BaseModel):
@@ -46,6 +47,14 @@ class FigureChoice(BaseModel):
     experiment: int = Field(default=0, ge=0, description="index of the record, from 0")
     start: float | None = Field(default=None, allow_inf_nan=False, description="start time, s")
     stop: float | None = Field(default=None, allow_inf_nan=False, description="stop time, s")
+
+
+class TrendChoice(FigureChoice):
+    """Options of the figure of a trend."""
+
+    outliers: OutlierRule = Field(
+        default="exclude", description="whether the laws leave outliers out or count them"
+    )
 
 
 class ComparisonChoice(FigureChoice):
@@ -80,7 +89,7 @@ def load_run_figure(
         _check_experiment(choice.experiment, len(tested.experiments))
         return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
     if name == "posterior":
-        return plot_posterior(*read_corner_parameters(stored))
+        return plot_posterior(*read_corner_parameters(stored), is_narrow=choice.columns == 1)
     data = read_run_figure_data(session, stored)
     if name == "history":
         return plotly.plot_history(data, choice.abscissa)
@@ -134,9 +143,9 @@ def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Fi
     return plot_noise_sweep(summary, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
 
-def load_trend_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+def load_trend_figure(session: Session, job_id: str, choice: TrendChoice) -> Figure:
     """Draw estimates over the label of a batch; empty if the job requests no trend."""
-    trend = load_trend(session, JobRepository(session).get(job_id))
+    trend = load_trend(session, JobRepository(session).get(job_id), choice.outliers)
     if trend is None:
         return plotly.empty_figure()
     return plot_trend(trend, min(choice.columns, 2))

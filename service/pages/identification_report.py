@@ -42,7 +42,7 @@ def render_identification_report(
     )
     return render_template(
         "report_identification.html",
-        run=to_result_view(to_result_document(found, seconds), unit, title),
+        run=to_result_view(to_result_document(found, seconds), found.data.model, unit, title),
         facts=list(facts.items()),
         figures=write_figures(_draw_all(found)),
         model=document,

@@ -28,6 +28,7 @@ from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
 from service.pages.render import render_template
+from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
 from service.pages.views import (
     JobView,
@@ -55,6 +56,7 @@ from sysid.figures import signals
 from sysid.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from sysid.figures.posterior import posterior_height
 from sysid.figures.residuals import residuals_height
+from sysid.trends.trend import OutlierRule
 
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
@@ -150,11 +152,12 @@ def job_page(
     run_id: str | None = None,
     cursor: str | None = None,
     cell: Sequence[str] = (),
+    outliers: OutlierRule = "exclude",
 ) -> str:
     """Render a job with its runs, one of them in full: the requested, the best, or the first.
 
     For a large sweep, the page shows the grid of its cells. It lists the runs of the chosen `cell`,
-    such as ``/noise/sigma=0.1``.
+    such as ``/noise/sigma=0.1``. The laws of a trend leave outliers out, or count them.
     """
     job = JobRepository(session).get(job_id)
     runs = RunRepository(session)
@@ -179,7 +182,7 @@ def job_page(
         is_listed=is_listed,
         cell_title=format_cell(chosen_cell, {}),
         noise_height=_noise_height(session, job, stored),
-        trend=_load_trend_view(session, job),
+        trend=_load_trend_view(session, job, outliers),
         comparable=_comparison_query(page.items),
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
@@ -330,7 +333,7 @@ def load_full_run(session: Session, stored: StoredRun) -> RunView:
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
         "posterior": posterior_height(len((result.get("posterior") or {}).get("parameters", ()))),
     }
-    return to_run_view(run, stored.rms_unit(session), heights)
+    return to_run_view(run, stored.rms_unit(session), heights, to_model_view(model))
 
 
 def _residuals_height(result: Mapping[str, Any]) -> int:
@@ -356,8 +359,8 @@ def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
     return noise_sweep_height(1 + len(names), columns=2)
 
 
-def _load_trend_view(session: Session, job: Job) -> TrendView | None:
-    trend = load_trend(session, job)
+def _load_trend_view(session: Session, job: Job, outliers: OutlierRule) -> TrendView | None:
+    trend = load_trend(session, job, outliers)
     return None if trend is None else to_trend_view(trend)
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 from service.pages.diagnostics import Diagnostics, to_diagnostics
 from sysid.core.text import format_estimate, format_interval
+from sysid.models.equation_display import format_equations
+from sysid.models.model import Model
 
 Document = Mapping[str, Any]
 
@@ -36,6 +38,15 @@ class PosteriorView:
 
 
 @dataclass(frozen=True, slots=True)
+class ModelView:
+    """What a model is called, and its equations as MathML."""
+
+    name: str
+    title: str
+    equations: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
 class ResultView:
     """A result as the shared pieces of pages and reports show it; `unit` is that of the RMS."""
 
@@ -53,10 +64,17 @@ class ResultView:
     diagnostics: Diagnostics
     posterior: Sequence[PosteriorView]
     title: str
+    model: ModelView
     error: str | None = None
 
 
-def to_result_view(result: Document, unit: str, title: str) -> ResultView:
+def to_model_view(model: Model) -> ModelView:
+    """Build the view of a model."""
+    equations = [equation.mathml for equation in format_equations(model)]
+    return ModelView(model.name, model.title, equations)
+
+
+def to_result_view(result: Document, model: Model, unit: str, title: str) -> ResultView:
     """Build the view of a result document."""
     return ResultView(
         unit=unit,
@@ -73,6 +91,7 @@ def to_result_view(result: Document, unit: str, title: str) -> ResultView:
         diagnostics=to_diagnostics(result),
         posterior=to_posterior_views(result),
         title=title,
+        model=to_model_view(model),
     )
 
 

@@ -20,6 +20,7 @@ from service.trends.text import (
 )
 from service.trends.trend import compute_trend, has_trend
 from sysid.core.text import format_number
+from sysid.trends.trend import OutlierRule
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +28,12 @@ class TrendView:
     """View of a trend; `laws` are (text, AIC, Birge ratio, whether chosen).
 
     The form suggests to accept the run at the reference's label under its name. In a batch without
-    a reference it suggests the middle run, which is the nearest to all others.
+    a reference it suggests the middle run without an outlier, which is the nearest to all others.
     """
 
     x: str
+    outliers: OutlierRule
+    has_outliers: bool
     headings: Sequence[str]
     rows: Sequence[PlaceRow]
     laws: Sequence[tuple[str, str, str, bool]]
@@ -44,12 +47,12 @@ class TrendView:
     height: int
 
 
-def load_trend(session: Session, job: Job) -> TrendOut | None:
+def load_trend(session: Session, job: Job, outliers: OutlierRule = "exclude") -> TrendOut | None:
     """Load the trend of a job; None if it requests none, or has too many runs for one."""
     if not has_trend(job):
         return None
     try:
-        return compute_trend(session, job.id)
+        return compute_trend(session, job.id, outliers)
     except InvalidRequest:
         return None
 
@@ -82,6 +85,8 @@ def to_trend_view(trend: TrendOut) -> TrendView:
     tables = build_tables(document, TYPESET)
     return TrendView(
         x=trend.x,
+        outliers=trend.outliers,
+        has_outliers=any(p.is_outlier for quantity in trend.quantities for p in quantity.points),
         headings=tables.headings,
         rows=tables.rows,
         laws=[
@@ -101,6 +106,8 @@ def to_trend_view(trend: TrendOut) -> TrendView:
 
 def _suggest_run(trend: TrendOut) -> str:
     runs = {point.x: point.runs[0] for point in trend.labels if point.runs}
-    middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
+    outliers = {p.x for quantity in trend.quantities for p in quantity.points if p.is_outlier}
+    usual = [run for x, run in runs.items() if x not in outliers]
+    middle = usual[len(usual) // 2 : len(usual) // 2 + 1]
     at_reference = None if trend.reference_x is None else runs.get(trend.reference_x)
     return at_reference or next(iter(middle), "")

@@ -18,6 +18,7 @@ from service.jobs.submit import to_job_out
 from service.pages.diagnostics import Diagnostics, to_diagnostics
 from service.pages.result_view import (
     EstimateView,
+    ModelView,
     PosteriorView,
     to_estimate_view,
     to_posterior_views,
@@ -55,6 +56,7 @@ class RunView(Answer):
     heights: Mapping[str, int]
     diagnostics: Diagnostics
     posterior: Sequence[PosteriorView]
+    model: ModelView | None
 
 
 class JobView(JobOut):
@@ -141,8 +143,10 @@ def to_job_view(job: Job, unit: str, now: datetime, outcome: OutcomeOut | None =
     return JobView.from_source(document, lost_leases=job.lost_leases, max_attempts=job.max_attempts)
 
 
-def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
-    """Build the view of a run; `heights` (px) are those of its plots."""
+def to_run_view(
+    run: Run, unit: str, heights: Mapping[str, int], model: ModelView | None = None
+) -> RunView:
+    """Build the view of a run; `heights` (px) are those of its plots. A row has no `model`."""
     result = run.result or {}
     return RunView.from_source(
         run,
@@ -159,6 +163,7 @@ def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         heights=heights,
         diagnostics=to_diagnostics(result),
         posterior=to_posterior_views(result),
+        model=model,
     )
 
 

@@ -62,8 +62,11 @@ def compare_with_reference(
     fitted, reference_quantity = reference.trends.get(quantity.name, (None, None))
     if fitted is None or reference_quantity is None or fitted.best_law is None:
         return drifts
-    used = [(p.x, p.estimate.stderr) for p in reference_quantity.points if p.estimate is not None]
-    reference_x, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
+    old_points = [
+        (p.x, p.estimate.stderr) for p in reference_quantity.points if p.estimate is not None
+    ]
+    used = np.delete(np.array(old_points), fitted.excluded, axis=0)
+    reference_x, errors = used[:, 0], used[:, 1]
     new_x = np.array([x for x, _ in new])
     moved = compute_law_drifts(
         [estimate for _, estimate in new], fitted.best_law, reference_x, errors, new_x, comparisons

@@ -14,7 +14,7 @@ BIRGE_LIMIT = 1.5  # Birge ratios below that happen by chance in small batches
 def describe_quantity(quantity: TrendQuantity, fitted: Trend) -> list[str]:
     """List all notes: on the points, the laws, and the predictions."""
     return [
-        *_describe_points(quantity),
+        *_describe_points(quantity, fitted),
         *_describe_laws(quantity, fitted),
         *_describe_predictions(quantity, fitted),
     ]
@@ -49,7 +49,11 @@ def describe_noise_models(
     )
 
 
-def _describe_points(quantity: TrendQuantity) -> Iterator[str]:
+def _describe_points(quantity: TrendQuantity, fitted: Trend) -> Iterator[str]:
+    if fitted.excluded:
+        with_error = _list_used_x(quantity)
+        outliers = ", ".join(f"{with_error[i]:g}" for i in fitted.excluded)
+        yield f"the laws leave out the outlier at {outliers}"
     without = [f"{point.x:g}" for point in quantity.points if point.estimate is None]
     if without:
         yield f"no standard error at {', '.join(without)}, so the laws leave it out"

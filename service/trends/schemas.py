@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.core.wire import Answer, Finite
+from sysid.trends.trend import OutlierRule
 
 
 class SpanOut(Answer):
@@ -43,7 +44,9 @@ class PointOut(Answer):
     stderr: Finite = Field(description="standard error, in the quantity's unit")
     runs: list[str] = Field(description="identifiers of the runs at this label")
     status: str = Field(description="status of the estimate")
-    is_used: bool = Field(description="whether the laws are fitted to it")
+    is_used: bool = Field(
+        description="whether the laws are fitted to it; an outlier leaves them by default"
+    )
     studentised: Finite = Field(default=None, description="deleted residual")
     p_value: float | None = Field(
         default=None, description="Bonferroni-corrected p-value of the outlier test"
@@ -119,6 +122,7 @@ class TrendOut(Answer):
 
     job: str = Field(description="identifier of the job")
     x: str = Field(description="name of the label")
+    outliers: OutlierRule = Field(description="whether the laws leave outliers out")
     reference: str | None = Field(default=None, description="run that the batch is compared with")
     reference_x: float | None = Field(
         default=None, description="label of the reference; null if it has none"

@@ -34,7 +34,7 @@ from service.trends.schemas import (
     TrendOut,
 )
 from sysid.trends.laws import FORMULAS, TrendLaw
-from sysid.trends.trend import Influence, Trend, fit_trend
+from sysid.trends.trend import Influence, OutlierRule, Trend, fit_trend
 
 MAX_RUNS = 5_000
 
@@ -44,8 +44,10 @@ def has_trend(job: Job) -> bool:
     return job.spec["trend"] is not None
 
 
-def compute_trend(session: Session, job_id: str) -> TrendOut:
+def compute_trend(session: Session, job_id: str, outliers: OutlierRule = "exclude") -> TrendOut:
     """Compute the trend that a job requests, from the runs that have succeeded so far.
+
+    Its laws leave outliers out, or count them with ``outliers="include"``.
 
     Raises
     ------
@@ -61,10 +63,10 @@ def compute_trend(session: Session, job_id: str) -> TrendOut:
         raise Conflict(
             f'{job.id} has no trend. Submit it with "trend": {{"x": …}}, where x names a label'
         )
-    key = job.id, job.attempt, job.finished_at, _find_reference_version(session, job)
+    key = job.id, job.attempt, job.finished_at, _find_reference_version(session, job), outliers
     return _trends.get(
         key,
-        lambda: _compute(session, job),
+        lambda: _compute(session, job, outliers),
         is_final=job.state.is_terminal,
         before_wait=partial(release_connection, session),
     )
@@ -83,7 +85,7 @@ def _find_reference_version(session: Session, job: Job) -> Hashable:
     return names, of.attempt, of.n_done, of.n_failed, of.finished_at
 
 
-def _compute(session: Session, job: Job) -> TrendOut:
+def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
     request = job.spec["trend"]
     rows_by_label, quantities = _collect_quantities(session, job)
     bodies = {
@@ -95,7 +97,9 @@ def _compute(session: Session, job: Job) -> TrendOut:
     channels = read_channels(session, {dataset for many in datasets.values() for dataset in many})
     reference = _load_reference(session, job, request.get("reference"))
     answers = [
-        _to_quantity_out(quantity, request["predict"], reference, quantities)
+        _to_quantity_out(
+            quantity, _fit_quantity(quantity, request["predict"], outliers), reference, quantities
+        )
         for quantity in quantities
     ]
     reference_noise_model = (
@@ -110,6 +114,7 @@ def _compute(session: Session, job: Job) -> TrendOut:
     return TrendOut(
         job=job.id,
         x=request["x"],
+        outliers=outliers,
         reference=None if reference is None else reference.run.id,
         reference_x=None if reference is None else reference.x,
         reference_names=[] if reference is None else list(reference.names),
@@ -149,7 +154,7 @@ def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchRefe
     if why:
         return BatchReference(run, x_value, why_no_trend=why, names=names)
     _, quantities = _collect_quantities(session, reference_job)
-    trends = {quantity.name: (_fit_quantity(quantity, ()), quantity) for quantity in quantities}
+    trends = {quantity.name: (_fit_quantity(quantity), quantity) for quantity in quantities}
     return BatchReference(run, x_value, trends, names=names)
 
 
@@ -167,29 +172,33 @@ def _explain_missing_trend(reference_job: Job, x: str) -> str:
     return ""
 
 
-def _fit_quantity(quantity: TrendQuantity, predict: Sequence[float]) -> Trend:
+def _fit_quantity(
+    quantity: TrendQuantity, predict: Sequence[float] = (), outliers: OutlierRule = "exclude"
+) -> Trend:
     used = [(point.x, point.estimate) for point in quantity.points if point.estimate is not None]
     return fit_trend(
-        [x for x, _ in used], [e.value for _, e in used], [e.stderr for _, e in used], predict
+        [x for x, _ in used],
+        [e.value for _, e in used],
+        [e.stderr for _, e in used],
+        predict,
+        outliers,
     )
 
 
 def _to_quantity_out(
     quantity: TrendQuantity,
-    predict: Sequence[float],
+    fitted: Trend,
     reference: BatchReference | None,
     all_: Sequence[TrendQuantity],
 ) -> QuantityOut:
-    fitted = _fit_quantity(quantity, predict)
-    influences = iter(fitted.influences)
+    with_error = [point.x for point in quantity.points if point.estimate is not None]
+    influences = dict(zip(with_error, fitted.influences, strict=False))  # none without a law
+    used = set(with_error) - {with_error[i] for i in fitted.excluded} if fitted.laws else set()
     n = sum(point.estimate is not None for other in all_ for point in other.points)
     drifts = compare_with_reference(quantity, reference, n)
     points = [
         _to_point_out(
-            point,
-            next(influences, None) if point.estimate is not None else None,
-            drifts.get(point.x, []),
-            bool(fitted.laws),
+            point, influences.get(point.x), drifts.get(point.x, []), is_used=point.x in used
         )
         for point in quantity.points
     ]
@@ -206,7 +215,7 @@ def _to_quantity_out(
 
 
 def _to_point_out(
-    point: BatchPoint, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
+    point: BatchPoint, influence: Influence | None, drifts: list[DriftOut], *, is_used: bool
 ) -> PointOut:
     judged = {} if influence is None else influence._asdict()
     return PointOut.from_source(
@@ -215,7 +224,7 @@ def _to_point_out(
         p_value=judged.get("p_value"),
         is_outlier=judged.get("is_outlier", False),
         stderr=None if point.estimate is None else point.estimate.stderr,
-        is_used=has_laws and point.estimate is not None,
+        is_used=is_used,
         drifts=drifts,
     )
 

@@ -4,11 +4,12 @@ A step is a mapping with one key, such as ``{"trim": {"start": 2, "stop": 8}}``.
 list are applied in order.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from sysid.core.errors import InvalidRecord, InvalidSettings, join_pointer, suggest_name
 from sysid.core.units import (
@@ -29,6 +30,27 @@ from sysid.data.splitting import find_cut_time
 StepFunction = Callable[[Recording, StepArguments], Recording]
 
 
+class SubtractedTrend(NamedTuple):
+    """What ``detrend`` subtracted from a channel: ``value + slope·(t - time)``.
+
+    `time` (s) is that of the first sample. `value` is in the unit that the channel then has,
+    `slope` in that unit per second. It is 0 for a mean.
+    """
+
+    channel: str
+    unit: str
+    time: float
+    value: float
+    slope: float
+
+
+class Derivation(NamedTuple):
+    """A derived recording, and what its steps ``detrend`` subtracted, in their order."""
+
+    recording: Recording
+    subtracted: tuple[SubtractedTrend, ...]
+
+
 def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recording:
     """Apply derivation steps to a recording, in order.
 
@@ -37,8 +59,20 @@ def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -
     InvalidSettings
         With the JSON pointer of the invalid part, such as ``/steps/2/pool/bin``.
     """
+    return apply_steps(recording, steps).recording
+
+
+def apply_steps(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Derivation:
+    """Apply derivation steps to a recording, in order, and say what was subtracted.
+
+    Raises
+    ------
+    InvalidSettings
+        With the JSON pointer of the invalid part, such as ``/steps/2/pool/bin``.
+    """
     if not isinstance(steps, list | tuple) or not steps:
         raise InvalidSettings("/steps", f"found {steps!r}; need a list with one step or more")
+    subtracted: list[SubtractedTrend] = []
     for number, step in enumerate(steps):
         if not isinstance(step, Mapping) or len(step) != 1:
             raise InvalidSettings(
@@ -48,11 +82,14 @@ def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -
         pointer = f"/steps/{number}/{name}"
         if name not in STEPS:
             raise InvalidSettings(pointer, f"there is no such step{suggest_name(str(name), STEPS)}")
+        arguments = StepArguments(pointer, value)
         try:
-            recording = STEPS[name](recording, StepArguments(pointer, value))
+            if name == "detrend":
+                subtracted += _describe_trends(recording, _fit_trends(recording, arguments))
+            recording = STEPS[name](recording, arguments)
         except InvalidRecord as error:
             raise InvalidSettings(pointer, str(error)) from None
-    return recording
+    return Derivation(recording, tuple(subtracted))
 
 
 def add_noise(recording: Recording, arguments: StepArguments) -> Recording:
@@ -178,6 +215,18 @@ def split_recording(recording: Recording, arguments: StepArguments) -> Recording
 
 def detrend_channels(recording: Recording, arguments: StepArguments) -> Recording:
     """Subtract the mean or the least-squares line; missing values are ignored."""
+    trends = _fit_trends(recording, arguments)
+    return _change_channels(
+        recording,
+        list(trends),
+        lambda channel: change_values(
+            channel, lambda times, values: np.asarray(values - trends[channel.name](times))
+        ),
+    )
+
+
+def _fit_trends(recording: Recording, arguments: StepArguments) -> dict[str, Polynomial]:
+    """Fit the mean or the line of each channel that a step names."""
     arguments.reject_others("kind", "channels")
     degree = ("mean", "linear").index(arguments.read_choice("kind", ("mean", "linear"), "mean"))
     names = (
@@ -186,16 +235,25 @@ def detrend_channels(recording: Recording, arguments: StepArguments) -> Recordin
         else list(recording.names)
     )
 
-    def detrend(channel: Channel) -> Channel:
+    trends = {}
+    for channel in map(recording.channel, names):
         is_present = np.isfinite(channel.values)
         if np.count_nonzero(is_present) <= degree:
             arguments.fail("", f"channel {channel.name!r} has too few values")
-        trend = np.polynomial.Polynomial.fit(
+        trends[channel.name] = Polynomial.fit(
             channel.times[is_present], channel.values[is_present], degree
         )
-        return change_values(channel, lambda times, values: np.asarray(values - trend(times)))
+    return trends
 
-    return _change_channels(recording, names, detrend)
+
+def _describe_trends(
+    recording: Recording, trends: Mapping[str, Polynomial]
+) -> Iterator[SubtractedTrend]:
+    for name, trend in trends.items():
+        channel = recording.channel(name)
+        start = float(channel.times[0])
+        slope = float(trend.deriv()(start))
+        yield SubtractedTrend(name, channel.unit, start, float(trend(start)), slope)
 
 
 def subtract_offset(recording: Recording, arguments: StepArguments) -> Recording:

@@ -18,6 +18,7 @@ MAX_SHOWN = 6
 """Parameters that a corner plot shows."""
 _CELL_PX, _GAP = 176, 0.02
 _MARGIN = {"l": 84, "r": 16, "t": 30, "b": 54}
+_NARROW_MARGIN = {**_MARGIN, "l": 62, "t": 112}  # room for the legend above all cells
 _MAX_POINTS = 500  # of a pair: more would hide each other
 _CELLS = 40  # of a density in each direction
 _ROOM = 3.0  # bandwidths around the samples
@@ -31,24 +32,29 @@ def posterior_height(n_parameters: int) -> int:
     return min(n_parameters, MAX_SHOWN) * _CELL_PX + _MARGIN["t"] + _MARGIN["b"]
 
 
-def plot_posterior(parameters: Sequence[CornerParameter], correlation: Floats) -> Figure:
+def plot_posterior(
+    parameters: Sequence[CornerParameter], correlation: Floats, *, is_narrow: bool = False
+) -> Figure:
     """Draw histograms on the diagonal, and pairs of samples with their 95 % regions below.
 
     `correlation` (D, D) is that of the estimates. With their standard errors it gives the dashed
-    ellipses. Of many parameters only those that are most correlated are shown.
+    ellipses. Of many parameters only those that are most correlated are shown. On a narrow page
+    the legend is above the cells, which have fewer ticks.
     """
     if not parameters:
         return empty_figure()
     chosen = choose_shown(parameters)
     shown = [parameters[i] for i in chosen]
+    margin = _NARROW_MARGIN if is_narrow else _MARGIN
+    beside = {"x": 1, "xanchor": "right", "y": 1, "yanchor": "top"}
     figure: Figure = {
         "data": [],
         "layout": base_layout(
-            posterior_height(len(shown)),
-            margin=_MARGIN,
+            posterior_height(len(shown)) + margin["t"] - _MARGIN["t"],
+            margin=margin,
             shapes=[],
             bargap=0,
-            legend={"x": 1, "xanchor": "right", "y": 1, "yanchor": "top"},
+            **({} if is_narrow else {"legend": beside}),
         ),
     }
     for column, row in combinations(range(len(shown)), 2):
@@ -63,6 +69,8 @@ def plot_posterior(parameters: Sequence[CornerParameter], correlation: Floats) -
         figure["data"].append(_draw_histogram(parameter, names))
         figure["layout"]["shapes"] += _draw_interval(parameter, names)
     _show_legend_once(figure)
+    if is_narrow:
+        _thin_ticks(figure)
     if len(shown) < len(parameters):
         title = f"the {len(shown)} most correlated of {len(parameters)} parameters"
         figure["layout"]["title"] = {
@@ -72,6 +80,13 @@ def plot_posterior(parameters: Sequence[CornerParameter], correlation: Floats) -
             "xanchor": "center",
         }
     return figure
+
+
+def _thin_ticks(figure: Figure) -> None:
+    """Let narrow cells have two level labels, which do not meet their neighbours."""
+    for name, axis in figure["layout"].items():
+        if name.startswith("xaxis"):
+            axis |= {"nticks": 2, "tickangle": 0, "tickfont": {"size": 10}}
 
 
 def choose_shown(parameters: Sequence[CornerParameter]) -> list[int]:

@@ -2,24 +2,28 @@
 
 A law (`sysid.trends.laws`) is fitted to points (x, estimate ± standard error). It has a confidence
 band and predictions at new x. Outliers, and estimates that have drifted from a reference, are
-flagged.
+flagged. An outlier leaves the law, so that it moves neither the law nor the size of its errors.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot, inf, isfinite, nan, sqrt
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, stdtr, stdtrit
 
-from sysid.core.types import FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.trends.laws import TrendLaw, compute_rounding_floor, fit_line, fit_power
 
 MIN_DISTINCT_X = 3
 """Fewest different values of x for a law with standard errors."""
 
+OutlierRule = Literal["exclude", "include"]
+"""Whether the laws leave outliers out."""
+
+_MAX_EXCLUDED_SHARE = 0.2  # of the points; what more of them say is no exception
 _OUTLIER_PROBABILITY = 0.05  # share of batches without an outlier that get a false alarm
 _DRIFT_PROBABILITY = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
 _SCATTER_PROBABILITY = 0.05  # share of batches with right errors that fail the χ² test
@@ -75,7 +79,9 @@ class Trend:
     best_law : TrendLaw or None
         Law with the smaller AIC.
     influences : tuple of Influence
-        Influence of each point.
+        Influence of each point. That of an excluded point is the one that excluded it.
+    excluded : tuple of int
+        Indices of the points that the laws leave out.
     band : tuple of TrendPoint
         Confidence band of the law over the measured range.
     predictions : tuple of TrendPoint
@@ -85,15 +91,31 @@ class Trend:
     laws: tuple[TrendLaw, ...] = ()
     best_law: TrendLaw | None = None
     influences: tuple[Influence, ...] = ()
+    excluded: tuple[int, ...] = ()
     band: tuple[TrendPoint, ...] = ()
     predictions: tuple[TrendPoint, ...] = ()
     reason: str = ""
 
 
+class _Fit(NamedTuple):
+    """Laws of the used points, the best first, and the influence of every point."""
+
+    laws: tuple[TrendLaw, ...]
+    influences: tuple[Influence, ...]
+    used: BoolArray
+
+
 def fit_trend(
-    x: Sequence[float], y: Sequence[float], stderr: Sequence[float], predict: Sequence[float] = ()
+    x: Sequence[float],
+    y: Sequence[float],
+    stderr: Sequence[float],
+    predict: Sequence[float] = (),
+    outliers: OutlierRule = "exclude",
 ) -> Trend:
     """Fit the laws to points and choose the better one, with its band and predictions.
+
+    An outlier is left out, and the laws are fitted again, until no other is flagged. At most a
+    fifth of the points leave.
 
     Parameters
     ----------
@@ -103,6 +125,14 @@ def fit_trend(
         Standard errors of the estimates, positive.
     predict : sequence of float
         Labels for which an interval is wanted.
+    outliers : {"exclude", "include"}
+        Whether the laws leave outliers out.
+
+    Examples
+    --------
+    >>> y = [1.0, 2.01, 2.99, 7.0, 5.0, 6.02]
+    >>> fit_trend([1, 2, 3, 4, 5, 6], y, [0.01] * 6).excluded
+    (3,)
     """
     labels, values, errors = (np.asarray(array, dtype=np.float64) for array in (x, y, stderr))
     distinct = np.unique(labels).size
@@ -112,24 +142,73 @@ def fit_trend(
             f"with a standard error; a law with errors needs {MIN_DISTINCT_X} or more"
         )
     with np.errstate(all="ignore"):  # an overflow of doubles gives no law
-        fitted = fit_line(labels, values, errors), fit_power(labels, values, errors)
-        laws = tuple(law for law in fitted if law is not None)
-        if not laws:
+        fit = _fit_laws(labels, values, errors, outliers)
+        if not fit.laws:
             return Trend(
                 reason=f"the {distinct} values of x, {np.min(labels):g} to {np.max(labels):g}, "
                 "or the estimates there, are too far apart in size for doubles. No law is "
                 "determined. Give x in a unit that makes them similar in size."
             )
-        chosen = min(laws, key=lambda law: law.aic)  # if equal the line, which comes first
+        chosen = _choose_law(fit.laws)
         return Trend(
-            laws=laws,
+            laws=fit.laws,
             best_law=chosen,
-            influences=_compute_influences(chosen, labels, values, errors),
-            band=_compute_band(chosen, labels),
+            influences=fit.influences,
+            excluded=tuple(np.flatnonzero(~fit.used).tolist()),
+            band=_compute_band(chosen, labels[fit.used]),
             predictions=predict_estimates(
-                chosen, labels, errors, np.asarray(predict, dtype=np.float64)
+                chosen, labels[fit.used], errors[fit.used], np.asarray(predict, dtype=np.float64)
             ),
         )
+
+
+def _fit_laws(x: FloatArray, y: FloatArray, stderr: FloatArray, outliers: OutlierRule) -> _Fit:
+    """Fit the laws; leave the worst outlier out and fit again, until no other is flagged."""
+    fit = _fit_used(x, y, stderr, np.ones(x.size, dtype=bool), ())
+    while outliers == "exclude" and (used := _drop_outlier(x, fit)) is not None:
+        rest = _fit_used(x, y, stderr, used, fit.influences)
+        if not rest.laws:
+            break
+        fit = rest
+    return fit
+
+
+def _fit_used(
+    x: FloatArray,
+    y: FloatArray,
+    stderr: FloatArray,
+    used: BoolArray,
+    before: Sequence[Influence],
+) -> _Fit:
+    """Fit the laws to the used points; the influences of others are those of `before`."""
+    points = x[used], y[used], stderr[used]
+    laws = tuple(law for law in (fit_line(*points), fit_power(*points)) if law is not None)
+    if not laws:
+        return _Fit((), (), used)
+    influences = iter(_compute_influences(_choose_law(laws), *points))
+    return _Fit(
+        laws,
+        tuple(next(influences) if is_used else before[i] for i, is_used in enumerate(used)),
+        used,
+    )
+
+
+def _choose_law(laws: Sequence[TrendLaw]) -> TrendLaw:
+    return min(laws, key=lambda law: law.aic)  # if equal the line, which comes first
+
+
+def _drop_outlier(x: FloatArray, fit: _Fit) -> BoolArray | None:
+    """Drop the worst outlier among the used points; None if none may leave."""
+    flagged = [
+        (abs(influence.studentised or 0.0), i)
+        for i, influence in enumerate(fit.influences)
+        if fit.used[i] and influence.is_outlier
+    ]
+    if not flagged or np.sum(~fit.used) + 1 > _MAX_EXCLUDED_SHARE * x.size:
+        return None
+    used = fit.used.copy()
+    used[max(flagged)[1]] = False
+    return used if np.unique(x[used]).size >= MIN_DISTINCT_X else None
 
 
 def compute_half_width(law: TrendLaw) -> float:

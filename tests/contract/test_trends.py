@@ -1,19 +1,20 @@
 """Trends of stored results: each label is compared with its own reference, at a common limit."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from service.core.states import JobState
+from service.pages.pages import job_page
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
 from service.repositories.references import ReferenceRepository
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
 from service.trends.trend import compute_trend
-from sysid.trends.trend import compute_drift_limit
+from sysid.trends.trend import OutlierRule, compute_drift_limit
 from tests.database import record_statements
 from tests.dispatching import Place
 from tests.results import claim_job, conclude, write_results
@@ -30,12 +31,16 @@ def place(tmp_path: Path) -> Iterator[Place]:
 
 
 def batch(
-    place: Place, change: dict[float, float] | None = None, reference: str | None = None
+    place: Place,
+    change: dict[float, float] | None = None,
+    reference: str | None = None,
+    lengths: Sequence[float] = LENGTHS,
 ) -> tuple[str, dict[float, str]]:
-    """A batch over three lengths, and its run at each; `change` is added to L and T at a length."""
-    labels = [{"x": x} for x in LENGTHS]
+    """A batch over lengths, and its run at each; `change` is added to L and T at a length."""
+    labels = [{"x": x} for x in lengths]
+    seeds = list(range(1, len(lengths) + 1))
     job = place.submit(
-        sweep={"axes": [{"path": "/seed", "values": [1, 2, 3], "labels": labels}]},
+        sweep={"axes": [{"path": "/seed", "values": seeds, "labels": labels}]},
         trend={"x": "x", "parameters": ["L", "T"], "reference": reference},
     )
     lease = claim_job(place.database, job)
@@ -50,9 +55,9 @@ def batch(
     return job, runs
 
 
-def trend(place: Place, job: str) -> TrendOut:
+def trend(place: Place, job: str, outliers: OutlierRule = "exclude") -> TrendOut:
     with place.database.read_session() as session:
-        return compute_trend(session, job)
+        return compute_trend(session, job, outliers)
 
 
 def drifts(found: TrendOut, kind: str) -> dict[tuple[str, float], Any]:
@@ -84,6 +89,27 @@ def test_the_limit_of_drift_counts_all_labels_and_quantities(place: Place) -> No
     assert len(along) == 2 * len(LENGTHS)
     assert {key for key, drift in along.items() if drift.drifted} == {("L", 4.0), ("T", 4.0)}
     assert along["L", 4.0].expected == pytest.approx(0.4)
+
+
+def test_an_outlier_moves_neither_its_own_law_nor_what_a_reference_expects(place: Place) -> None:
+    lengths = (1.0, 2.0, 4.0, 5.0, 7.0, 8.0)
+    first, runs = batch(place, {5.0: 3.0}, lengths=lengths)
+    found, counted = trend(place, first), trend(place, first, "include")
+    assert (found.outliers, counted.outliers) == ("exclude", "include")
+    for quantity, other in zip(found.quantities, counted.quantities, strict=True):
+        assert [p.x for p in quantity.points if p.is_outlier] == [5.0]
+        assert [p.x for p in quantity.points if not p.is_used] == [5.0]
+        assert "the laws leave out the outlier at 5" in quantity.notes
+        assert all(point.is_used for point in other.points)
+    with place.database.read_session() as session:
+        pages = [job_page(session, first, "", outliers=one) for one in ("exclude", "include")]
+    for text, query in zip(pages, ("", "?outliers=include"), strict=True):
+        assert f'/figures/trend{query}" style' in text
+        assert f'/jobs/{first}{query}#trend" aria-current="true"' in text
+        assert f'<option value="{runs[5.0]}">' in text
+        assert f'<option value="{runs[4.0]}" selected>' in text
+    job, _ = batch(place, None, runs[2.0], lengths)
+    assert drifts(trend(place, job), "trend")["L", 5.0].expected == pytest.approx(0.5)
 
 
 def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:

@@ -172,12 +172,15 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
     assert spec["parameters"] == {**asked, "y(0)": {"lower": -3.0, "upper": 900.0}}
 
 
-def test_a_part_of_the_recording_is_chosen_in_its_plot(own_site: Site, page: Page) -> None:
+def test_a_part_of_the_recording_is_chosen_in_its_plot_and_its_mean_subtracted(
+    own_site: Site, page: Page
+) -> None:
     opened(own_site, page, f"?dataset={own_site.filled.dataset}&fit=fopdt")
     plot = page.locator("[data-preview]")
     expect(plot.locator(".scatterlayer .trace")).to_have_count(2)
     assert page.locator("table.jobs tbody tr").count() == 5  # the form's model filters no list
-    expect(page.locator("#about-model")).to_contain_text("dx/dt = (K·u(t − L) − x)/T")
+    math = page.get_by_role("math", name="dx/dt = (K*u(t - L) - x)/T")
+    expect(math.locator("mfrac")).to_have_count(2)
     expect(page.get_by_label("upper of L")).to_have_attribute("placeholder", re.compile(r"^\d"))
     expect(page.locator("#parameters tr").first).to_contain_text("static gain")
     plot.evaluate("plot => Plotly.relayout(plot, {'xaxis.range[0]': 6, 'xaxis.range[1]': 12})")
@@ -187,13 +190,20 @@ def test_a_part_of_the_recording_is_chosen_in_its_plot(own_site: Site, page: Pag
     page.get_by_role("button", name="Identify").click()
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text("need more than the start")
     page.get_by_label("to [s]").fill("15")
+    page.get_by_role("combobox", name="subtract").select_option("the mean")
+    page.get_by_role("group", name="Channels from which").get_by_label("P1").uncheck()
+    page.get_by_label("validation data").select_option("recording tube 40 m")
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
     with own_site.parts.database.read_session() as session:
-        [part] = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec["datasets"]
+        spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
+        [part], [other] = spec["datasets"], spec["validation"]["datasets"]
         dataset = DatasetRepository(session).get(part)
+        validation = DatasetRepository(session).get(other)
     assert part != own_site.filled.dataset
     assert dataset.duration == pytest.approx(9, abs=0.1)
+    [mean] = dataset.details["subtracted"]
+    assert validation.details["steps"] == [{"offset": {"P2": mean["value"]}}]
 
 
 def test_a_file_is_dropped_on_the_page(own_site: Site, page: Page) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.standing import Service
 
@@ -45,11 +45,35 @@ def filled_in(service: Service, page: Page, path: Path, name: str) -> None:
     page.get_by_label("name of the job").fill(name)
 
 
-def test_a_file_becomes_estimates_with_their_errors(
+def press_tab_to(page: Page, target: Locator) -> None:
+    """Reach what a user without a mouse would use next."""
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if target.evaluate("node => node === document.activeElement"):
+            return
+    pytest.fail(f"no Tab leads to {target}")
+
+
+def test_a_file_becomes_estimates_with_their_errors_without_a_mouse(
     service: Service, page: Page, tmp_path: Path
 ) -> None:
-    filled_in(service, page, recording(tmp_path / "step.csv"), "whole way")
-    page.get_by_role("button", name="Identify").click()
+    page.goto(service.stand.url)
+    press_tab_to(page, page.locator("#new > summary"))
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
+    press_tab_to(page, page.get_by_label("or upload a recording"))
+    with page.expect_file_chooser() as chooser:
+        page.keyboard.press("Enter")
+    chooser.value.set_files(recording(tmp_path / "step.csv"))
+    expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
+    model = page.get_by_role("combobox", name="Model", exact=True)
+    press_tab_to(page, model)
+    page.keyboard.type("fopdt")
+    expect(model).to_have_value("fopdt")
+    press_tab_to(page, page.get_by_label("name of the job"))
+    page.keyboard.type("whole way")
+    press_tab_to(page, page.get_by_role("button", name="Identify"))
+    page.keyboard.press("Enter")
     page.wait_for_url(re.compile(r"/jobs/job_"))
     expect(page.locator("#job .chip")).to_have_text("succeeded")
     table = page.locator("table.estimates tbody")
@@ -58,6 +82,7 @@ def test_a_file_becomes_estimates_with_their_errors(
     assert float(delay.inner_text()) == pytest.approx(L, abs=0.02)
     page.locator('[data-figure="response"]').scroll_into_view_if_needed()
     expect(page.locator('[data-figure="response"] .scatterlayer .trace')).to_have_count(8)
+    press_tab_to(page, page.get_by_role("link", name="Simulate"))
 
 
 def test_a_long_search_is_watched_and_cancelled(

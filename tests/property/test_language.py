@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from xml.etree import ElementTree
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from sysid.language.checker import check_expression
 from sysid.language.functions import FUNCTIONS
 from sysid.language.intervals import bound_expression
+from sysid.language.mathml import format_mathml
 from sysid.language.monomials import collect_terms, to_expression
 from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
@@ -108,6 +110,10 @@ rational = st.recursive(
 )
 
 
+def _raise(base: Expression, exponent: int) -> Expression:
+    return Binary("**", base, Number(float(exponent)))
+
+
 @given(rational)
 def test_collecting_terms_keeps_the_value(tree: Expression) -> None:
     at = {"a": Fraction(3, 7), "b": Fraction(-5, 3), "c": Fraction(11, 2)}
@@ -117,6 +123,41 @@ def test_collecting_terms_keeps_the_value(tree: Expression) -> None:
     except ZeroDivisionError:
         return
     assert math.isclose(expected, found, rel_tol=1e-6, abs_tol=1e-6)
+
+
+powers = st.recursive(
+    rational, lambda inner: st.builds(_raise, inner, st.integers(0, 3)), max_leaves=4
+)
+
+
+@given(powers)
+@example(check_expression("L - (L - (d - L*-d))/-(L + d)**2", SCOPE).tree)
+@example(check_expression("1 - L - d - L - d - L - d - L - d - L - d - L", SCOPE).tree)
+def test_an_equation_as_shown_has_the_value_of_its_text(tree: Expression) -> None:
+    at = {"a": Fraction(3, 7), "b": Fraction(-5, 3), "c": Fraction(11, 2)}
+    at |= {"L": Fraction(2, 9), "d": Fraction(7, 4)}
+    shown = _read(ElementTree.fromstring(f"<math>{format_mathml(format_expression(tree))}</math>"))
+    scope = Scope("differential", parameters=dict.fromkeys(at, (-9.0, 9.0)))
+    seen = check_expression(shown, scope)
+    assert seen.tree is not None, (shown, seen.faults)
+    try:
+        expected = meaning(tree, at, _no_signal)  # type: ignore[arg-type]
+    except ZeroDivisionError:
+        return
+    assert math.isclose(expected, meaning(seen.tree, at, _no_signal), rel_tol=1e-9), shown  # type: ignore[arg-type]
+
+
+def _read(shown: ElementTree.Element) -> str:
+    """Read MathML as a reader does: what stands in a row is a text, whoever made the row."""
+    parts = [_read(child) for child in shown]
+    match shown.tag:
+        case "mfrac":
+            return f"(({parts[0]})/({parts[1]}))"
+        case "msup":
+            return f"{parts[0]}**({parts[1]})"
+        case _:
+            text = {"−": "-", "⋅": "*"}.get(shown.text or "", shown.text or "")
+            return text + "".join(parts)
 
 
 @given(st.text(max_size=200))

@@ -196,6 +196,36 @@ def test_one_wild_point_is_flagged_and_rarely_one_of_a_clean_batch() -> None:
     assert [one.is_outlier for one in found.influences] == [i == 4 for i in range(8)]
 
 
+def test_the_laws_are_those_of_the_points_without_the_outliers() -> None:
+    x = np.arange(1.0, 11.0)
+    stderr = np.linspace(0.05, 0.15, 10)
+    y = 2.0 + 0.5 * x + stderr * np.random.default_rng(3).normal(size=10)
+    y[[2, 7]] += [4.0, -3.0]
+    rest = np.delete(np.arange(10), [2, 7])
+    found = fit_trend(x, y, stderr, [20.0])
+    alone = fit_trend(x[rest], y[rest], stderr[rest], [20.0])
+    assert (found.excluded, alone.excluded) == ((2, 7), ())
+    assert [law.coefficients for law in found.laws] == [law.coefficients for law in alone.laws]
+    assert (found.band, found.predictions) == (alone.band, alone.predictions)
+    assert [found.influences[i] for i in rest] == list(alone.influences)
+    assert [i for i, one in enumerate(found.influences) if one.is_outlier] == [2, 7]
+    assert fit_trend(x[1:], y[1:], stderr[1:]).excluded == (1,)  # one of nine, the worse
+    counted = fit_trend(x, y, stderr, outliers="include")
+    assert counted.excluded == ()
+    assert counted.best_law is not None
+    assert counted.best_law.degrees == 8
+
+
+@pytest.mark.parametrize(("n", "excluded"), [(4, 0), (5, 1), (9, 1), (10, 2)])
+def test_at_most_a_fifth_of_the_points_leaves_a_law(n: int, excluded: int) -> None:
+    x = np.arange(1.0, n + 1.0)
+    y = 2.0 + 0.5 * x + 1e-4 * np.random.default_rng(1).normal(size=n)
+    y[[0, 3, -1]] += [60.0, -8.0, 1.0]
+    assert len(fit_trend(x, y, np.full(n, 1e-4)).excluded) <= excluded
+    y[[0, -1]] -= [60.0, 1.0]
+    assert fit_trend(x, y, np.full(n, 1e-4)).excluded == ((3,) if excluded else ())
+
+
 def test_a_point_that_its_stated_error_explains_is_no_outlier() -> None:
     y = 2.0 + 0.5 * X
     y[1] += 0.1

@@ -1,39 +1,20 @@
-// What a model is: its description, its equations as they are written by hand, its source.
+// What a model is: its description, its equations as MathML, its source.
 
 import { makeElement } from './live.js';
 
 const place = document.getElementById('about-model');
 
-/** Write an expression with raised powers, and dots for products. Text never becomes markup. */
-function writeExpression(text) {
-  const line = document.createElement('code');
-  for (const [part] of text.matchAll(/\*\*\s*(?:[\w.]+|\([^()]*\))|(?:(?!\*\*)[^])+?(?=\*\*|$)/g)) {
-    const power = part.match(/^\*\*\s*\(?([^()]*)\)?$/);
-    line.append(power ? makeElement('sup', power[1]) : part.replaceAll(/\s*\*\s*/g, '·').replaceAll('-', '−'));
-  }
-  return line;
-}
+/** Make the element of an equation. The server makes the MathML from the checked model. */
+const makeMath = (mathml) => document.importNode(new DOMParser().parseFromString(mathml, 'application/xml').documentElement, true);
 
-const LEFT_SIDES = {
-  differential: (state) => `d${state}/dt = `,
-  difference: (state) => `${state}, next sample = `,
-};
-
-/** Show title, description, equations, outputs and source of a model. */
-export function describeModel(model) {
-  const writeLeft = LEFT_SIDES[model.form] ?? ((name) => `${name} = `);
-  const rows = [
-    ...Object.entries(model.equations ?? {}).map(([name, text]) => [writeLeft(name), text]),
-    ...Object.entries(model.outputs ?? {}).map(([name, text]) => [`${name} = `, text]),
-  ].filter(([, text]) => typeof text === 'string');
-  const list = makeElement('div', '', 'equations');
-  for (const [left, text] of rows) {
-    const row = document.createElement('div');
-    row.append(makeElement('i', left), writeExpression(text));
-    list.append(row);
+/** Show title, equations, description and source of a model. */
+export function describeModel(model, equations) {
+  const list = Object.assign(makeElement('div', '', 'equations'), { role: 'group', ariaLabel: 'Equations', tabIndex: 0 });
+  for (const { mathml } of equations) {
+    list.append(document.createElement('div'));
+    list.lastChild.append(makeMath(mathml));
   }
-  const parts = [makeElement('b', model.title ?? model.name ?? '')];
-  if (rows.length) parts.push(list);
+  const parts = [makeElement('b', model.title ?? model.name ?? ''), list];
   if (model.description) parts.push(makeElement('p', model.description, 'muted'));
   if (model.source) parts.push(makeElement('p', `Source: ${model.source}`, 'muted'));
   place.replaceChildren(...parts);

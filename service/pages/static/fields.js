@@ -42,6 +42,7 @@ export function fillTable(model, changes) {
       input.dataset.bound = followsData ? '' : bounds?.[column] ?? '';
       input.value = changes[name]?.[column] ?? input.dataset.bound;
       row.append(document.createElement('td'));
+      row.lastChild.dataset.label = column;
       row.lastChild.append(input);
     }
     row.append(makeElement('td', bounds?.unit ?? '–', 'muted'), makeElement('td', bounds?.description ?? '', 'muted'));

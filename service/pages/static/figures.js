@@ -8,6 +8,7 @@ const CONFIG = {
   responsive: true,
   modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d', 'toImage', 'sendChartToCloud'], // nothing leaves this service
 };
+const isDark = () => dark.matches && !document.body.classList.contains('printing'); // paper is white
 const seen = new WeakSet();
 const latest = new WeakMap();
 
@@ -17,8 +18,8 @@ export const listPlots = () => [...document.querySelectorAll('[data-figure]')];
 function buildAddress(plot, extra = {}) {
   const url = new URL(plot.dataset.url, location.href);
   const query = new URLSearchParams([...url.searchParams, ...new URLSearchParams(plot.dataset.query ?? '')]);
-  query.set('theme', dark.matches ? 'dark' : 'light');
-  if (['convergence', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', countColumns(plot));
+  query.set('theme', isDark() ? 'dark' : 'light');
+  if (['convergence', 'posterior', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', countColumns(plot));
   for (const [name, value] of Object.entries(extra)) query.set(name, value);
   url.search = query;
   return url;
@@ -67,13 +68,13 @@ function offerImages(plot) {
   }
 }
 
-/** Draw every plot, fit all to a sheet, and print. */
+/** Draw every plot in light colours for the width of a sheet, and print. */
 async function printAll() {
-  await Promise.all(listPlots().filter((plot) => !seen.has(plot)).map((plot) => {
+  document.body.classList.add('printing');
+  await Promise.all(listPlots().map((plot) => {
     seen.add(plot);
     return draw(plot);
   }));
-  document.body.classList.add('printing');
   await fitPlots();
   window.print();
 }
@@ -83,7 +84,7 @@ const fitPlots = () => Promise.all([...document.querySelectorAll('.js-plotly-plo
 /** Request the profiles of a run, and draw them. */
 export async function drawProfiles(button) {
   const plot = button.closest('section').querySelector('[data-profile-plot]');
-  const url = `${button.dataset.profile}?theme=${dark.matches ? 'dark' : 'light'}`;
+  const url = `${button.dataset.profile}?theme=${isDark() ? 'dark' : 'light'}`;
   button.disabled = true;
   showMessage(plot, '…');
   try {
@@ -168,7 +169,7 @@ addEventListener('keydown', (event) => {
 });
 addEventListener('afterprint', () => {
   document.body.classList.remove('printing');
-  fitPlots();
+  redraw().then(fitPlots);
 });
 
 export function start() {

@@ -3,13 +3,13 @@
 import { Problem, address, ask, makeElement, keepLatest, post } from './live.js';
 import * as forms from './fields.js';
 import { clearFaults, fillTable, readOverrides, showProposals } from './fields.js';
-import { forgetPreview, previewDataset, readRange } from './preview.js';
+import { forgetPreview, listValidationSteps, previewDataset, readSteps } from './preview.js';
 import { describeModel } from './equations.js';
 
 const panel = document.getElementById('new');
 const form = document.getElementById('job-form');
 const field = (name) => form.elements.namedItem(name);
-const state = { dataset: null, model: null, cloned: null, extra: {}, part: null };
+const state = { dataset: null, model: null, cloned: null, extra: {}, part: null, validation: null };
 const query = new URLSearchParams(location.search);
 const USUAL_MODEL = 'fopdt';
 
@@ -91,7 +91,7 @@ async function showDataset() {
   state.dataset = answer.dataset;
   const facts = document.getElementById('dataset-facts');
   const channels = state.dataset?.channels ?? [];
-  if (state.dataset) previewDataset(form, state.dataset.id);
+  if (state.dataset) previewDataset(form, state.dataset);
   else forgetPreview(form);
   facts.textContent = channels.map(({ name, unit }) => (unit && unit !== '1' ? `${name} [${unit}]` : name)).join(' · ');
   mapChannels();
@@ -142,7 +142,7 @@ async function showListedModel(changes) {
   field('equations').value = text;
   field('equations').readOnly = true;
   document.getElementById('yaml').open = false;
-  applyModel(model.document, changes);
+  applyModel(model.document, model.equations, changes);
   showVerdict({ valid: true });
 }
 
@@ -160,7 +160,7 @@ async function checkModel(changes) {
     ask(address('/v1/models:check'), { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
   if (!result) return null;
   showVerdict(result);
-  if (result.valid) applyModel(result.normal_form, changes);
+  if (result.valid) applyModel(result.normal_form, result.equations, changes);
   return result.valid;
 }
 
@@ -178,11 +178,11 @@ function showVerdict(result) {
   place.replaceChildren(makeElement('span', ...verdict), ...(list.children.length ? [list] : []));
 }
 
-function applyModel(model, changes) {
+function applyModel(model, equations, changes) {
   const same = JSON.stringify(state.model) === JSON.stringify(model);
   state.model = model;
   if (same && !changes) return;
-  describeModel(model);
+  describeModel(model, equations);
   fillTable(model, changes ?? readOverrides());
   mapChannels();
 }
@@ -279,30 +279,35 @@ function buildBody() {
 /** Build the validation: null, the last part of the recording, or another recording. */
 function buildValidation(value) {
   if (!value) return null;
-  return value.startsWith('ds_') ? { datasets: [value] } : { fraction: Number(value) };
+  return value.startsWith('ds_') ? { datasets: [state.validation ?? value] } : { fraction: Number(value) };
 }
 
-/** Store the chosen part of the recording, if it is not all of it. */
-async function cutRecording() {
-  const range = readRange(form);
-  state.part = null;
-  if (!range || !state.dataset) return true;
+const derive = (id, steps) => post(address(`/v1/datasets/${encodeURIComponent(id)}:derive`), { steps });
+
+/** Store the chosen part of the recording without what is subtracted, and validation data likewise. */
+async function prepareRecording() {
+  const steps = readSteps(form);
+  state.part = state.validation = null;
+  if (!steps.length || !state.dataset) return true;
   try {
-    const part = await post(address(`/v1/datasets/${encodeURIComponent(state.dataset.id)}:derive`), { steps: [{ trim: range }] });
+    const part = await derive(state.dataset.id, steps);
     state.part = part.id;
+    const others = listValidationSteps(part);
+    const validation = field('validation').value;
+    if (validation.startsWith('ds_') && others.length) state.validation = (await derive(validation, others)).id;
     return true;
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
-    form.querySelector('[data-fault="/datasets"]').textContent = `The part of the recording: ${error.errors[0]?.detail ?? error.message}.`;
+    form.querySelector('[data-fault="/datasets"]').textContent = `The use of the recording: ${error.errors[0]?.detail ?? error.message}.`;
     showState('');
-    field('from').focus();
+    field(error.errors[0]?.pointer?.includes('detrend') ? 'detrend' : 'from').focus();
     return false;
   }
 }
 
-/** Own equations are checked, and the part of the recording is cut, before the job is sent. */
+/** Own equations are checked, and the recording is prepared, before the job is sent. */
 async function isReady() {
-  return (await isModelReady()) && cutRecording();
+  return (await isModelReady()) && prepareRecording();
 }
 
 async function isModelReady() {

@@ -1,9 +1,10 @@
 // The channels of a recording in the form, and the part of it that is used.
 
 import { draw } from './figures.js';
-import { address } from './live.js';
+import { address, makeElement } from './live.js';
 
 const plot = document.querySelector('[data-preview]');
+const detrended = document.getElementById('detrended');
 const field = (form, name) => form.elements.namedItem(name);
 let loading = null;
 
@@ -20,9 +21,10 @@ function loadPlotly() {
 }
 
 /** Draw the channels of a recording. A zoom along the time chooses the part that is used. */
-export async function previewDataset(form, id) {
-  for (const name of ['from', 'to']) field(form, name).value = '';
+export async function previewDataset(form, { id, channels }) {
+  clear(form);
   document.getElementById('preview').hidden = false;
+  detrended.replaceChildren(...channels.map(({ name }) => makeTick(name)));
   plot.dataset.figure = 'signals';
   plot.dataset.url = address(`/v1/datasets/${encodeURIComponent(id)}/figures/signals`);
   await loadPlotly();
@@ -38,12 +40,45 @@ export async function previewDataset(form, id) {
 }
 
 export function forgetPreview(form) {
-  for (const name of ['from', 'to']) field(form, name).value = '';
+  clear(form);
   document.getElementById('preview').hidden = true;
 }
 
+function clear(form) {
+  for (const name of ['from', 'to', 'detrend']) field(form, name).value = '';
+  detrended.hidden = true;
+}
+
+/** Make the tick of a channel from which the mean or line is subtracted. */
+function makeTick(name) {
+  const label = makeElement('label', '', 'inline');
+  const box = Object.assign(document.createElement('input'), { type: 'checkbox', name: 'detrended', value: name, checked: true });
+  label.append(box, name);
+  return label;
+}
+
+document.addEventListener('change', ({ target }) => {
+  if (target.name === 'detrend') detrended.hidden = !target.value;
+});
+
+/** Read how the recording is prepared, as steps of a derivation: its part, and what is subtracted. */
+export function readSteps(form) {
+  const range = readRange(form);
+  const kind = field(form, 'detrend').value;
+  const channels = [...detrended.querySelectorAll(':checked')].map((box) => box.value);
+  return [...(range ? [{ trim: range }] : []), ...(kind ? [{ detrend: { kind, channels } }] : [])];
+}
+
+/** Read what is subtracted from validation data: the means of the prepared part, or their own lines. */
+export function listValidationSteps(part) {
+  const step = part.details.steps.find(({ detrend }) => detrend);
+  if (!step) return [];
+  const means = Object.fromEntries(part.details.subtracted.map(({ channel, value }) => [channel, value]));
+  return [step.detrend.kind === 'mean' ? { offset: means } : step];
+}
+
 /** Read the part of the recording that is used; null for all of it. Other text is sent as typed. */
-export function readRange(form) {
+function readRange(form) {
   const range = {};
   for (const [name, key] of [['from', 'start'], ['to', 'stop']]) {
     const text = field(form, name).value.trim();

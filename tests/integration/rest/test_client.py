@@ -98,10 +98,16 @@ def test_a_dataset_is_downloaded_piece_by_piece(client: Client, dataset: str) ->
 
 
 def test_models_are_read_checked_and_stored(client: Client) -> None:
-    document = client.model("fopdt")["document"]
-    assert client.check_model(document)["valid"] is True
+    read = client.model("fopdt")
+    document, [equation, _] = read["document"], read["equations"]
+    assert equation["text"] == "dx/dt = (K*u(t - L) - x)/T"
+    assert equation["mathml"].startswith("<math")
+    checked = client.check_model(document)
+    assert checked["valid"] is True
+    assert checked["equations"] == read["equations"]
     assert client.add_model({**document, "name": "own"})["version"] == 1
-    assert "own" in {one["name"] for one in client.models()}
+    listed = {one["name"]: one for one in client.models()}
+    assert listed["own"]["equations"] == []
 
 
 @pytest.mark.parametrize("name", ["a b", "a/b?c#d", "100%", "é:x"])

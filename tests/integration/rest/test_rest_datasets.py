@@ -1,6 +1,7 @@
 """Datasets over REST: stored once, read in parts, derived, simulated, traced back."""
 
 from hashlib import sha256
+from html import escape
 from io import BytesIO
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from starlette.testclient import TestClient
 
+from service.core.text import format_subtracted
 from service.formats.mcap import read_mcap
 from tests.rest import CSV, recording, refused, store_csv
 
@@ -209,6 +211,18 @@ def test_lineage_leads_from_a_derived_dataset_to_its_source(
     edge = {"parent": dataset, "child": child["id"], "relation": "derived"}
     assert edge in server.get(f"/v1/datasets/{child['id']}/lineage").json()["edges"]
     assert edge in server.get(f"/v1/datasets/{dataset}/lineage").json()["edges"]
+
+
+def test_a_detrended_dataset_tells_what_was_subtracted(server: TestClient, dataset: str) -> None:
+    steps = [{"trim": {"start": 5}}, {"detrend": {"kind": "linear", "channels": ["y"]}}]
+    derived = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps}).json()
+    [line] = derived["details"]["subtracted"]
+    assert (line["channel"], line["time"]) == ("y", 5.0)
+    text = format_subtracted(line)
+    assert f"Subtracted from {escape(text)}." in server.get(f"/datasets/{derived['id']}").text
+    body = {"model": "fopdt", "datasets": [derived["id"]]}
+    job = server.post("/v1/jobs", json=body).json()
+    assert f"subtracted from {escape(text)}" in server.get(f"/jobs/{job['id']}").text
 
 
 def test_a_part_tells_and_keeps_what_was_recorded_before_it(

@@ -291,6 +291,10 @@ def test_figure_page_and_report_show_the_trend(served: ServedBatch) -> None:
     assert [one["x"] for one in points] == [list(LENGTHS)] * 3
     assert all(len(one["error_y"]["array"]) == 4 for one in points)
     assert json.dumps(figure, allow_nan=False)
+    query = {"outliers": "include"}
+    for path in ("figures/trend", "trend"):
+        assert served.server.get(f"/v1/jobs/{served.job}/{path}", params=query).is_success
+        refused(served.server.get(f"/v1/jobs/{served.job}/{path}?outliers=some"), 422, "invalid")
     page = served.server.get(f"/jobs/{served.job}").text
     assert "Trend over length [m]" in page
     assert "L = (0.0" in page
@@ -339,12 +343,23 @@ def test_the_command_uploads_prints_and_accepts(
         words.append(f"{x:g}={file}")
     out = tmp_path / "trend.json"
     told = command.invoke(
-        build_program(), [*words, "--output", str(out), "--accept", "own", "--accept-run", "4"]
+        build_program(),
+        [
+            *words,
+            "--output",
+            str(out),
+            "--accept",
+            "own",
+            "--accept-run",
+            "4",
+            "--keep-outliers",
+        ],
     )
     assert told.exit_code == 0, told.output
     assert "L = (" in told.output
     assert "predicted" in told.output
     trend = json.loads(out.read_text())
+    assert trend["outliers"] == "include"
     accepted = next(one["runs"][0] for one in trend["labels"] if one["x"] == 4)
     assert f"own: {accepted}" in told.output
     shown = command.invoke(build_program(), ["references", "show", "own"])

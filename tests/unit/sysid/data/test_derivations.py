@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidSettings
-from sysid.data.derivations import derive_recording
+from sysid.data.derivations import apply_steps, derive_recording
 from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Hold, Recording, Segment
 from sysid.models.catalogue.load import load_model
@@ -95,6 +95,20 @@ def test_detrending_takes_away_what_it_says() -> None:
     np.testing.assert_allclose(values(line, "y"), 0, atol=1e-12)
     mean = derive_recording(recording(), [{"detrend": {}}])
     assert np.mean(values(mean, "u")) == pytest.approx(0, abs=1e-14)
+
+
+def test_what_detrending_subtracted_gives_the_recording_back() -> None:
+    before = [{"trim": {"start": 2}}, {"unit": {"y": "mm"}}]
+    steps = [{"detrend": {"channels": ["y"]}}, {"detrend": {"kind": "linear"}}]
+    derived, subtracted = apply_steps(recording(), [*before, *steps])
+    assert [(one.channel, one.unit) for one in subtracted] == [("y", "mm"), ("u", "V"), ("y", "mm")]
+    assert [one.slope == 0 for one in subtracted] == [True, False, False]
+    whole = derive_recording(recording(), before)
+    for name in ("u", "y"):
+        trends = [one for one in subtracted if one.channel == name]
+        times = derived.channel(name).times
+        back = values(derived, name) + sum(t.value + t.slope * (times - t.time) for t in trends)
+        np.testing.assert_allclose(back, values(whole, name), atol=1e-9)
 
 
 def test_a_line_survives_resampling() -> None:
