@@ -61,6 +61,8 @@ MAX_JOBS = 64
 may be claimed if they are short or urgent: one identification need not wait for 64 sweeps."""
 MAX_ENDING = 2
 """Parcels whose end is being written at most; then the dispatcher waits for the oldest."""
+NEW_OBJECTS = 10_000
+"""New objects after which garbage is searched among them; a run has dozens while it is open."""
 SHORT_RUNS = 8
 """A job with at most this many runs is short."""
 
@@ -443,16 +445,19 @@ def serve_jobs(settings: Settings, local: LocalRay | None, start: DispatcherStar
 
 @contextmanager
 def _spare_from_collection() -> Iterator[None]:
-    """Leave what lives now out of the search for garbage, until the block ends.
+    """Search seldom for garbage, and not among what lives now, until the block ends.
 
     Modules have some hundred thousand objects. To search them again and again took a tenth of the
     time of a dispatcher.
     """
+    _, *later = thresholds = gc.get_threshold()
+    gc.set_threshold(NEW_OBJECTS, *later)
     gc.freeze()
     try:
         yield
     finally:
         gc.unfreeze()
+        gc.set_threshold(*thresholds)
 
 
 def bind_lease(lease: Lease) -> AbstractContextManager[None]:
