@@ -11,6 +11,7 @@ from service.queue.dispatchers import DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
+from service.storage.tables import Job
 from tests.rest import parts_of, recording, refused, store_csv
 
 
@@ -304,3 +305,31 @@ def test_the_wall_time_of_a_job_is_null_while_it_waits_and_stands_still_at_its_e
         LeaseQueue(session).finish_job(claim.lease, JobState.CANCELLED)
     ended, later = (own.get(f"/v1/jobs/{job['id']}").json()["seconds"] for _ in range(2))
     assert second <= ended == later
+
+
+def test_a_job_whose_model_an_earlier_version_accepted_stays_in_the_lists(
+    server: TestClient, dataset: str
+) -> None:
+    model = {
+        "name": "pipe",
+        "form": "differential",
+        "inputs": {"u": "degC", "q": "m3/h"},
+        "states": {"x": "degC"},
+        "parameters": {"V": {"lower": 0.1, "upper": 1, "unit": "m3"}},
+        "equations": {"x": "u(t - V/q) - x"},  # the lag is in hours, which was read as seconds
+        "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    }
+    refused(
+        server.post("/v1/jobs", json={"model": model, "datasets": [dataset]}),
+        422,
+        "invalid",
+    )
+    job = submit(server, dataset)["id"]
+    with parts_of(server).database.write_session() as session:
+        stored = session.get_one(Job, job)
+        stored.spec = {**stored.spec, "model": model}
+    listed = server.get("/v1/jobs").json()["items"]
+    assert [entry["rms_unit"] for entry in listed if entry["id"] == job] == ["1"]
+    for path in ("/", f"/v1/jobs/{job}", f"/v1/jobs/{job}/runs"):
+        assert server.get(path).status_code == 200, path
