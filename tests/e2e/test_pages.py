@@ -152,10 +152,10 @@ def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
 def test_results_are_sorted_and_ticked_to_be_compared(site: Site, page: Page) -> None:
     page.goto(site.url)
     names = page.locator("table.jobs .name")
-    page.get_by_role("button", name="Fit").click()
-    expect(names.nth(0)).to_have_text("three methods, four seeds")
-    page.get_by_role("button", name="Fit").click()
+    page.get_by_role("link", name="Fit").click()
     expect(names.nth(0)).to_have_text("tube 40 m, pattern 1")
+    page.get_by_role("link", name="Fit").click()
+    expect(names.nth(0)).to_have_text("three methods, four seeds")
     compare = page.get_by_role("button", name="Compare")
     expect(compare).to_be_disabled()
     page.get_by_label("compare tube 40 m, pattern 1").check()
@@ -168,7 +168,7 @@ def test_results_are_sorted_and_ticked_to_be_compared(site: Site, page: Page) ->
         }"""
     )
     expect(page.get_by_label("compare three methods, four seeds")).to_be_checked()
-    expect(names.nth(0)).to_have_text("tube 40 m, pattern 1")  # the order stays too
+    expect(names.nth(0)).to_have_text("three methods, four seeds")  # the order stays too
     compare.click()
     expect(page.get_by_role("heading", level=1)).to_have_text("Comparison of 2 runs")
     assert page.locator(f"{figure(page, 'response')} {LINES}").count() >= 3
