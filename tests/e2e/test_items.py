@@ -70,7 +70,7 @@ def test_a_recording_is_deleted_after_its_jobs_were_shown(own_site: Site, page: 
     expect(page).to_have_url(f"{own_site.url}/")
     expect(page.locator("table.jobs tbody tr")).to_have_count(4)
     page.goto(f"{own_site.url}/datasets/{own_site.filled.dataset}")
-    expect(page.get_by_text("deleted,")).to_be_visible()  # its place in the lineage
+    expect(page.get_by_text("job, deleted")).to_be_visible()  # its place in the lineage
     page.get_by_role("button", name="Delete").click()
     dialog = page.get_by_role("dialog", name="Delete the dataset")
     dialog.get_by_role("button", name="Delete").click()
