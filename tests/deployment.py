@@ -185,7 +185,10 @@ def _locate_node(host: str) -> dict[str, str]:
 
 def _fill(text: str, chosen: Mapping[str, str]) -> str:
     """Fill in the variables of Compose; a secret that nothing needs here is any text."""
-    return re.sub(r"\$\{(\w+):\?[^}]*\}", lambda found: chosen.get(found[1], "rehearsal"), text)
+    with_defaults = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text)
+    return re.sub(
+        r"\$\{(\w+):\?[^}]*\}", lambda found: chosen.get(found[1], "rehearsal"), with_defaults
+    )
 
 
 def _replace(text: str, replaced: Mapping[str, str]) -> str:

@@ -28,6 +28,8 @@ from service.storage.sessions import Database, SessionOwner
 from service.storage.tables import DEFAULT_PROJECT, ApiKey
 
 MAX_USER_CHARACTERS = 100
+MAX_ADDRESS_CHARACTERS = 100
+"""More than any address; a proxy may pass on what its client calls one."""
 NOTE_BUSY_SECONDS = 0.5
 """How long the note of a key's use waits for the lock of others; then a later one is written."""
 _NO_DIGEST = hash_secret(make_secret())
@@ -177,7 +179,9 @@ def record_refusal(
             key = session.get(ApiKey, key_id)
         if key is None:
             return
-        owner = SessionOwner(key.project_id, f"address:{address}", request_id)
+        owner = SessionOwner(
+            key.project_id, f"address:{address[:MAX_ADDRESS_CHARACTERS]}", request_id
+        )
         with database.open_for(owner).write_session(NOTE_BUSY_SECONDS) as session:
             record_action(session, "key.refuse", key.id)
 

@@ -61,6 +61,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         separate_input_output_schemas=False,
         docs_url=None,  # FastAPI's own page loads its scripts from elsewhere; ours is at /docs
         redoc_url=None,
+        redirect_slashes=False,  # its address has the scheme that a proxy may have changed
     )
     problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)

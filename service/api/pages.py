@@ -8,6 +8,7 @@ from fastapi.responses import (
     HTMLResponse,
     JSONResponse,
     PlainTextResponse,
+    RedirectResponse,
     Response,
 )
 
@@ -25,6 +26,7 @@ from service.api.items import (
 )
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
+from service.core.root_path import to_address
 from service.pages import guides, health, model_pages, pages, reference_pages, results
 from service.pages import render as assets
 from service.pages.bounds import propose_bounds
@@ -55,6 +57,8 @@ def guide_page(path: str) -> Response:
     """Show a page of the documentation, or one of its files."""
     if file := guides.find_file(path):
         return FileResponse(file, headers={"Cache-Control": "no-cache"})
+    if guides.is_folder(path):  # its links are relative
+        return RedirectResponse(to_address(f"/guides/{path}/"))
     return HtmlPage(pages.guide_page(path))
 
 

@@ -128,14 +128,18 @@ def add_datasets(
         fail_usage(f"--name names one recording; found {len(files)} files")
     for file in files:
         check_file(file)
+    stored = []
     with connect_client(url, key) as client:
         for file in files:
             source = read_file(file) if file == STANDARD_INPUT else file
             with report_faults(upload_origins(file)):
-                stored = client.add_dataset(
-                    source, name, segments=segments, sample_time=sample_time
+                stored.append(
+                    client.add_dataset(source, name, segments=segments, sample_time=sample_time)
                 )
-            _print_dataset(stored, as_json)
+            if not as_json:
+                _print_dataset(stored[-1], as_json)
+    if as_json:
+        print_json(stored[0] if len(files) == 1 else stored)
 
 
 @app.command("show", epilog=show_examples("lagid dataset show recording"))

@@ -205,7 +205,7 @@ def list_runs(
     label: LabelFilter = None,
     tag: TagFilter = None,
     order: Annotated[
-        str | None, typer.Option(help="Column to sort by, such as rms (default: number).")
+        str | None, typer.Option(help="Column to sort by, such as best_rms (default: number).")
     ] = None,
     descending: Annotated[
         bool, typer.Option("--descending", help="The largest value first.")

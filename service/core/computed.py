@@ -4,13 +4,19 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from threading import Lock
+from threading import BoundedSemaphore, Lock
 from typing import Any, TypeVar, cast
+
+from service.core.errors import ServiceBusy
 
 FRESH_SECONDS = 0.05
 """What took less and may change is computed anew each time."""
 REUSE_FACTOR = 20
 """What took longer is used again for so many times its time."""
+MAX_WAITING = 16
+"""Requests of this process that wait while others compute their value: each one holds one of the
+threads that all need."""
+_waiting = BoundedSemaphore(MAX_WAITING)
 
 T = TypeVar("T")
 
@@ -61,6 +67,11 @@ class ComputedValues:
         before_wait : callable
             Releases what the caller need not hold while another request computes the value.
 
+        Raises
+        ------
+        ServiceBusy
+            If too many requests wait already.
+
         Examples
         --------
         >>> squares = ComputedValues(size=10)
@@ -74,7 +85,7 @@ class ComputedValues:
                 self._entries.popitem(last=False)
         if not entry.lock.acquire(blocking=False):
             before_wait()
-            entry.lock.acquire()
+            _wait_for(entry.lock)
         try:
             if not entry.is_usable(is_final=is_final):
                 begun = time.monotonic()
@@ -84,3 +95,12 @@ class ComputedValues:
             return cast(T, entry.value)
         finally:
             entry.lock.release()
+
+
+def _wait_for(lock: Lock) -> None:
+    if not _waiting.acquire(blocking=False):
+        raise ServiceBusy("too many requests wait for the same result; ask again in a few seconds")
+    try:
+        lock.acquire()
+    finally:
+        _waiting.release()

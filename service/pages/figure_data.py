@@ -210,7 +210,7 @@ def read_run_experiments(
 
     Outputs have their bands where these can be computed.
     """
-    experiments = _read_experiments(session, store, stored)
+    experiments = read_plain_experiments(session, store, stored)
     if not experiments or not stored.estimates:
         return experiments
     try:
@@ -219,9 +219,10 @@ def read_run_experiments(
         return experiments
 
 
-def _read_experiments(
+def read_plain_experiments(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[ExperimentTraces]:
+    """Read the same records without bands, which take simulations."""
     try:
         fits = load_fitted_signals(session, store, stored)
     except Conflict:  # a dataset was deleted: the other figures are shown

@@ -14,6 +14,7 @@ from service.pages.diagnostics import plot_residual_tests
 from service.pages.figure_data import (
     read_corner_parameters,
     read_dataset_traces,
+    read_plain_experiments,
     read_residual_analysis,
     read_run_experiments,
     read_run_figure_data,
@@ -115,7 +116,7 @@ def load_comparison_figure(
     ordered = load_compared_runs(session, choice.run, same_data=False)
     titles = build_titles(ordered)
     read = {
-        titles[stored.run.id]: read_run_experiments(session, store, stored)
+        titles[stored.run.id]: read_plain_experiments(session, store, stored)
         for stored in ordered[:MAX_OVERLAID_RUNS]
     }
     experiments = max(read.values(), key=len)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from posixpath import dirname, join, normpath
+from posixpath import basename, dirname, join, normpath
 
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
@@ -37,7 +37,8 @@ def read_guide(path: str) -> Guide:
     Parameters
     ----------
     path : str
-        Of its file, from the folder of the documentation. A folder lists its pages.
+        Of its file, from the folder of the documentation. A folder, whose path ends with one
+        slash, lists its pages.
 
     Raises
     ------
@@ -60,6 +61,11 @@ def find_file(path: str) -> Path | None:
     return file if file is not None and file.suffix in FILES else None
 
 
+def is_folder(path: str) -> bool:
+    """Return whether a path is that of a folder with pages, without the slash at its end."""
+    return f"{path}/" in _list_folders()
+
+
 @cache
 def _list_files() -> dict[str, Path]:
     """List pages and files by their paths; only what is listed is ever opened."""
@@ -72,6 +78,16 @@ def _list_files() -> dict[str, Path]:
     }
 
 
+@cache
+def _list_folders() -> dict[str, list[str]]:
+    """List the pages of each folder, by its path with a slash at its end."""
+    folders: dict[str, list[str]] = {}
+    for name in sorted(_list_files()):
+        if name.endswith(".md") and dirname(name):
+            folders.setdefault(f"{dirname(name)}/", []).append(name)
+    return folders
+
+
 def _find_folder() -> Path:
     """Find the documentation: in the installed package, or in the checkout."""
     spec = find_spec("service.guides")
@@ -82,13 +98,11 @@ def _find_folder() -> Path:
 
 def _list_folder(path: str) -> str:
     """List the pages of a folder as Markdown, each by its title."""
-    folder = path.rstrip("/") + "/"
-    found = [name for name in sorted(_list_files()) if name.startswith(folder)]
-    pages = [name for name in found if name.endswith(".md") and "/" not in name[len(folder) :]]
-    if not pages:
+    pages = _list_folders().get(path)
+    if pages is None:
         raise NotFound("page", path)
-    lines = [f"* [{read_guide(name).title}]({name[len(folder) :]})" for name in pages]
-    return "\n".join([f"# {folder.rstrip('/').capitalize()}", "", *lines])
+    lines = [f"* [{read_guide(name).title}]({basename(name)})" for name in pages]
+    return "\n".join([f"# {path.rstrip('/').capitalize()}", "", *lines])
 
 
 def _render(text: str, path: str) -> str:
@@ -99,7 +113,8 @@ def _render(text: str, path: str) -> str:
             token.attrs["id"] = _name_anchor(content.content)
         _keep_inside(token.children or [], path)
     html = str(parser.renderer.render(tokens, parser.options, {}))
-    html = html.replace("<pre>", '<pre tabindex="0">')  # wide output is scrolled with keys, too
+    # What is wider than the page is scrolled with keys, too.
+    html = re.sub("<(pre|table)>", r'<\1 tabindex="0">', html)
     return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)  # an empty heading is none
 
 

@@ -98,7 +98,9 @@ def results_page(session: Session, choice: ResultChoice) -> str:
     parameter, entries = _choose_parameter(page.items, choice.parameter)
     query = dict(choice.form)
     listed = [
-        ListedResult(row, find_model_name(row.job.spec), _describe_place(row), to_estimate_view(one))
+        ListedResult(
+            row, find_model_name(row.job.spec), _describe_place(row), to_estimate_view(one)
+        )
         for row, one in entries
     ]
     return render_template(

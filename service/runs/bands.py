@@ -18,7 +18,7 @@ from service.core.concurrency import simulation_limit
 from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest, NotFound
 from service.jobs.stored_run import StoredRun, load_estimated_run, to_estimate
-from service.runs.profiles import read_estimate
+from service.runs.profiles import measure_work, read_estimate
 from service.runs.schemas import BandExperimentOut, BandOut, BandsOut
 from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
     from sysid.uncertainty.output_bands import OutputBands
 
-MAX_WORK = 20_000_000  # measured values × parameters
+MAX_WORK = 20_000_000  # of `measure_work`: about five seconds
 _CACHE_SIZE = 4  # runs: a zoom reads the same bands repeatedly
 _computed_bands = ComputedValues(_CACHE_SIZE)
 
@@ -123,10 +123,10 @@ def _compute_bands(
 
 
 def _check_work(run_id: str, problem: "Problem") -> None:
-    work = problem.evaluator.n_measured * len(problem.free_parameters)
+    work = measure_work(problem)
     if work > MAX_WORK:
         raise Conflict(
-            f"the bands of run {run_id} are too much work. Samples × parameters is {work:.3g}; "
+            f"the bands of run {run_id} are too much work. Steps × parameters is {work:.3g}; "
             f"need at most {MAX_WORK:.3g}. Use `compute_bands` of the Python library"
         )
 

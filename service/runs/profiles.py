@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
 
 
-MAX_WORK = 300_000_000  # measured values × parameters × points × profiles
+MAX_WORK = 300_000_000  # `measure_work` × points × profiles
 LIMIT_SECONDS = 45.0  # a client waits a minute
 CHI_SQUARED_95 = (
     3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
@@ -51,12 +51,12 @@ def compute_profiles(
         problem = stored.problem(session, store)
     theta = read_estimate(problem, stored)
     names = _choose_parameters(problem, body)
-    work = problem.evaluator.n_measured * len(problem.free_parameters) * body.points * len(names)
+    work = measure_work(problem) * body.points * len(names)
     if work > MAX_WORK:
         raise InvalidRequest.from_fault(
             "/parameters",
             f"{len(names)} profiles of {body.points} points are too much work for this run. "
-            f"Samples × parameters × points × profiles is {work:.3g}; need at most "
+            f"Steps × parameters × points × profiles is {work:.3g}; need at most "
             f"{MAX_WORK:.3g}. "
             "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
@@ -106,6 +106,14 @@ def _profile_parameters(
             ratio=profile.likelihood_ratio.tolist(),
             rms=profile.rms.tolist(),
         )
+
+
+def measure_work(problem: "Problem") -> int:
+    """Measure the work of all derivatives: integration steps, or values if more, × parameters.
+
+    A model may have a thousand substeps, so its samples do not tell how long a simulation takes.
+    """
+    return max(problem.evaluator.n_measured, problem.n_steps) * len(problem.free_parameters)
 
 
 def read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:

@@ -88,9 +88,12 @@ def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> Indices:
     """Choose at most `max_points` indices: the ends, and each bin's minimum and maximum.
 
     A spike of one sample therefore stays visible at any zoom. Several arrays may share the indices.
+    Fewer than four points have no room for a bin: they are the ends.
     """
     if values.size <= max_points:
         return np.arange(values.size)
+    if max_points < 4:
+        return np.array([0, values.size - 1])
     inner = find_extremes(values, max_points - 2)
     return np.unique(np.concatenate([[0, values.size - 1], inner])).astype(np.intp)
 

@@ -151,7 +151,7 @@ def _describe_catalogue() -> Iterator[str]:
         if source := document.get("source"):
             yield f"\nSource: {source}\n"
         for equation in format_equations(load_model(name)):
-            yield f'\n<div class="equation">{equation.mathml}</div>\n'
+            yield f'\n<div style="overflow-x: auto; margin: .6rem 0">{equation.mathml}</div>\n'
         if parameters := document.get("parameters"):
             yield "\n| parameter | unit | from | to | meaning |\n|---|---|--:|--:|---|\n"
             for parameter, given in parameters.items():

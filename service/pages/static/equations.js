@@ -9,7 +9,7 @@ const makeMath = (mathml) => document.importNode(new DOMParser().parseFromString
 
 /** Show title, equations, description and source of a model. */
 export function describeModel(model, equations) {
-  const list = makeElement('div', '', 'equations');
+  const list = Object.assign(makeElement('div', '', 'equations'), { role: 'group', ariaLabel: 'Equations', tabIndex: 0 });
   for (const { mathml } of equations) {
     list.append(document.createElement('div'));
     list.lastChild.append(makeMath(mathml));

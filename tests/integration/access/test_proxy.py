@@ -87,16 +87,22 @@ def test_a_cookie_is_secure_where_a_proxy_speaks_https(
 
 
 @pytest.mark.parametrize(
-    ("address", "seen"), [("127.0.0.1", "203.0.113.5"), ("10.9.9.9", "10.9.9.9")]
+    ("address", "told", "seen"),
+    [
+        ("127.0.0.1", "203.0.113.5", "203.0.113.5"),
+        ("10.9.9.9", "203.0.113.5", "10.9.9.9"),
+        ("127.0.0.1", "x" * 5000, "x" * 100),
+    ],
+    ids=["a proxy", "another peer", "a proxy that passes on a lie"],
 )
 def test_only_a_proxy_tells_from_where_a_wrong_key_came(
-    tmp_path: Path, address: str, seen: str
+    tmp_path: Path, address: str, told: str, seen: str
 ) -> None:
     with guard("sqlite", tmp_path) as guarded:
         token = guarded.add_key()
         guarded.client._transport.client = (address, 1)  # type: ignore[attr-defined]
         headers = {
-            "X-Forwarded-For": "203.0.113.5",
+            "X-Forwarded-For": told,
             "Forwarded": "for=203.0.113.6",
             "X-Forwarded-Host": "evil.example",
         }

@@ -379,6 +379,8 @@ def test_several_recordings_are_stored_at_once(server: str, data: Path, tmp_path
     stored = run_lagid("dataset", "add", *copies, LAGID_URL=server)
     lines = [line for line in stored.stdout.splitlines() if line.startswith("ds_")]
     assert [line.partition(":")[0].split()[1:] for line in lines] == [["tube", "1"], ["tube", "2"]]
+    listed = json.loads(run_lagid("dataset", "add", *copies, "--json", LAGID_URL=server).stdout)
+    assert [dataset["name"] for dataset in listed] == ["tube 1", "tube 2"]
 
 
 def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(

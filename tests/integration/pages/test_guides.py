@@ -7,6 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.api.app import create_app
+from service.pages import guides
 from tests.repository import ROOT
 from tests.rest import settings_of
 
@@ -57,6 +58,16 @@ def test_headings_have_anchors_as_on_a_forge(client: TestClient) -> None:
     assert '<h2 id="lagged-states">Lagged states</h2>' in page
 
 
+def test_a_folder_has_one_address_where_its_links_lead_to_its_pages(client: TestClient) -> None:
+    asked = client.get("/guides/howto", follow_redirects=False)
+    assert (asked.status_code, asked.headers["Location"]) == (307, "/guides/howto/")
+    listed = client.get("/guides/howto/").text
+    assert 'href="read_the_verdict.md"' in listed
+    before = guides.read_guide.cache_info().currsize
+    assert client.get("/guides/howto///", follow_redirects=False).status_code == 404
+    assert guides.read_guide.cache_info().currsize == before  # nobody fills it
+
+
 def test_pictures_come_with_their_type(client: TestClient) -> None:
     picture = client.get("/guides/tutorials/pictures/first_time_lag.png")
     assert picture.headers["Content-Type"] == "image/png"
@@ -65,7 +76,10 @@ def test_pictures_come_with_their_type(client: TestClient) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["nothing.md", "%2e%2e/README.md", "..%2fREADME.md", "%2fetc%2fpasswd", "site/conf.py", ""],
+    [
+        *("nothing.md", "%2e%2e/README.md", "..%2fREADME.md", "%2fetc%2fpasswd", "site/conf.py"),
+        *("", "howto//", "/howto/", "tutorials/pictures/"),
+    ],
 )
 def test_only_the_documentation_is_shown(client: TestClient, path: str) -> None:
     assert client.get(f"/guides/{path}", follow_redirects=False).status_code == 404

@@ -280,9 +280,9 @@ def test_every_column_of_a_page_has_a_heading() -> None:
         assert "<th></th>" not in path.read_text(encoding="utf-8"), path.name
 
 
-def test_why_the_one_run_of_a_job_failed_is_told_once_above_its_figures(
+def test_why_the_one_run_of_a_job_failed_is_told_once_above_its_model(
     client: TestClient, filled: Filled
 ) -> None:
     text = client.get(f"/jobs/{filled.failed}").text
-    assert text[: text.index("Progress of every island")].count('class="note bad"') == 1
+    assert text[: text.index("<h2>Model</h2>")].count('class="note bad"') == 1
     assert "The run failed." in text

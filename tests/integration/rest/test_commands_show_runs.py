@@ -222,6 +222,8 @@ def test_a_dataset_is_derived_by_its_name(served: Served, tmp_path: Path) -> Non
     assert told.exit_code == 0, told.output
     stored = json.loads(told.stdout)
     assert served.client.lineage(stored["id"])["edges"][0]["parent"] == served.data
+    steps.write_text("- detrend: {channels: [y]}\n")
+    assert "note: subtracted from y: " in lagid("dataset", "derive", "steps", str(steps)).output
     with pytest.raises(ProblemError, match=r"no dataset 'step'.*did you mean 'steps'"):
         served.client.derive("step", [{"detrend": {}}])
 

@@ -19,6 +19,8 @@ from tests.rest import refused
         "/v1/datasets/ds_0",
         "/v1/datasets/ds_0/content",
         "/v1/models/nothing",
+        "/v1/jobs/",  # not led elsewhere: the address would have a scheme that may be wrong
+        "/datasets/",
     ],
 )
 def test_what_is_not_there_is_not_found(server: TestClient, path: str) -> None:

@@ -1,11 +1,13 @@
 """Bands of a run's outputs, and the order of its process: as documents, in figure and page."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from service.pages import figure_data
 from service.runs import bands
 from tests.identified import ServedRun, identified, serve_run
 from tests.rest import parts_of, recording, refused, store_csv
@@ -52,10 +54,11 @@ def test_bands_surround_the_simulated_output_over_the_whole_record(served: Serve
     assert outer[1] == pytest.approx(np.hypot(inner[1], 1.98 * noise), rel=0.02)
 
 
-def test_fewer_points_are_read_on_request(served: ServedRun) -> None:
-    path, query = f"/v1/runs/{served.run}/bands", {"max_points": 10}
+@pytest.mark.parametrize("most", [2, 3, 4, 10])
+def test_fewer_points_are_read_on_request(served: ServedRun, most: int) -> None:
+    path, query = f"/v1/runs/{served.run}/bands", {"max_points": most}
     [output] = served.server.get(path, params=query).json()["experiments"][0]["outputs"]
-    assert len(output["times"]) <= 10 < output["samples"]
+    assert 2 <= len(output["times"]) <= most < output["samples"]
     assert len(output["prediction_upper"]) == len(output["times"])
 
 
@@ -100,10 +103,20 @@ def test_bands_that_cannot_be_computed_say_why_and_the_figure_does_without(
     _, (run,) = identified(parts_of(served.server), {**served.body, "seed": 7})
     answer = served.server.get(f"/v1/runs/{run}/bands")
     refused(answer, 409, "conflict")
-    assert "too much work. Samples × parameters is 1.2e+03; need at most 10" in answer.text
+    [told] = re.findall(r"too much work. Steps × parameters is (\S+); need at most 10", answer.text)
+    result = served.server.get(f"/v1/runs/{run}").json()
+    samples, free = result["criteria"]["samples"], result["criteria"]["parameters"]
+    assert result["substeps"] > 1  # each of which is simulated
+    assert float(told) == pytest.approx(samples * result["substeps"] * free, rel=0.02)
     figure = served.server.get(f"/v1/runs/{run}/figures/response").json()
     assert [trace["name"] for trace in figure["data"][:2]] == ["measured", "identified"]
     refused(served.server.get("/v1/runs/run_none/bands"), 404, "not-found")
+    computed: list[object] = []  # several runs over each other are drawn without bands
+    monkeypatch.setattr(figure_data, "load_bands", lambda *given: computed.append(given))
+    query = f"run={served.run}&run={run}"
+    compared = served.server.get(f"/pages/compare/response?{query}").json()
+    assert len([trace for trace in compared["data"] if trace.get("mode") == "lines"]) > 2
+    assert computed == []
 
 
 def test_records_count_by_their_noise_when_a_run_is_opened_again(served: ServedRun) -> None:

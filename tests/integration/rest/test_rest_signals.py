@@ -19,7 +19,7 @@ from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
 from tests.identified import identified
 from tests.rest import recording, settings_of, store_csv
-from workers import job_queue
+from workers import job_queue, packing, tasks
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 SIGMAS = [0.0, 0.1, 0.2]
@@ -46,6 +46,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         }
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(job_queue, "choose_pack_size", lambda cost, waiting, slots: waiting)
+            for module, name in (  # however busy the machine is, the pack is not cut
+                (packing, "PACK_SECONDS"),
+                (packing, "FIRST_SLICE_SECONDS"),
+                (tasks, "PACK_LIMIT_SECONDS"),
+            ):
+                patched.setattr(module, name, 600.0)
             _, runs = identified(app.state.parts, body)
             yield Served(server, app.state.parts, runs, body)
 

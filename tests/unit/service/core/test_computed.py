@@ -1,12 +1,16 @@
 """Values that take long are computed once, and those that may change not too often."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import islice
+from threading import Event
 from types import SimpleNamespace
 
 import pytest
 
 from service.core import computed
-from service.core.computed import FRESH_SECONDS, REUSE_FACTOR, ComputedValues
+from service.core.computed import FRESH_SECONDS, MAX_WAITING, REUSE_FACTOR, ComputedValues
+from service.core.errors import ServiceBusy
 
 
 class Clock:
@@ -81,3 +85,28 @@ def test_what_failed_is_tried_again(clock: Clock) -> None:
     with pytest.raises(OSError):  # noqa: PT011 - any
         values.get("a", fail, is_final=True)
     assert values.get("a", lambda: 7, is_final=True) == 7
+
+
+def test_few_requests_wait_for_a_value_and_others_are_told_to_come_again() -> None:
+    """A thread that waits is one that no other request has."""
+    values, may_end = ComputedValues(2), Event()
+
+    def compute() -> int:
+        may_end.wait(30.0)
+        return 7
+
+    def ask() -> int | str:
+        try:
+            return values.get("a", compute, is_final=True)
+        except ServiceBusy as error:
+            return str(error)
+
+    with ThreadPoolExecutor(MAX_WAITING + 4) as pool:
+        answers = [pool.submit(ask) for _ in range(MAX_WAITING + 4)]
+        refused = [one.result() for one in islice(as_completed(answers), 3)]
+        may_end.set()
+    assert {str(one).partition(";")[0] for one in refused} == {
+        "too many requests wait for the same result"
+    }
+    assert [one.result() for one in answers].count(7) == MAX_WAITING + 1
+    assert ask() == 7
