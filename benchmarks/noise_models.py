@@ -12,6 +12,7 @@ plants have random parameters and random steps as input. The model has their str
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import exp, sqrt
 from multiprocessing import get_context
 from pathlib import Path
@@ -127,9 +128,9 @@ PLANTS = ("fopdt", "sopdt", "ipdt")
 NOISES = ("white", "slow", "slow and white", "random input", "a lag too few")
 
 
-def draw_case(number: int) -> Case:
+def draw_case(number: int, first_seed: int) -> Case:
     """A plant of the catalogue's kinds with one kind of noise, and two records of it."""
-    random = np.random.default_rng(FIRST_SEED + number)
+    random = np.random.default_rng(first_seed + number)
     plant, noise = PLANTS[number % 3], NOISES[number // 3 % 5]
     period, n = 0.2, int(random.integers(250, 600))
     gain, lag = random.uniform(1.0, 3.0), random.uniform(0.3, 1.5)
@@ -191,9 +192,9 @@ def run_case(case: Case) -> Outcome:
     )
 
 
-def run_draw(number: int) -> Outcome:
+def run_draw(number: int, first_seed: int) -> Outcome:
     """Run a simulated case."""
-    return run_case(draw_case(number))
+    return run_case(draw_case(number, first_seed))
 
 
 def print_outcomes(title: str, outcomes: list[Outcome]) -> None:
@@ -233,7 +234,8 @@ def main(options: argparse.Namespace) -> None:
     cases = list(list_measured(options.data)) if options.data else []
     with get_context("spawn").Pool(options.jobs) as pool:
         measured = pool.map(run_case, cases, chunksize=1)
-        simulated = pool.map(run_draw, range(draws), chunksize=4)
+        run = partial(run_draw, first_seed=options.first_seed)
+        simulated = pool.map(run, range(draws), chunksize=4)
     rows = []
     for title, outcomes in (("measured", measured), ("simulated", simulated)):
         if outcomes:
@@ -248,6 +250,7 @@ if __name__ == "__main__":
     arguments = parser(__doc__ or "")
     arguments.add_argument("--data", type=Path, help="folder of the measured records")
     arguments.add_argument("--draws", type=int, help=f"simulated plants (default {DRAWS})")
+    arguments.add_argument("--first-seed", type=int, default=FIRST_SEED)
     arguments.add_argument("--by-kind", action="store_true", help="a row for each kind of noise")
     arguments.add_argument("--jobs", type=int, default=1, help="processes")
     main(arguments.parse_args())

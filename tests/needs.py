@@ -1,8 +1,8 @@
 """What a test needs and a machine may lack, such as Chromium, a C compiler or measured records.
 
 Without it the test is skipped with a reason. With `LAGID_REQUIRE_BROWSER`,
-`LAGID_REQUIRE_COMPILER`, `LAGID_REQUIRE_PYTHON`, `LAGID_REQUIRE_GENERATOR` or `LAGID_REQUIRE_DATA`
-set to 1 it fails.
+`LAGID_REQUIRE_COMPILER`, `LAGID_REQUIRE_PYTHON`, `LAGID_REQUIRE_GENERATOR`, `LAGID_REQUIRE_DATA`
+or `LAGID_REQUIRE_NOTEBOOK` set to 1 it fails.
 `LAGID_MAX_SKIPPED` limits all other skips: the whole run fails if more tests were skipped, because
 a gate that skips is not seen.
 """
@@ -15,7 +15,7 @@ import pytest
 
 from tests.repository import ROOT
 
-Need = Literal["browser", "compiler", "data", "generator", "python"]
+Need = Literal["browser", "compiler", "data", "generator", "notebook", "python"]
 
 DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
 

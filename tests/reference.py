@@ -127,6 +127,7 @@ class Twin:
             self.given[name] = [float(v) for v in later]
         self.started = True
         self.first = {name: past[0] for name, past in self.past.items()}
+        self.histories = {one.state: one.expression for one in model.histories}
         zero = model.solver.history == "zero"
         self.before = dict.fromkeys(self.names, 0.0) if zero else self.first
 
@@ -248,6 +249,8 @@ class Twin:
             c = 1.0  # already updated: as it is at the end of the step
         place = c - past.offset
         at = place - self._lag(past, m, c)
+        if m + at < 0 and past.name in self.histories:
+            return self._value(self.histories[past.name], m, at, {}, 0)
         now = self.past[past.name][m]
         rise = values.get(past.name, now) - now
         if at > 0 and self._has_slopes():
@@ -268,6 +271,8 @@ class Twin:
 
         def sample(steps: int) -> float:
             place = m + min(steps, 0)
+            if place < 0 and name in self.histories:
+                return self._value(self.histories[name], place, 0.0, {}, 0)
             return self.past[name][place] if place >= 0 else self.before[name]
 
         if self._has_slopes() and f > 0:

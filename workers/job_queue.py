@@ -156,7 +156,7 @@ class JobQueue:
     def absorb_pack(self, handle: PackHandle, pack: PackResult) -> None:
         """Record the results of a pack; islands that were not processed are sent again."""
         items = self.in_flight.pop(handle)
-        waiting = self._release_runs(handle, items)
+        waiting = set(self._release_runs(handle, items))
         again: list[WorkItem] = []
         for item, result in zip(items, pack.results, strict=True):
             run = self._active.get(result.run)
@@ -204,12 +204,10 @@ class JobQueue:
     def _take_unstarted(self, size: int) -> list[ActiveRun]:
         """Take the next `size` runs that have not started and use the same records."""
         chosen = [self._ready.popleft()]
+        keys = chosen[0].spec.problem.record_keys
         while self._ready and len(chosen) < size:
             following = self._ready[0]
-            if (
-                following.needs_own_pack
-                or following.spec.problem.record_keys != chosen[0].spec.problem.record_keys
-            ):
+            if following.needs_own_pack or following.spec.problem.record_keys != keys:
                 break
             chosen.append(self._ready.popleft())
         return chosen

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
@@ -67,8 +67,10 @@ class ProblemSpec:
 
     def replace_noise(self, noise: Noise) -> "ProblemSpec":
         """Return the same fit with other noise; the key of all else is not computed again."""
-        other = replace(self, noise=noise)
-        other.__dict__["noise_free_key"] = self.noise_free_key
+        key = self.noise_free_key
+        other = object.__new__(ProblemSpec)  # `replace` looks up each field, run by run
+        other.__dict__.update(self.__dict__, noise=noise, noise_free_key=key)
+        other.__dict__.pop("cache_key", None)
         return other
 
     @property

@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from lagid import __version__  # noqa: E402 - of this checkout
+from service.pages.guides import list_notebooks  # noqa: E402
 from tests.documents.reference import follow_top_level, write_reference  # noqa: E402
 
 write_reference(ROOT / "docs" / "reference")
@@ -18,10 +19,13 @@ author = "The maintainers of lagid"
 release = __version__
 root_doc = "index"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
-exclude_patterns = ["README.md", "site", "notebooks", "openapi.json"]
+exclude_patterns = ["README.md", "site", "openapi.json"]
 source_suffix = {".md": "markdown"}
 suppress_warnings = ["toc.not_included"]
 html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+pygments_dark_style = "github-dark"  # Furo's own underlines names like links
 html_title = f"lagid {__version__}"
 html_show_sphinx = False
 html_copy_source = False
@@ -37,9 +41,15 @@ linkcheck_anchors = False
 
 
 def setup(app: Sphinx) -> None:
-    """Let links to pages of the top level of the repository lead to their copies."""
+    """Let links to pages of the top level lead to their copies, and pages to their notebooks."""
+    notebooks = list_notebooks()
 
     def follow(_: Sphinx, page: str, source: list[str]) -> None:
         source[0] = follow_top_level(source[0], "/reference/")
+        if f"{page}.ipynb" in notebooks:
+            title, rest = source[0].split("\n", 1)
+            path = f"/reference/notebooks/{page}.ipynb"
+            link = f"{{download}}`This page as a Jupyter notebook <{path}>`"
+            source[0] = f"{title}\n\n{link}\n{rest}"
 
     app.connect("source-read", follow)

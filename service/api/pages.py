@@ -54,9 +54,11 @@ def reference_page() -> Response:
 
 @router.get("/guides/{path:path}", **HIDDEN)
 def guide_page(path: str) -> Response:
-    """Show a page of the documentation, or one of its files."""
+    """Show a page of the documentation, one of its files, or a page as a notebook."""
     if file := guides.find_file(path):
         return FileResponse(file, headers={"Cache-Control": "no-cache"})
+    if notebook := guides.make_notebook(path):
+        return Response(notebook, media_type="application/x-ipynb+json")
     if guides.is_folder(path):  # its links are relative
         return RedirectResponse(to_address(f"/guides/{path}/"))
     return HtmlPage(pages.guide_page(path))

@@ -195,10 +195,15 @@ def fail_usage(message: str) -> NoReturn:
 
 def split_setting_path(change: str) -> list[str]:
     """Split the path of a ``--set path=value`` at its dots; end the command if it has no ``=``."""
-    path, equals, _ = change.partition("=")
+    path, equals, value = change.partition("=")
     if not equals:
         fail_usage(f"--set {change}: need path=value, such as algorithm.population=100")
-    return [part for part in path.replace("/", ".").split(".") if part]
+    parts = [part for part in path.replace("/", ".").split(".") if part]
+    if parts[:1] == ["initial"] and len(parts) > 1:
+        name, *fields = parts[1:]
+        wanted = ".".join(["parameters", f"{name.removesuffix('(0)')}(0)", *(fields or ["fixed"])])
+        fail_usage(f"--set {change}: a start value is a parameter: --set '{wanted}={value}'")
+    return parts
 
 
 def apply_setting(body: dict[str, Any], change: str) -> None:

@@ -1,6 +1,8 @@
 """`lagid`: the command line. Only the command that is run is imported; `--help` imports all."""
 
+import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -152,7 +154,7 @@ def build_program(only: str | None = None) -> typer.Typer:
             "lagid identify recording.csv --model fopdt", "lagid models", "lagid demo"
         ),
     )
-    program.callback()(describe_program)
+    program.callback(help=_join_lines(describe_program.__doc__))(describe_program)
     for panel, commands in _PANELS.items():
         for name, (source, *examples) in commands.items():
             if only not in (None, name):
@@ -163,7 +165,16 @@ def build_program(only: str | None = None) -> typer.Typer:
             else:
                 epilog = show_examples(*examples)
                 program.command(name, rich_help_panel=panel, epilog=epilog)(command)
+    groups = [group.typer_instance for group in program.registered_groups]
+    for each in (program, *filter(None, groups)):
+        for info in each.registered_commands:
+            info.help = _join_lines(info.callback.__doc__)
     return program
+
+
+def _join_lines(docstring: str | None) -> str:
+    """Join the lines of each paragraph of a help text; the terminal breaks them at its width."""
+    return re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.cleandoc(docstring or ""))
 
 
 def _load_command(source: str) -> Any:

@@ -121,7 +121,7 @@ class _BoundsMaker:
             entry["reference"] = retry_transient(partial(self._read_reference, cell))
             if entry["reference"] is None:
                 return {**entry, "note": "no run succeeded, so there is no reference for errors"}
-            spec = self._parts.build_specification(cell).problem
+            spec = self._parts.share_parts(cell).build_specification(cell).problem
             return {**entry, **self._compute_bounds(spec, entry["reference"]["values"])}
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no Cramér–Rao bound: %s", self._job.id, error)

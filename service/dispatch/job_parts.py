@@ -41,7 +41,7 @@ class DataKey(NamedTuple):
     channels: SignalChannels
 
 
-class _SharedParts(NamedTuple):
+class SharedParts(NamedTuple):
     """What is equal in the runs of a sweep that differ only in `_OWN_PATHS`.
 
     `problem` has no noise. `body` is the body of any of these runs.
@@ -50,6 +50,27 @@ class _SharedParts(NamedTuple):
     body: Mapping[str, Any]
     problem: ProblemSpec
     algorithm: GeneticAlgorithm
+    compare_orders: bool
+
+    @property
+    def reference(self) -> str | None:
+        """The warm start that the runs name: none, a run, or the previous one."""
+        reference: str | None = self.body["warm_start"]
+        return reference
+
+    def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
+        """Build the specification of one of these runs, with its warm start."""
+        body = self.body
+        sigma = cell.get("/noise/sigma", body["noise"]["sigma"])
+        noise = Noise(float(sigma), int(cell.get("/noise/seed", body["noise"]["seed"])))
+        return RunSpec(
+            self.problem.replace_noise(noise),
+            self.algorithm,
+            int(cell.get("/seed", body["seed"])),
+            warm,
+            posterior=body.get("posterior", False),  # older jobs do not have it
+            compare_orders=self.compare_orders,
+        )
 
 
 _OWN_PATHS = ("/seed", "/noise/seed", "/noise/sigma")
@@ -80,7 +101,7 @@ class JobParts:
         self._data: dict[str, DataKey] = {}
         self._cached_records: OrderedDict[str, Records] = OrderedDict()
         self._groups: list[AxisGroup] | None = None
-        self._shared: OrderedDict[str, _SharedParts] = OrderedDict()
+        self._shared: OrderedDict[str, SharedParts] = OrderedDict()
 
     def build_cells(self, numbers: range) -> list[NewRun]:
         """Build the rows of runs of the sweep that do not exist yet."""
@@ -89,51 +110,22 @@ class JobParts:
         cells = build_stored_cells(self.job.spec, self._groups, numbers.start)
         return list(islice(cells, len(numbers)))
 
-    def build_specification(self, cell: Mapping[str, Any], warm: WarmStartValues = ()) -> RunSpec:
-        """Build the specification of one cell's run, with its warm start.
+    def share_parts(self, cell: Mapping[str, Any]) -> SharedParts:
+        """Return the parts of a cell's run that it shares with others, built at the first one.
 
         Raises
         ------
         SysidError, ServiceError, StorageError
             If its settings are invalid, or its model is missing.
         """
-        return self._specify_run(cell, self._share_parts(cell), warm)
-
-    def read_reference(self, cell: Mapping[str, Any]) -> str | None:
-        """Return the warm start that a cell names: none, a run, or the previous one."""
-        reference: str | None = self._share_parts(cell).body["warm_start"]
-        return reference
-
-    def _specify_run(
-        self, cell: Mapping[str, Any], shared: _SharedParts, warm: WarmStartValues
-    ) -> RunSpec:
-        body = shared.body
-        sigma = cell.get("/noise/sigma", body["noise"]["sigma"])
-        noise = Noise(float(sigma), int(cell.get("/noise/seed", body["noise"]["seed"])))
-        return RunSpec(
-            shared.problem.replace_noise(noise),
-            shared.algorithm,
-            int(cell.get("/seed", body["seed"])),
-            warm,
-            posterior=body.get("posterior", False),  # older jobs do not have it
-            compare_orders=self._compares_orders(body),
-        )
-
-    def _compares_orders(self, body: Mapping[str, Any]) -> bool:
-        """Whether the orders of a process are compared: by default only if there is no sweep."""
-        requested: bool | None = body.get("compare_orders")  # older jobs do not have it
-        return not self.job.spec["sweep"]["axes"] if requested is None else requested
-
-    def _share_parts(self, cell: Mapping[str, Any]) -> _SharedParts:
-        """Return the parts of a cell's run that it shares with others, built at the first one."""
-        key = repr([(path, value) for path, value in cell.items() if path not in _OWN_PATHS])
+        key = repr([item for item in cell.items() if item[0] not in _OWN_PATHS])
         if key not in self._shared:
             self._shared[key] = self._build_shared_parts(build_run_body(self.job.spec, cell))
             if len(self._shared) > _MAX_SHARED_PARTS:
                 self._shared.popitem(last=False)
         return self._shared[key]
 
-    def _build_shared_parts(self, body: Mapping[str, Any]) -> _SharedParts:
+    def _build_shared_parts(self, body: Mapping[str, Any]) -> SharedParts:
         model = load_stored_model(body["model"])
         validation = body["validation"] or {}
         validation_datasets = validation.get("datasets")
@@ -146,7 +138,14 @@ class JobParts:
             validation_fraction=validation.get("fraction"),
             settings=fit_settings_of(body),
         )
-        return _SharedParts(body, problem, to_algorithm(body["algorithm"]))
+        return SharedParts(
+            body, problem, to_algorithm(body["algorithm"]), self._compares_orders(body)
+        )
+
+    def _compares_orders(self, body: Mapping[str, Any]) -> bool:
+        """Whether the orders of a process are compared: by default only if there is no sweep."""
+        requested: bool | None = body.get("compare_orders")  # older jobs do not have it
+        return not self.job.spec["sweep"]["axes"] if requested is None else requested
 
     def load_records(self, key: str) -> Records:
         """Load the records of that key from the object store, or from the cache.

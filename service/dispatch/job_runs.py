@@ -151,9 +151,9 @@ class JobRuns:
 
     def _to_coming_runs(self, rows: list[tuple[WaitingRun, RunState | None]]) -> Iterator[JobEntry]:
         """Convert rows to runs, or to earlier runs with the same specification."""
-        queued = [
-            retry_transient(partial(self._build_queued_run, row, state)) for row, state in rows
-        ]
+        queued = retry_transient(
+            lambda: [self._build_queued_run(row, state) for row, state in rows]
+        )
         sources = retry_transient(partial(self._find_computed_runs, queued))
         for run in queued:
             source = sources.get(run.run)
@@ -182,8 +182,9 @@ class JobRuns:
 
     def _build_queued_run(self, row: WaitingRun, state: RunState | None) -> QueuedRun | InvalidRun:
         try:
-            warm = self.parts.warm.find_values(row, self.parts.read_reference(row.cell))
-            spec = self.parts.build_specification(row.cell, warm)
+            shared = self.parts.share_parts(row.cell)
+            warm = self.parts.warm.find_values(row, shared.reference)
+            spec = shared.build_specification(row.cell, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return InvalidRun(row.id, RunFailure(str(error), type(error).__name__))
         return QueuedRun(row.id, spec, state, row.kills)

@@ -44,7 +44,7 @@ CHECKPOINT_SECONDS = 4.0
 MAX_REASONS = 3
 MAX_ENDED = 1000
 """Runs that one transaction ends, about. A longer one would hold up the heartbeat of the job."""
-MAX_STARTED = 500
+MAX_STARTED = 200
 """Runs marked as running in one transaction. Of thousands of short runs most end unmarked."""
 
 FEW_ENDED = 100
@@ -241,13 +241,14 @@ class RunRecorder:
     def record_results(self, packed: PackedResults) -> None:
         """Record the complete runs of a pack."""
         self._pending.packs.append(packed)
-        counted = sum(map(self._count_evaluations, packed.runs))
-        metrics.evaluations.inc(max(0, packed.evaluations - counted))
-        metrics.runs.labels("succeeded").inc(len(packed.runs))
+        counted = 0
         if self._live or self._checkpoint_evaluations:
+            counted = sum(map(self._count_evaluations, packed.runs))
             for run in packed.runs:
                 self._checkpoint_evaluations.pop(run, None)
                 self._end_live_run(run)
+        metrics.evaluations.inc(max(0, packed.evaluations - counted))
+        metrics.runs.labels("succeeded").inc(len(packed.runs))
         for run, estimates in packed.estimates.items():
             self._report_end(run, estimates)
         self._evaluations += packed.evaluations
@@ -309,6 +310,8 @@ class RunRecorder:
             if may_wait and not self._written_beside[1].done():
                 return
             self._finish_batch()
+        if self.has_ended:  # its lease is gone
+            return
         if self._is_ending:
             self._write_end()
             return

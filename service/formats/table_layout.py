@@ -536,6 +536,15 @@ def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
         seen.add(column.name)
 
 
+def _list_columns(columns: Sequence[TableColumn]) -> str:
+    """List the columns of a table in which none is a time, as a part of a sentence."""
+    names = ", ".join(one.name for one in columns if one.name and one.role != "label")
+    if labels := ", ".join(one.name for one in columns if one.role == "label"):
+        names += f", and {labels} as labels of segments"
+    counts = next((one.name for one in columns if one.kind == "count"), "")
+    return f"{names}." + (f" Column {counts!r} only counts rows." if counts else "")
+
+
 def _assign_time(
     columns: Sequence[TableColumn], sample_time: float | None, row: int | None
 ) -> list[TableColumn]:
@@ -553,11 +562,8 @@ def _assign_time(
         raise build_period_error(sample_time)
     if time is None:
         if sample_time is None:
-            names = ", ".join(column.name for column in columns if column.name)
-            counts = next((column.name for column in columns if column.kind == "count"), "")
-            counted = f" Column {counts!r} only counts rows." if counts else ""
             raise UnreadableFile(
-                f"there is no time column; found {names}.{counted} Name one of them t (in "
+                f"there is no time column; found {_list_columns(columns)} Name one of them t (in "
                 "seconds), or ",
                 GIVE_PERIOD,
                 row=row,

@@ -20,8 +20,8 @@ MAX_LABEL_CHARACTERS = 64
 class SweepCell:
     """One run of a sweep: the value of each axis' field, and labels for tables and plots."""
 
-    values: Mapping[str, Any] = field(default_factory=dict)
-    labels: Mapping[str, float | str] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
+    labels: dict[str, float | str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,18 +86,16 @@ def build_axis_groups(axes: Sequence[SweepAxisIn], groups: list[list[int]]) -> l
 
 def iterate_cells(groups: Sequence[AxisGroup], start: int = 0) -> Iterator[SweepCell]:
     """Iterate over the crossed groups' cells from number `start`; without axes one empty cell."""
-    lengths = [len(steps) for steps in groups]
-    positions = [-1] * len(groups)
-    cells = [SweepCell()] * len(groups)
-    for number in range(start, prod(lengths)):
-        values: dict[str, Any] = {}
-        labels: dict[str, float | str] = {}
-        for group, position in enumerate(locate_cell(number, lengths)):
-            if positions[group] != position:  # mostly of the last group only
-                positions[group], cells[group] = position, groups[group].build_cell(position)
-            values.update(cells[group].values)
-            labels.update(cells[group].labels)
-        yield SweepCell(values, labels)
+    if not groups:
+        yield from (SweepCell(),)[start:]
+        return
+    *slower, fastest = groups
+    row, first = divmod(start, len(fastest))
+    for cell in iterate_cells(slower, row):  # so that little is built for each cell
+        for position in range(first, len(fastest)):
+            own = fastest.build_cell(position)
+            yield SweepCell({**cell.values, **own.values}, {**cell.labels, **own.labels})
+        first = 0
 
 
 def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:

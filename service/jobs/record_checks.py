@@ -123,7 +123,7 @@ def find_length_faults(
 def _check_longest_delay(
     model: Model, parameters: tuple[Parameter, ...], step: float, duration: float
 ) -> RecordTooShort | None:
-    """Return the error of the longest delay, if it is too long."""
+    """Return the error of the longest delay that is too long."""
     if not duration > 0:
         return RecordTooShort(duration, 0.0, "a simulation")
     spans = {p.name: get_interval(p) for p in parameters}
@@ -136,7 +136,7 @@ def _check_longest_delay(
         key=lambda past_value: -compute_longest_delay(model, past_value, spans, step),
     )
     try:
-        for past in lagged[:1]:
+        for past in lagged:
             check_record_length(model, past, spans, step, duration)
     except RecordTooShort as error:
         return error

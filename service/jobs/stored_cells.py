@@ -5,7 +5,8 @@ the job creates the others from the stored axes when it needs them. Names in axi
 resolved at submission. A name that changes its meaning later therefore changes nothing.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from operator import itemgetter
 from typing import Any
 
 from service.core.json_pointer import build_run_body, get_value
@@ -34,14 +35,19 @@ def build_stored_cells(
     spec: Mapping[str, Any], groups: list[AxisGroup], start: int = 0
 ) -> Iterator[StoredCell]:
     """Build the rows of a job's runs from number `start`."""
+    paths = {axis.path for steps in groups for _, axis, _ in steps.columns}
+    read_method = _build_reader(spec, paths, "/algorithm/method")
+    read_seed = _build_reader(spec, paths, "/seed")
+    read_sigma = _build_reader(spec, paths, "/noise/sigma")
     for number, cell in enumerate(iterate_cells(groups, start), start):
+        values = cell.values
         yield StoredCell(
-            number=number,
-            cell=dict(cell.values),
-            labels=dict(cell.labels) if cell.labels else _NO_LABELS,
-            method=_find_field_value(spec, cell, "algorithm", "method"),
-            seed=_find_field_value(spec, cell, "seed"),
-            sigma=_find_field_value(spec, cell, "noise", "sigma"),
+            number,
+            values,
+            cell.labels or _NO_LABELS,
+            method=read_method(values),
+            seed=read_seed(values),
+            sigma=read_sigma(values),
         )
 
 
@@ -88,10 +94,13 @@ def _is_object(value: Any) -> bool:
     return isinstance(value, dict)
 
 
-def _find_field_value(spec: Mapping[str, Any], cell: SweepCell, *parts: str) -> Any:
-    """Find the value of a field in the run's body without building the body."""
-    path = "/" + "/".join(parts)
-    if path in cell.values:
-        return cell.values[path]
-    whole = cell.values.get(f"/{parts[0]}", spec[parts[0]])
-    return whole.get(parts[1], spec[parts[0]][parts[1]]) if len(parts) > 1 else whole
+def _build_reader(
+    spec: Mapping[str, Any], paths: Collection[str], path: str
+) -> Callable[[Mapping[str, Any]], Any]:
+    """Build the reader of a field of a run's body, from the values of a cell with these paths."""
+    if path in paths:
+        return itemgetter(path)
+    default, (whole, _, name) = get_value(spec, path), path.rpartition("/")
+    if whole in paths:
+        return lambda values: values[whole].get(name, default)
+    return lambda values: default

@@ -15,19 +15,23 @@ from markdown_it.token import Token
 from markupsafe import Markup
 
 from service.core.errors import NotFound
+from service.pages.notebooks import to_notebook
 
 INDEX = "README.md"
 _SITE_ONLY = "index.md"  # its lists are of the site's builder
-FILES = (".png", ".json", ".ipynb")
+FILES = (".png", ".json")
+NOTEBOOK_FOLDERS = ("tutorials", "howto", "answers")
+"""Folders whose pages are notebooks, too, if they have code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """A page of the documentation; `html` is its content."""
+    """A page of the documentation; `html` is its content, `notebook` the name of its notebook."""
 
     title: str
     html: Markup
     is_index: bool
+    notebook: str | None
 
 
 @cache
@@ -52,13 +56,33 @@ def read_guide(path: str) -> Guide:
         text = _list_folder(path)
     title = re.search(r"^# (.+)$", text, re.M)
     html = _render(text, path)
-    return Guide(title[1] if title else "lagid", Markup(html), path == INDEX)
+    notebook = path.removesuffix(".md") + ".ipynb"
+    name = notebook.rpartition("/")[2] if notebook in list_notebooks() else None
+    return Guide(title[1] if title else "lagid", Markup(html), path == INDEX, name)
 
 
 def find_file(path: str) -> Path | None:
     """Find a picture or another file of a page; None if there is none."""
     file = _list_files().get(path)
     return file if file is not None and file.suffix in FILES else None
+
+
+def make_notebook(path: str) -> str | None:
+    """Make the notebook of a page, such as ``tutorials/first_time_lag.ipynb``; None if none is."""
+    page = list_notebooks().get(path)
+    return None if page is None else to_notebook(page.read_text(encoding="utf-8"))
+
+
+@cache
+def list_notebooks() -> dict[str, Path]:
+    """List the pages that are notebooks, too, by the paths of these."""
+    return {
+        f"{path.removesuffix('.md')}.ipynb": file
+        for path, file in _list_files().items()
+        if path.startswith(tuple(f"{folder}/" for folder in NOTEBOOK_FOLDERS))
+        and file.suffix == ".md"
+        and re.search(r"^```(?:python|console)$", file.read_text(encoding="utf-8"), re.M)
+    }
 
 
 def is_folder(path: str) -> bool:

@@ -1,7 +1,8 @@
 """Writes of the dispatcher to runs. Every write holds the lease of a parcel; most are in bulk."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from datetime import datetime
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -34,9 +35,8 @@ from service.storage.statements import (
 )
 from service.storage.tables import Checkpoint, Job, MigrationLog, Run, RunHistory
 
-# Every default of the table: if one is missing, the slow path of the ORM is used.
 _RUN_DEFAULTS = {
-    "state": JobState.QUEUED,
+    "state": JobState.QUEUED.value,
     "attempt": 0,
     "kills": 0,
     "evaluations": 0,
@@ -44,13 +44,18 @@ _RUN_DEFAULTS = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NewRun:
-    """A run to be created: its position in the sweep, and its settings."""
+_NOTHING: Document = {}
+
+
+class NewRun(NamedTuple):
+    """A run to be created: its position in the sweep, and its settings.
+
+    Its fields are the columns of `_CELL_COLUMNS`. No document is changed, so runs may share one.
+    """
 
     number: int
-    cell: Document = field(default_factory=dict)
-    labels: Document = field(default_factory=dict)
+    cell: Document = _NOTHING
+    labels: Document = _NOTHING
     spec_hash: str | None = None
     method: str | None = None
     seed: int | None = None
@@ -228,9 +233,8 @@ class RunWriter:
         """Hand the rows to SQLite, and return how many runs were open."""
         self._session.flush()
         connection = self._session.connection()
-        moment = UtcDateTime().bind_processor(connection.dialect)
-        assert moment is not None
-        constants = (self._lease.job_id, self._lease.attempt, moment(self._clock()))
+        now = _to_sqlite_time(connection, self._clock())
+        constants = (self._lease.job_id, self._lease.attempt, now)
         cursor: Any = connection.connection.cursor()
         n_ended = 0
         for layout, *blocks in zip(LAYOUTS, *(pack.rows for pack in packs), strict=True):
@@ -358,11 +362,19 @@ _CELL_COLUMNS: Mapping[str, ColumnKind] = {
     "seed": "bigint",
     "sigma": "double precision",
 }
-_INSERT_IN_POSTGRES = (
-    f"INSERT INTO runs (project_id, job_id, created_at, {', '.join(_RUN_DEFAULTS)}, "
+_INSERT = (
+    f"INSERT INTO runs ({', '.join(_RUN_DEFAULTS)}, project_id, job_id, created_at, "
     f"id, {', '.join(_CELL_COLUMNS)}) "
-    f"SELECT {', '.join(['%s'] * (3 + len(_RUN_DEFAULTS)))}, * "
-    f"FROM unnest(%s::text[], {', '.join(f'%s::{kind}[]' for kind in _CELL_COLUMNS.values())}) "
+)
+_DEFAULT_LIST = ", ".join(map(repr, _RUN_DEFAULTS.values()))
+_INSERT_IN_SQLITE = (
+    f"{_INSERT} VALUES ({_DEFAULT_LIST}, "
+    f"{', '.join(f'?{number}' for number in range(1, 5 + len(_CELL_COLUMNS)))}) "
+    "ON CONFLICT DO NOTHING"
+)
+_INSERT_IN_POSTGRES = (
+    f"{_INSERT} SELECT {_DEFAULT_LIST}, %s, %s, %s, cells.* FROM json_to_recordset(%s::json) "
+    f"AS cells (id text, {', '.join(f'{name} {kind}' for name, kind in _CELL_COLUMNS.items())}) "
     "ON CONFLICT DO NOTHING"
 )
 _OPEN_LIST = ", ".join(repr(state.value) for state in OPEN_STATES)
@@ -425,11 +437,13 @@ def _remember_tables(session: Session, connection: Connection) -> None:
 
 def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[WaitingRun]:
     """Create the queued runs of a job in bulk; existing runs stay unchanged."""
-    is_sqlite = session.get_bind().dialect.name == "sqlite"
-    insert, waiting = _insert_in_sqlite if is_sqlite else _insert_in_postgres, list[WaitingRun]()
+    session.flush()
+    connection, waiting = session.connection(), list[WaitingRun]()
+    is_sqlite = connection.dialect.name == "sqlite"
+    insert = _insert_in_sqlite if is_sqlite else _insert_in_postgres
     for chunk in split_chunks(cells):
         ids = new_ids("run", len(chunk))
-        insert(session, job, ids, chunk)
+        insert(connection, job, ids, chunk)
         waiting += [
             WaitingRun(run, cell.number, cell.cell, 0) for run, cell in zip(ids, chunk, strict=True)
         ]
@@ -437,47 +451,37 @@ def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> list[Wai
 
 
 def _insert_in_sqlite(
-    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+    connection: Connection, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
 ) -> None:
-    constants = {
-        **_RUN_DEFAULTS,
-        "project_id": job.project_id,
-        "job_id": job.id,
-        "created_at": utc_now(),
-    }
-    rows = (
-        {**_build_run_values(cell), **constants, "id": run}
-        for cell, run in zip(cells, ids, strict=True)
-    )
-    insert_missing(session, Run, rows)
+    constants = (job.project_id, job.id, _to_sqlite_time(connection, utc_now()))
+    columns = [
+        _list_json(values) if kind == "jsonb" else values
+        for kind, values in zip(_CELL_COLUMNS.values(), zip(*cells, strict=True), strict=True)
+    ]
+    cursor: Any = connection.connection.cursor()
+    cursor.executemany(_INSERT_IN_SQLITE, map(constants.__add__, zip(ids, *columns, strict=True)))
+    cursor.close()
 
 
 def _insert_in_postgres(
-    session: Session, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
+    connection: Connection, job: Job, ids: Sequence[str], cells: Sequence[NewRun]
 ) -> None:
-    """Insert by one statement, which takes each column as an array."""
-    session.flush()
-    driver: Any = session.connection().connection.driver_connection
-    columns = [_list_values(cells, name, kind) for name, kind in _CELL_COLUMNS.items()]
-    constants = [job.project_id, job.id, utc_now(), *_RUN_DEFAULTS.values()]
+    """Insert by one statement, which takes the rows as one document."""
+    rows = [{"id": run, **cell._asdict()} for run, cell in zip(ids, cells, strict=True)]
+    driver: Any = connection.connection.driver_connection
     with driver.cursor() as cursor:
-        cursor.execute(_INSERT_IN_POSTGRES, [*constants, list(ids), *columns])
+        cursor.execute(_INSERT_IN_POSTGRES, [job.project_id, job.id, utc_now(), to_json(rows)])
 
 
-def _list_values(cells: Sequence[NewRun], name: str, kind: str) -> list[Any]:
-    """List a column as PostgreSQL takes it: an array has values of one type."""
-    if kind == "jsonb":
-        return _list_json(cells, name)
-    values = [getattr(cell, name) for cell in cells]
-    if kind != "double precision":
-        return values
-    return [None if value is None else float(value) for value in values]
+def _to_sqlite_time(connection: Connection, moment: datetime) -> Any:
+    convert = UtcDateTime().bind_processor(connection.dialect)
+    assert convert is not None
+    return convert(moment)
 
 
-def _list_json(cells: Sequence[NewRun], name: str) -> list[str]:
-    """Return one document of each cell as text; equal objects are written once."""
+def _list_json(documents: Sequence[Document]) -> list[str]:
+    """Return documents as text; equal objects are written once."""
     texts: dict[int, str] = {}
-    documents = [getattr(cell, name) for cell in cells]
     for document in documents:
         if id(document) not in texts:
             texts[id(document)] = to_json(document)
@@ -493,10 +497,6 @@ def _build_outcome_values(outcome: RunOutcome, now: Any, attempt: int) -> dict[s
         "attempt": attempt,
         "finished_at": now,
     }
-
-
-def _build_run_values(cell: NewRun) -> dict[str, Any]:
-    return {name: getattr(cell, name) for name in NewRun.__slots__}
 
 
 def _extract_estimates(result: Document | None) -> Document | None:

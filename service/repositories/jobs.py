@@ -224,7 +224,8 @@ class JobRepository:
             raise RowConflict(
                 f"{job_id} is {job.state}; only a queued or running job can be cancelled"
             )
-        job.cancel_requested, job.error = True, reason
+        if not job.cancel_requested:  # else the first who asked has told why
+            job.cancel_requested, job.error = True, reason
         if job.state is JobState.QUEUED:
             job.state, job.finished_at = JobState.CANCELLED, utc_now()
             self._session.execute(delete(Parcel).where(Parcel.job_id == job_id))

@@ -90,7 +90,7 @@ def _compute_bands(
         estimate_noise,
         list_whole_records,
     )
-    from sysid.identification.generalised_least_squares import make_whitening
+    from sysid.residuals.series import make_whitening
     from sysid.uncertainty.analysis import analyse_estimate
     from sysid.uncertainty.output_bands import ParameterSpread
 
@@ -100,22 +100,27 @@ def _compute_bands(
         problem = stored.problem(session, store)
         release_connection(session)
         _check_work(run_id, problem)
-        theta, degrees = read_estimate(problem, stored), float(problem.n_scored)
-        degrees -= theta.size
+        theta = read_estimate(problem, stored)
+        noise_degrees = float(problem.n_scored - theta.size)
         times = result.get("correlation_times") or {}
         with simulation_limit.acquire():
             whitening = make_whitening(problem, times) if any(times.values()) else None
             uncertainty = analyse_estimate(problem, theta, whitening=whitening).uncertainty
             if uncertainty is None:
                 raise Conflict(f"run {run_id} has no standard errors, so there are no bands")
-            covariance, samples = uncertainty.covariance, _read_samples(stored)
             return compute_fit_bands(
                 stored.model,
                 list_whole_records(records.estimation, _list_later_parts(records)),
                 [to_estimate(document) for document in stored.estimates],
                 _read_ties(stored.body),
-                ParameterSpread(problem.free_names, covariance, degrees, samples),
-                estimate_noise(map(_to_metrics, result["agreement"]["estimation"]), degrees),
+                ParameterSpread(
+                    problem.free_names,
+                    uncertainty.covariance,
+                    uncertainty.degrees,
+                    noise_degrees,
+                    _read_samples(stored),
+                ),
+                estimate_noise(map(_to_metrics, result["agreement"]["estimation"]), noise_degrees),
                 stored.body["prediction"],
             )
     except (SysidError, NotFound, InvalidRequest, RowNotFound, ObjectMissing) as error:

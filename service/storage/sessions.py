@@ -24,6 +24,8 @@ from service.storage.tables import DEFAULT_PROJECT
 
 BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
+CACHE_KIB = 32_768
+"""Pages that a connection of SQLite keeps if it writes thousands of rows at a time, in KiB."""
 ANALYSED_ROWS = 1000
 """Rows of each index that SQLite's ANALYZE reads."""
 _READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
@@ -223,6 +225,8 @@ def _prepare_sqlite(
     _enable_wal(connection)
     # NORMAL syncs the write-ahead log only now and then, FULL at each commit.
     connection.execute(f"PRAGMA synchronous = {'FULL' if is_durable else 'NORMAL'}")
+    if not is_durable:  # of a dispatcher: a transaction that does not fit is written twice
+        connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
     connection.execute("PRAGMA foreign_keys = ON")
 
 

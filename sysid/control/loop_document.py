@@ -20,6 +20,7 @@ from sysid.models.delays import list_past_values
 from sysid.models.model import DerivedInitial, EstimatedInitial, FixedInitial, InitialState, Model
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
+from sysid.models.ties import resolve_ties
 
 _PERIOD_SYMBOL = Symbol("h", "period")
 _STEP_ROUNDING = 1e-9  # of a step: a delay shorter than a whole step by this counts as one
@@ -216,13 +217,23 @@ class LoopDocumentBuilder:
             "form": "differential" if model.form == "differential" else "difference",
             "inputs": {self.reference: self.output.unit, **inputs},
             "states": states,
-            "parameters": {p.name: _to_declaration(p) for p in model.parameters}
-            | self.new_parameters,
+            "parameters": self._declare_parameters() | self.new_parameters,
             "equations": equations,
             "outputs": {k: {"expression": e, "unit": unit} for k, (e, unit) in outputs.items()},
             "initial": initial,
+            "history": {
+                one.state: format_expression(one.expression, self.clock) for one in model.histories
+            },
             "solver": dict(model.document["solver"]) | self._choose_substeps(),
         }
+
+    def _declare_parameters(self) -> dict[str, dict[str, Any]]:
+        """Declare the plant's parameters; ties lose their constants and intermediate names."""
+        ties = resolve_ties(self.model, self.model.parameters)
+        declared = {p.name: _to_declaration(p) for p in self.model.parameters}
+        for name, tree in ties.items():
+            declared[name]["tied"] = format_expression(tree)
+        return declared
 
     def _choose_substeps(self) -> dict[str, int]:
         """Choose more substeps if the controller's time constants need them.
@@ -277,8 +288,7 @@ def choose_free_name(name: str, taken: set[str]) -> str:
 
 def _to_declaration(parameter: Parameter) -> dict[str, Any]:
     fields = {
-        name: getattr(parameter, name)
-        for name in ("lower", "upper", "unit", "scale", "fixed", "tied")
+        name: getattr(parameter, name) for name in ("lower", "upper", "unit", "scale", "fixed")
     }
     return {name: value for name, value in fields.items() if value is not None}
 

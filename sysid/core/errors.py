@@ -22,7 +22,7 @@ raise. They return ``nan`` or ``inf``, and the caller decides.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 _MAX_NAMES = 30
 """Most valid names that a message lists; there may be thousands of datasets."""
@@ -44,6 +44,17 @@ class SysidError(Exception):
     ...     print(error)
     there is no model 'mine.yaml'; a file is a path: Path('mine.yaml')
     """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By default an error is unpickled by calling its class with its message. A pool of
+        # processes never ends if that fails.
+        return _rebuild_error, (type(self), self.args, self.__dict__)
+
+
+def _rebuild_error(kind: type[SysidError], args: tuple[Any, ...], state: dict[str, Any]) -> Any:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(state)
+    return error
 
 
 class InvalidBounds(SysidError, ValueError):

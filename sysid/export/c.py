@@ -35,7 +35,7 @@ _RESERVED_WORDS = (
     "between between_on_grid held sample past lately n t p step steps i part stage slope work "
     "points grid ratio ramp half width meets place whole averaged averaged_on_grid sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
-    "BUFSIZ RAND_MAX pchip_rise pchip_slope"
+    "BUFSIZ RAND_MAX table_interval pchip_rise pchip_slope"
 )
 _LINE_WIDTH = 92
 
@@ -583,17 +583,25 @@ static double modulo(double x, double y)
     return rest*y < 0.0 ? rest + y : rest;
 }
 """
+_TABLE_INTERVAL = """\
+/* Number of the interval between points of a table, from 0, that has x. */
+static int table_interval(double x, const double *xs)
+{
+    int i = 0;
+    while (x >= xs[i + 1])
+        ++i;
+    return i;
+}
+"""
 _TABLE = """\
 /* Value of a table of n points at x, linear; its end values outside. */
 static double table(double x, int n, const double *xs, const double *ys)
 {
-    int i = 0;
     if (!(x > xs[0]))
         return isnan(x) ? x : ys[0];
     if (x >= xs[n - 1])
         return ys[n - 1];
-    while (x >= xs[i + 1])
-        ++i;
+    const int i = table_interval(x, xs);
     return ys[i] + (x - xs[i])*((ys[i + 1] - ys[i])/(xs[i + 1] - xs[i]));
 }
 """
@@ -623,13 +631,9 @@ static double pchip_slope(int i, int n, const double *xs, const double *ys)
 /* Value at x of a monotone cubic through n points; its end values outside. */
 static double pchip(double x, int n, const double *xs, const double *ys)
 {
-    int i = 0;
-    if (!(x > xs[0]))
-        return isnan(x) ? x : ys[0];
-    if (x >= xs[n - 1])
-        return ys[n - 1];
-    while (x >= xs[i + 1])
-        ++i;
+    if (!(x > xs[0] && x < xs[n - 1]))
+        return table(x, n, xs, ys);
+    const int i = table_interval(x, xs);
     const double h = xs[i + 1] - xs[i], part = x - xs[i], mean = pchip_rise(i, xs, ys);
     const double over = mean - pchip_slope(i, n, xs, ys);
     const double under = pchip_slope(i + 1, n, xs, ys) - mean;
@@ -642,6 +646,7 @@ HELPERS: Mapping[str, str] = {
     "greatest": _GREATEST,
     "clip": _CLIP,
     "modulo": _MODULO,
+    "table_interval": _TABLE_INTERVAL,
     "table": _TABLE,
     "pchip": _PCHIP,
     "between": _BETWEEN,

@@ -148,8 +148,17 @@ class GeneratedProgram:
         return self.prefix + self.start_names[model.states[state].name]
 
     def write_history(self, state: str) -> str:
-        """Write the value of a state before the start."""
-        zero = self.identified.model.solver.history == "zero"
+        """Write the value of a state before the start.
+
+        Of a history function only the last step may be needed, by a cubic through four samples.
+        """
+        model = self.identified.model
+        history = model.find_history(state)
+        is_read = model.solver.interpolation == "cubic" and not reads_cubics(model)
+        if history is not None and is_read:
+            scope = HistoryScope(self, f"(-{self.step_variable})")
+            return write_expression(history, self.language, scope)
+        zero = model.solver.history == "zero"
         return "0.0" if zero else f"{self.array_names[state]}[0]"
 
     def list_arrays(self, state: str) -> tuple[str, ...]:
@@ -301,6 +310,24 @@ class LoopScope(ExportScope):
             return self._write_present_state(past.name)
         if self.stage == "recursion":
             return self._write_earlier_state(past)
+        history = program.identified.model.find_history(past.name)
+        value = self._write_delayed_state(past)
+        if history is None or past.delay is None:
+            return value
+        delay, position = program.name_delay(past.delay), self._write_state_position(past.name)
+        time = f"(({position} - {delay})*{program.step_variable})"
+        before = write_expression(history, program.language, HistoryScope(program, time))
+        return program.language.write_choice(f"{position} < {delay}", before, value)
+
+    def _write_state_position(self, name: str) -> str:
+        """Write the place in steps from which a delay of a state counts."""
+        if self.stage == "slope":
+            return "step + part"
+        is_later = self.stage == "update" and self._is_updated(name)
+        return "step + 1" if is_later else self.program.loop_variable
+
+    def _write_delayed_state(self, past: PastValue) -> str:
+        program = self.program
         every, before = program.list_arrays(past.name), program.write_history(past.name)
         delay = self._write_state_delay(past)
         if self.stage == "slope":
@@ -376,6 +403,17 @@ class StartScope(DelayScope):
         return f"{self.program.input_names[past.name]}[0]"
 
 
+@dataclass(frozen=True, slots=True)
+class HistoryScope(DelayScope):
+    """Scope of a history function: parameters, and a time before the start."""
+
+    time: str
+
+    def write_symbol(self, symbol: Symbol) -> str:
+        """Write the time, or a parameter."""
+        return self.time if symbol.kind == "time" else DelayScope.write_symbol(self, symbol)
+
+
 def write_delay_steps(
     program: GeneratedProgram, delay: Expression, scope: ExportScope | None = None
 ) -> str:
@@ -440,18 +478,25 @@ def indent_lines(lines: Sequence[str], levels: int = 1) -> list[str]:
     return [textwrap.indent(line, "    " * levels) for line in lines]
 
 
+_CALLED_HELPERS = {
+    "lately": ("past",),
+    "past": ("sample",),
+    "clip": ("least", "greatest"),
+    "pchip": ("table",),
+    "table": ("table_interval",),
+}
+"""Helpers that helpers call, each caller before those that it calls; a language may have fewer."""
+
+
 def list_needed_helpers(
     helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
 ) -> list[str]:
     """List the texts of used helpers and those they call, each before its caller."""
     wanted = set(used)
     wanted |= {name.removesuffix("_on_grid") for name in wanted}
-    if "lately" in wanted:
-        wanted.add("past")
-    if "past" in wanted:
-        wanted.add("sample")
-    if "clip" in wanted:
-        wanted |= {"least", "greatest"}
+    for caller, called in _CALLED_HELPERS.items():
+        if caller in wanted:
+            wanted |= set(called)
     variants = _find_variants(identified)
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 

@@ -32,8 +32,8 @@ _RESERVED_WORDS = (
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
     "slope_4 every points ratio ramp half width averaged averaged_on_grid sample_time range zip "
-    "map max min int float abs len y before between between_on_grid held past lately sign signal "
-    "array grid print math erf pchip pchip_slope slice ValueError"
+    "map max min int float abs len between between_on_grid held past lately grid print math erf "
+    "pchip pchip_slope slice ValueError"
 )
 _LINE_WIDTH = 96
 
@@ -98,7 +98,7 @@ class PythonLanguage(TargetLanguage):
 
     def write_delay(self, text: str, *, is_whole: bool) -> str:
         """Write a time lag that is not negative."""
-        least = f"max({text}, 0.0)"
+        least = f"max(0.0, {text})"  # this order makes nan 0, as in a kernel
         return f"np.floor({least} + 0.5)" if is_whole else least
 
     def write_limit(self, delay: str) -> str:
@@ -127,10 +127,8 @@ def write_python_source(identified: IdentifiedModel) -> str:
     InvalidSettings
         If a value is missing.
     """
-    names = [output.name for output in identified.model.outputs]
-    taken = [word for word in _RESERVED_WORDS.split() if word not in names]
     language = PythonLanguage()
-    program = GeneratedProgram(identified, language, Identifiers(taken))
+    program = GeneratedProgram(identified, language, Identifiers(_RESERVED_WORDS.split()))
     loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
     head = [
         *_write_arrays(program),

@@ -10,7 +10,7 @@ from math import inf
 from sysid.language.functions import Interval
 from sysid.language.intervals import bound_expression
 from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, walk
-from sysid.models.delays import compute_longest_delay, list_past_values
+from sysid.models.delays import compute_longest_delay, has_known_past, list_past_values
 from sysid.models.parameters import Parameter
 from sysid.models.sections import get_interval
 from sysid.models.ties import collect_parameter_names
@@ -50,6 +50,8 @@ def find_widest_bounds(problem: Problem, parameter: Parameter) -> Interval:
     def is_delay_possible(past: PastValue, wide: Mapping[str, Interval]) -> bool:
         if past.delay is None or bound_expression(past.delay, wide)[0] < 0:
             return False
+        if has_known_past(problem.model, past):
+            return True
         return all(compute_longest_delay(problem.model, past, wide, h) < last for h, last in grids)
 
     ends = (

@@ -25,6 +25,7 @@ from sysid.models.model import (
     DerivedInitial,
     EstimatedInitial,
     FixedInitial,
+    HistoryFunction,
     InitialState,
     MeasuredInitial,
     Model,
@@ -61,7 +62,9 @@ def find_scalings(model: Model, parameters: Sequence[Parameter]) -> FloatArray:
     """
     states = tuple(state.name for state in model.states)
     outputs = tuple(output.expression for output in model.outputs)
-    return _find_cached_scalings(states, model.equations, outputs, model.initial, tuple(parameters))
+    return _find_cached_scalings(
+        states, model.equations, outputs, model.initial, model.histories, tuple(parameters)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -70,6 +73,7 @@ def _find_cached_scalings(
     equations: tuple[Expression, ...],
     outputs: tuple[Expression, ...],
     initial: tuple[InitialState, ...],
+    histories: tuple[HistoryFunction, ...],
     parameters: tuple[Parameter, ...],
 ) -> FloatArray:
     """Find the scalings, cached for the runs of one model; the result is read-only."""
@@ -87,6 +91,9 @@ def _find_cached_scalings(
     for output in outputs:
         weights.require_equal({}, weights.weigh_expression(output))
     _add_initial_conditions(weights, states, initial, {p.name for p in parameters})
+    for history in histories:
+        weight = weights.weigh_expression(history.expression)
+        weights.require_equal({history.state: Fraction(1)}, weight)
     null = _solve_null_space(weights.equations, [*states, *free])
     free_rows = [[row.get(name, Fraction(0)) for name in free] for row in null]
     exponents = _reduce_to_echelon(free_rows, len(free))

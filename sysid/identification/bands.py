@@ -53,7 +53,7 @@ def compute_bands(
     starts = {name_initial_state(state.name, 0) for state in model.states}
     shared = {parameter.name for parameter in model.parameters} | starts
     estimates = [estimate for estimate in found.estimates if estimate.name in shared]
-    noise = pool_noise(found.agreement, spread.degrees)
+    noise = pool_noise(found.agreement, spread.noise_degrees)
     compared = replace(record, outputs=tuple(_fill_missing(one) for one in record.outputs))
     [bands] = compute_fit_bands(model, [compared], estimates, data.ties, spread, noise)
     return bands
@@ -80,7 +80,7 @@ def compute_record_bands(
         found.estimates,
         data.ties,
         spread,
-        estimate_noise(found.agreement, spread.degrees),
+        estimate_noise(found.agreement, spread.noise_degrees),
         data.prediction,
     )
 
@@ -97,6 +97,7 @@ def list_whole_records(records: Sequence[Record], later: Sequence[Record]) -> li
                     channel,
                     times=np.concatenate([channel.times, after.times]),
                     values=np.concatenate([channel.values, after.values]),
+                    repeats=None,
                 )
                 for channel, after in zip(record.outputs, rest.outputs, strict=True)
             ),
@@ -166,6 +167,7 @@ def _read_spread(found: Identification) -> ParameterSpread | None:
     return ParameterSpread(
         found.uncertainty.names,
         found.uncertainty.covariance,
+        found.uncertainty.degrees,
         float(found.criteria.samples - found.criteria.parameters),
         found.posterior.samples if found.posterior is not None and has_samples else None,
     )

@@ -23,7 +23,6 @@ from sysid.identification.deadline import Deadline
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     fit_generalised_least_squares,
-    make_whitening,
 )
 from sysid.identification.integration_step import (
     HalfStep,
@@ -52,6 +51,7 @@ from sysid.identification.minima import (
 from sysid.identification.noise_model_choice import (
     PredictionErrors,
     compare_on_blocks,
+    explain_noise_model_choice,
     may_be_ar1,
 )
 from sysid.identification.search_evidence import is_explained
@@ -61,6 +61,7 @@ from sysid.identification.warnings import find_delay_parameters
 from sysid.islands.state import RunState
 from sysid.islands.stopping import count_restarts
 from sysid.residuals.residual_tests import run_residual_tests
+from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening
 from sysid.search.archive import read_archive
 from sysid.search.island import Island, compute_analysis_budget, get_island_settings
@@ -69,7 +70,7 @@ from sysid.search.state import SAME_OPTIMUM
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.intervals import keep_in_bounds
+from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
 from sysid.uncertainty.unequal_noise import fit_unequal_noise
 
 _MOST_PROJECTED = 6000  # simulations of a scan by projection
@@ -174,6 +175,7 @@ def find_best_estimate(
     noise = search.apply_noise_model(validation, is_settled=not changes)
     minima = search.collect_minima(recorded)
     marked = mark_changing(search.analysis.estimates, half, limit)
+    marked = mark_poor_intervals(search.problem.free_parameters, marked)
     analysis = replace(search.analysis, estimates=keep_in_bounds(marked))
     return BestEstimate(search.problem, tuple(search.ends), minima, first, noise, analysis)
 
@@ -341,9 +343,7 @@ class _EstimateSearch:
         if errors is None or not (errors.speak_for_ar1 and estimate.is_complete):
             self.analysis = before
             return None
-        return estimate._replace(
-            least_squares_theta=theta, least_squares_error=errors.white, error=errors.ar1
-        )
+        return estimate._replace(note=explain_noise_model_choice(self.problem, theta, errors))
 
     def _use_noise_model(self) -> GeneralisedEstimate:
         """Estimate under first-order noise, and analyse, if the residuals are not white."""

@@ -23,8 +23,12 @@ from sysid.identification.input_hold import (
 )
 from sysid.identification.integration_step import explain_finer_step
 from sysid.identification.minima import mark_ambiguous
-from sysid.identification.noise_model_choice import explain_noise_model_choice, resolve_noise_model
-from sysid.identification.process_order import compare_orders, warn_other_order
+from sysid.identification.noise_model_choice import resolve_noise_model
+from sysid.identification.process_order import (
+    compare_orders,
+    mark_order_dependent,
+    warn_other_order,
+)
 from sysid.identification.result import Identification
 from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
 from sysid.identification.unstable_run import warn_unstable_run
@@ -136,6 +140,7 @@ def _build_identification(
         left, late = budget.count_left(), deadline.is_past_grace
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
+        analysis = replace(analysis, estimates=mark_order_dependent(analysis, orders))
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in found.minima if minimum.is_compatible]
@@ -193,8 +198,8 @@ def _build_identification(
             *unstable,
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
-            *explain_noise_model_choice(problem, noise),
-            *(() if posterior is None else describe_posterior(posterior)),
+            *filter(None, [noise.note]),
+            *(() if posterior is None else describe_posterior(posterior, analysis.estimates)),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,

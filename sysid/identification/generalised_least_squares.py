@@ -1,25 +1,24 @@
 """Generalised least squares: estimates under first-order noise.
 
 Least squares treats residuals as independent. If the noise changes slowly, neighbouring residuals
-repeat the same information, and a slow disturbance outweighs the fast part of the record. So the
-residuals are whitened by a first-order noise model (`sysid.residuals.whitening`). The parameters
-are estimated from the whitened residuals, and the noise from the new residuals, until both stay
-(feasible generalised least squares; Cochrane and Orcutt, J. Am. Stat. Assoc. 44 (1949) 32).
+repeat the same information, and a slow disturbance outweighs the fast part of the record. So
+parameters are estimated from residuals that a first-order noise model whitens
+(`sysid.residuals.whitening`), and the noise from the new residuals, until both stay (feasible
+generalised least squares; Cochrane and Orcutt, J. Am. Stat. Assoc. 44 (1949) 32).
 
 The noise is described by its *correlation time* τ, at which the residuals' autocorrelation has
-fallen to 1/e. For first-order noise τ is equivalent to the correlation of neighbours. For smooth
-disturbances, neighbours are equal to many digits. Their correlation then leads to a model of
-differences, in which rounding and sensor noise outweigh all else; τ does not. The first-order noise
-is a working correlation: if it is not the true one, the estimates stay valid but lose some
-efficiency. The covariance is that of the whitened residuals, by a sandwich if these are coloured
-(Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.coloured`).
+fallen to 1/e. For first-order noise τ is equivalent to the correlation of neighbours. Neighbours of
+a smooth disturbance are equal to many digits. Their correlation would lead to a model of
+differences, in which rounding and sensor noise outweigh all else. If the first-order noise is not
+the true one, the estimates stay valid but lose some efficiency, and the covariance is a sandwich
+(Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.sandwich`).
 
 If switches make the loss rough, the minimum near that of least squares need not be the lowest. So
-points are drawn along the covariance of least squares, and the lowest of them are starts as well.
+the lowest of points drawn along the covariance of least squares are starts as well.
 
-Estimated parameters absorb a part of the noise. At the end it is added again: the covariance of the
-fitted outputs, S C Sᵀ, is added to the autocovariance of the residuals. This is done only once.
-Repeated, noise with a white part drifted away, and its offset with it.
+Estimated parameters absorb a part of the noise. At the end the covariance of the fitted outputs,
+S C Sᵀ, is added to the autocovariance of the residuals, once: repeated, noise with a white part
+drifted away, and its offset with it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,11 +30,10 @@ from numpy.fft import irfft, rfft
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import space_residuals
-from sysid.residuals.coloured import ResidualPart, is_coloured, iterate_parts
-from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.residuals.series import ResidualPart, is_coloured, iterate_parts, make_whitening
+from sysid.residuals.whitening import Whitening
 from sysid.search.least_squares import (
     N_TRIED,
-    LeastSquaresSolution,
     ScoredSamples,
     fill_jacobian,
     solve_least_squares,
@@ -70,11 +68,8 @@ class GeneralisedEstimate(NamedTuple):
         Ends of least squares from all starts, including the estimate.
     rms : FloatArray, shape (m,)
         RMS of the whitened residuals there.
-    least_squares_theta : FloatArray, shape (D,), or None
-        Estimates of least squares, if the noise model was selected by ``auto``
-        (`sysid.identification.noise_model_choice`).
-    least_squares_error, error : float
-        Prediction error by which ``auto`` selected, of both estimates.
+    note : str
+        Why ``auto`` selected the noise model (`sysid.identification.noise_model_choice`).
     """
 
     theta: FloatArray
@@ -83,21 +78,7 @@ class GeneralisedEstimate(NamedTuple):
     is_complete: bool = True
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
-    least_squares_theta: FloatArray | None = None
-    least_squares_error: float = 0.0
-    error: float = 0.0
-
-
-def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
-    """Make the whitening of a problem's scored samples."""
-    coefficients = [
-        compute_ar1_coefficient(part.times, correlation_times.get(part.output, 0.0))
-        for part in iterate_parts(problem)
-    ]
-    return Whitening(
-        np.concatenate([np.zeros(0), *coefficients]),
-        sum(time > 0 for time in correlation_times.values()),
-    )
+    note: str = ""
 
 
 def fit_generalised_least_squares(
@@ -131,41 +112,30 @@ def fit_generalised_least_squares(
         new_times = estimate_correlation_times(problem, coloured, error, None)
         is_last = i == _MAX_ROUNDS - 1 or _have_converged(new_times, times)
         if search.simulations_left < search.round_simulations:
-            return _to_estimate(problem, theta, place, times, search, False)
+            search.is_cut = True
+            break
         if is_last:
             spread = _factor_output_covariance(
                 search.compute_slopes(place, error), error, make_whitening(problem, times)
             )
             new_times = estimate_correlation_times(problem, coloured, error, spread)
         times, whitening = new_times, make_whitening(problem, new_times)
-        starts = (
-            _draw_starts(search, place, whitening, covariance, random) if i == 0 or is_last else []
-        )
+        draws = i == 0 or is_last
+        starts = _draw_starts(search, place, whitening, covariance, random) if draws else []
         place = search.find_lowest_minimum([place, *starts], whitening)
         error = search.compute_residuals(place[None])[0]
         if is_last:
             break
-    return _to_estimate(problem, theta, place, times, search, not search.is_cut)
+    if any(times.values()):
+        theta = from_unit(problem.evaluator, place[None])[0]
+    minima = from_unit(problem.evaluator, search.ends)
+    complete = not search.is_cut
+    return GeneralisedEstimate(theta, times, search.evaluations, complete, minima, search.rms)
 
 
 def select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
     """Select the outputs whose weighted residuals (n,) are clearly not white."""
     return {part.output for part in iterate_parts(problem) if is_coloured(part, error[part.rows])}
-
-
-def _to_estimate(
-    problem: Problem,
-    theta: FloatArray,
-    place: FloatArray,
-    times: Mapping[str, float],
-    search: "WhitenedLeastSquares",
-    is_complete: bool,
-) -> GeneralisedEstimate:
-    """Make the estimate at a point; without any correlation, that of least squares."""
-    if any(times.values()):
-        theta = from_unit(problem.evaluator, place[None])[0]
-    minima = from_unit(problem.evaluator, search.ends)
-    return GeneralisedEstimate(theta, times, search.evaluations, is_complete, minima, search.rms)
 
 
 def _draw_starts(
@@ -184,7 +154,9 @@ def _draw_starts(
     moves = moves * random.standard_normal((_N_DRAWN, place.size)) @ factor_covariance(covariance).T
     theta = from_unit(evaluator, place[None]) + moves
     places = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
-    totals = _sum_squares(whitening.whiten(search.compute_residuals(places)))
+    with np.errstate(all="ignore"):  # diverged simulations
+        totals = np.sum(np.square(whitening.whiten(search.compute_residuals(places))), axis=1)
+    totals = np.where(np.isfinite(totals), totals, np.inf)
     return [places[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
 
 
@@ -261,13 +233,11 @@ def _find_decay_lag(correlation: FloatArray) -> float:
 class WhitenedLeastSquares:
     """Least squares of whitened residuals over unit coordinates, counting simulations."""
 
-    def __init__(self, problem: Problem, budget: int) -> None:
+    def __init__(self, problem: Problem, budget: int = 2**62) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
         self.is_cut = False  # whether a search ended early because the budget was spent
-        self.ends, self.rms = (
-            np.zeros((0, len(problem.free_parameters))),
-            np.zeros(0),
-        )  # of the last round
+        # of the last round
+        self.ends, self.rms = np.zeros((0, len(problem.free_parameters))), np.zeros(0)
         rows = problem.scored_rows
         self._scored = ScoredSamples(problem.evaluator, rows, problem.evaluator.weight[rows])
         self._step_simulations = len(problem.free_parameters) + N_TRIED
@@ -282,10 +252,7 @@ class WhitenedLeastSquares:
     def compute_residuals(self, places: FloatArray) -> FloatArray:
         """Compute weighted residuals (P, n) at points (P, D)."""
         self.evaluations += places.shape[0]
-        predicted = self.problem.predict(from_unit(self.problem.evaluator, places))
-        scored = self._scored
-        measured = scored.evaluator.measured[scored.rows]
-        return np.asarray(scored.weight * (predicted[:, scored.rows] - measured))
+        return self.problem.compute_residuals(from_unit(self.problem.evaluator, places))
 
     def compute_slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
         """Compute the slopes (n, D) of the residuals."""
@@ -296,29 +263,18 @@ class WhitenedLeastSquares:
 
     def find_lowest_minimum(self, starts: Sequence[FloatArray], whitening: Whitening) -> FloatArray:
         """Find the lowest minimum from starts (D,); the first start is always searched."""
+        scored = self._scored._replace(ar1_coefficient=whitening.ar1_coefficient)
+        at_once = steps_at_once(starts[0].size, self.problem.n_steps)
         solutions = []
         for start in starts:
             steps = min(_MAX_STEPS, (self.simulations_left - 2) // self._step_simulations)
             if steps < 1:
                 self.is_cut = True
                 break
-            solution = self._solve(start, whitening, steps)
+            solution = solve_least_squares(scored, start, 0.0, steps=steps, at_once=at_once)
+            self.evaluations += solution.evaluations
             self.is_cut |= steps < _MAX_STEPS and not solution.is_converged
             solutions.append(solution)
         self.ends = np.array([solution.place for solution in solutions])
         self.rms = np.sqrt([solution.loss for solution in solutions])
         return solutions[int(np.argmin(self.rms))].place
-
-    def _solve(self, place: FloatArray, whitening: Whitening, steps: int) -> LeastSquaresSolution:
-        at_once = steps_at_once(place.size, self.problem.n_steps)
-        scored = self._scored._replace(ar1_coefficient=whitening.ar1_coefficient)
-        solution = solve_least_squares(scored, place, 0.0, steps=steps, at_once=at_once)
-        self.evaluations += solution.evaluations
-        return solution
-
-
-def _sum_squares(errors: FloatArray) -> FloatArray:
-    """Sum the squares (P,) of residuals (P, n); inf where one is not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        totals = np.einsum("pn,pn->p", errors, errors)
-    return np.where(np.isfinite(totals), totals, np.inf)

@@ -91,10 +91,8 @@ def compare_half_step(
         return None
     fine = _halve_step(problem)
     error, columns = analysis.residuals_and_sensitivities
-    rows = problem.scored_rows
-    weight = problem.evaluator.weight[rows]
     with np.errstate(all="ignore"):  # what diverges with one of the steps
-        residual = weight * (fine.predict(theta[None])[0][rows] - problem.evaluator.measured[rows])
+        residual = fine.compute_residuals(theta[None])[0]
         move = residual - error
         squares, own = float(move @ move), float(error @ error)
         is_near = squares <= error.size * (_NOTABLE_ERROR * problem.output_scale) ** 2
@@ -203,7 +201,7 @@ def _mark_estimate(estimate: Estimate, half: HalfStep, limit: str) -> Estimate:
     return replace(
         estimate,
         stderr=stderr,
-        interval95=(max(lower, estimate.lower), min(upper, estimate.upper)),
+        interval95=(lower, upper),
         reason=f"its error is that of the integration: half the step moves it by {move:.1g}"
         f"{format_unit(estimate.unit)}, and the record has no noise",
     )

@@ -17,16 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.settings import NoiseModel
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.core.units import format_unit
 from sysid.identification.generalised_least_squares import (
     GeneralisedEstimate,
     WhitenedLeastSquares,
     estimate_correlation_times,
-    make_whitening,
     select_coloured_outputs,
 )
-from sysid.residuals.coloured import iterate_parts
+from sysid.residuals.series import iterate_parts, make_whitening
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import to_unit
 from sysid.uncertainty.analysis import Analysis
@@ -52,10 +51,8 @@ def may_be_ar1(problem: Problem, analysis: Analysis) -> bool:
     """Whether the residuals of a free run by squares are coloured: else there is no choice."""
     uncertainty = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
-    return is_free and uncertainty is not None and uncertainty.noise_colour in _COLOURED
-
-
-_COLOURED = ("coloured", "drifting")
+    colour = "white" if uncertainty is None else uncertainty.noise_colour
+    return is_free and colour in ("coloured", "drifting")
 
 
 def compare_on_blocks(
@@ -106,7 +103,7 @@ def _number_blocks(problem: Problem, division: int) -> IntArray:
     return numbers
 
 
-def _leave_out(problem: Problem, rows: FloatArray) -> Problem:
+def _leave_out(problem: Problem, rows: BoolArray) -> Problem:
     """Leave scored samples out of the residuals of least squares."""
     weight = problem.evaluator.weight.copy()
     weight[problem.scored_rows[rows]] = 0.0
@@ -122,19 +119,17 @@ def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem
     return replace(problem, settings=replace(problem.settings, loss=loss))
 
 
-def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> tuple[str, ...]:
-    """Explain why ``auto`` selected ar1, and what least squares gave."""
-    if noise.least_squares_theta is None:
-        return ()
+def explain_noise_model_choice(
+    problem: Problem, theta: FloatArray, errors: PredictionErrors
+) -> str:
+    """Explain why ``auto`` selected ar1, and what least squares gave (D,)."""
     squares = ", ".join(
         f"{parameter.name} = {value:.4g}{format_unit(parameter.unit)}"
-        for parameter, value in zip(
-            problem.free_parameters, noise.least_squares_theta.tolist(), strict=True
-        )
+        for parameter, value in zip(problem.free_parameters, theta.tolist(), strict=True)
     )
     unit = format_unit(problem.unit)
     return (
         "noise_model auto selected ar1: its free run predicts data that were not used better, with "
-        f"an RMS error of {noise.error:.4g}{unit} and not {noise.least_squares_error:.4g}{unit}. "
-        f"Plain least squares gave {squares}. To get these, use loss: {{noise_model: white}}",
+        f"an RMS error of {errors.ar1:.4g}{unit} and not {errors.white:.4g}{unit}. "
+        f"Plain least squares gave {squares}. To get these, use loss: {{noise_model: white}}"
     )

@@ -29,19 +29,18 @@ from sysid.core.settings import FitSettings, Loss
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from sysid.identification.generalised_least_squares import make_whitening
+from sysid.identification.generalised_least_squares import WhitenedLeastSquares
 from sysid.identification.result import OrderComparison, OrderFit
 from sysid.identification.warnings import find_delay_parameters
 from sysid.models.catalogue.load import load_model
 from sysid.models.catalogue.processes import Process, ProcessEntry, list_neighbouring_orders
 from sysid.models.model import name_initial_state, replace_substeps
-from sysid.residuals.coloured import is_coloured, iterate_parts
+from sysid.residuals.series import is_coloured, iterate_parts, make_whitening
 from sysid.residuals.whitening import Whitening
-from sysid.search.least_squares import ScoredSamples, solve_least_squares, steps_at_once
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
-from sysid.uncertainty.analysis import analyse_estimate, compute_criteria
+from sysid.uncertainty.analysis import Analysis, analyse_estimate, compute_criteria
 from sysid.uncertainty.estimates import Estimate
 
 _SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
@@ -50,7 +49,6 @@ _NEW_PARTS = (0.1, 0.4, 1.0)  # of the slowest time constant: starts of the part
 _MOVE = 1e-3  # of a parameter, relative: what it changes in the process
 _MAX_SIMULATIONS = 4000  # of an order: half for the fit, the rest for noise model and errors
 _ROUNDS = 2  # of least squares and correlation time, in turn
-_MAX_STEPS = 30  # of least squares in a round
 _SHORTEST_TIME, _LONGEST_TIME = 0.1, 0.5  # correlation time, of a sampling period and the record
 _NOTABLE_MOVE = 1.0  # of a standard error of the dead time
 
@@ -79,12 +77,6 @@ class _FittedOrder:
     problem: Problem
     theta: FloatArray
     evaluations: int
-
-    def compute_residuals(self, theta: FloatArray) -> FloatArray:
-        """Compute the weighted residuals (n,) at an estimate (D,)."""
-        rows, evaluator = self.problem.scored_rows, self.problem.evaluator
-        predicted = self.problem.predict(theta[None])[0]
-        return np.asarray((evaluator.weight * (predicted - evaluator.measured))[rows])
 
 
 def compare_orders(
@@ -141,6 +133,33 @@ def compare_orders(
         "ar1" if has_colour else "white",
         tuple(compared),
     ), spent
+
+
+def mark_order_dependent(
+    analysis: Analysis, comparison: OrderComparison | None
+) -> tuple[Estimate, ...]:
+    """Mark an identified dead time whose interval does not hold that of the preferred order.
+
+    Its standard error assumes the model's order, and the data contradict that. If errors are by
+    repeat, nothing is marked: the criterion takes samples as independent, and says too much.
+    """
+    estimates, uncertainty = analysis.estimates, analysis.uncertainty
+    is_clustered = uncertainty is not None and uncertainty.noise_colour == "clustered"
+    if comparison is None or is_clustered:
+        return estimates
+    if comparison.preferred_model in (None, comparison.model):
+        return estimates
+    [best] = comparison.open_fits
+    reason = f"it is {_write_delay(comparison, best)}, which the data prefer"
+    return tuple(
+        replace(estimate, status="order-dependent", reason=reason)
+        if estimate.name == comparison.delay
+        and estimate.status == "identified"
+        and estimate.interval95 is not None
+        and not estimate.interval95[0] <= best.delay <= estimate.interval95[1]
+        else estimate
+        for estimate in estimates
+    )
 
 
 def warn_other_order(comparison: OrderComparison | None, model: str) -> list[str]:
@@ -310,7 +329,7 @@ def _to_theta(problem: Problem, entry: ProcessEntry, process: Process) -> FloatA
 
 
 def _has_coloured_residuals(fitted: _FittedOrder) -> bool:
-    residuals = fitted.compute_residuals(fitted.theta)
+    residuals = fitted.problem.compute_residuals(fitted.theta[None])[0]
     return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(fitted.problem))
 
 
@@ -320,7 +339,7 @@ def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, 
     if has_colour:
         theta, whitening, simulations = _fit_coloured_noise(fitted)
         spent += simulations
-    residuals = fitted.compute_residuals(theta)
+    residuals = problem.compute_residuals(theta[None])[0]
     analysis = analyse_estimate(problem, theta, whitening=whitening)
     criteria = compute_criteria(
         problem, residuals if whitening is None else whitening.whiten(residuals), whitening
@@ -340,23 +359,13 @@ def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, 
 
 def _fit_coloured_noise(fitted: _FittedOrder) -> tuple[FloatArray, Whitening, int]:
     """Estimate under first-order noise whose correlation time has the largest likelihood."""
-    problem, theta, spent = fitted.problem, fitted.theta, 0
-    rows, evaluator = problem.scored_rows, problem.evaluator
-    scored = ScoredSamples(evaluator, rows, evaluator.weight[rows])
-    at_once = steps_at_once(theta.size, problem.n_steps)
-    whitening = _fit_correlation_time(problem, fitted.compute_residuals(theta))
+    problem, theta, search = fitted.problem, fitted.theta, WhitenedLeastSquares(fitted.problem)
+    whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
     for _ in range(_ROUNDS):
-        solved = solve_least_squares(
-            scored._replace(ar1_coefficient=whitening.ar1_coefficient),
-            to_unit(evaluator, theta[None])[0],
-            0.0,
-            steps=_MAX_STEPS,
-            at_once=at_once,
-        )
-        theta = from_unit(evaluator, solved.place[None])[0]
-        spent += solved.evaluations + 1
-        whitening = _fit_correlation_time(problem, fitted.compute_residuals(theta))
-    return theta, whitening, spent
+        place = search.find_lowest_minimum([to_unit(problem.evaluator, theta[None])[0]], whitening)
+        theta = from_unit(problem.evaluator, place[None])[0]
+        whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
+    return theta, whitening, search.evaluations + _ROUNDS
 
 
 def _fit_correlation_time(problem: Problem, residuals: FloatArray) -> Whitening:
@@ -364,9 +373,12 @@ def _fit_correlation_time(problem: Problem, residuals: FloatArray) -> Whitening:
     from scipy.optimize import minimize_scalar  # imported late: slow to load, rarely needed
 
     [output] = problem.model.outputs
-    spans = [part.times for part in iterate_parts(problem)]
     # Pooled repeats have several samples at a time.
-    shortest = min(float(np.median(np.diff(np.unique(times)))) for times in spans)
+    distinct = [np.unique(part.times) for part in iterate_parts(problem)]
+    spans = [times for times in distinct if times.size > 1]
+    if not spans:
+        return make_whitening(problem, {})
+    shortest = min(float(np.median(np.diff(times))) for times in spans)
     longest = max(float(np.ptp(times)) for times in spans)
 
     def compute_bic(logarithm: float) -> float:

@@ -19,7 +19,6 @@ from sysid.residuals.residual_tests import ResidualTests
 from sysid.uncertainty.estimates import Estimate
 
 _MAX_WARNINGS = 3
-_MAX_CHARACTERS = 160  # of a warning in the short text
 _BECAUSE = {
     "starts": "the search settled",
     "residuals": "the search settled, as nothing but noise is left",
@@ -42,7 +41,7 @@ def summarise_result(found: Identification) -> str:
     lines += [f"  {'  '.join(cells).rstrip()}" for cells in _align_columns(rows)]
     lines += _list_verdicts(found)
     shown = found.warnings[:_MAX_WARNINGS]
-    lines += [f"note: {_shorten(warning)}" for warning in shown]
+    lines += [f"note: {warning}" for warning in shown]
     left = len(found.warnings) - len(shown)
     if left > 0:
         lines.append(f"and {left} more in `warnings`")
@@ -179,10 +178,6 @@ def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= _MAX_CHARACTERS else f"{text[: _MAX_CHARACTERS - 1]}…"
 
 
 def _write_cells(estimate: Estimate) -> str:

@@ -22,7 +22,7 @@ from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
 from sysid.data.interpolation import interpolate_channel
-from sysid.residuals.coloured import ResidualPart, iterate_parts
+from sysid.residuals.series import ResidualPart, iterate_parts
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
@@ -122,7 +122,9 @@ class _LinearFit:
             for part in iterate_parts(self._problem)
             for values in self._list_past_inputs(part)
         ]
-        gain = self._compute_gain(np.column_stack(regressors), len(regressors))
+        gain = 0.0  # no input moves
+        if regressors:
+            gain = self._compute_gain(np.column_stack(regressors), len(regressors))
         return Suspect(DYNAMICS, gain, "Try a model of another order")
 
     def _list_past_inputs(self, part: ResidualPart) -> Iterator[FloatArray]:
@@ -203,6 +205,8 @@ class _LinearFit:
                 continue
             free = np.ones(self._error.size, dtype=np.bool_)
             free[part.rows] = ~at_limit
+            if np.count_nonzero(free) <= self._basis.shape[1]:
+                continue
             move = np.linalg.lstsq(self._basis[free], self._error[free], rcond=None)[0]
             left = self._error - self._basis @ move
             if np.mean(side * left[~free] > 0) < _ONE_SIDED:

@@ -298,14 +298,13 @@ def _is_contradicted(
     """Whether samples that read an assumed input (n,) do not follow from a fit of the others."""
     if not assumed.any():
         return False
-    evaluator, rows = problem.evaluator, problem.scored_rows
-    error = evaluator.weight * (problem.predict(end.theta[None])[0] - evaluator.measured)
+    error = problem.compute_residuals(end.theta[None])[0][assumed]
     degrees = others.n_scored - end.theta.size
     count = int(np.count_nonzero(assumed))
     variance = end.rms**2 * others.n_scored / degrees
     if variance <= 0:
-        return bool(np.any(error[rows][assumed] != 0))
-    ratio = float(np.mean(error[rows][assumed] ** 2)) / variance
+        return bool(np.any(error != 0))
+    ratio = float(np.mean(error**2)) / variance
     return bool(f_tail(count, degrees, ratio) < _UNLIKELY)
 
 

@@ -22,8 +22,8 @@ from sysid.core.units import format_unit
 from sysid.identification.fixed_start import compute_start_slopes, list_fixed_starts
 from sysid.identification.minima import scan_parameters
 from sysid.identification.warnings import find_delay_parameters
-from sysid.residuals.coloured import is_coloured, iterate_parts
 from sysid.residuals.past_outputs import reads_outputs
+from sysid.residuals.series import is_coloured, iterate_parts
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate

@@ -192,7 +192,7 @@ def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
 
 def _find_undetermined(evidence: Evidence) -> Iterator[Reason]:
     """Find parameters that the data do not determine; serious if they determine none."""
-    known = evidence.list_names("identified", "not settled", "not validated")
+    known = evidence.list_names("identified", "not settled", "not validated", "order-dependent")
     severity: Severity = "caution" if known else "serious"
     if names := evidence.list_names("ambiguous"):
         yield Reason(

@@ -20,6 +20,7 @@ from sysid.models.units import (
 from sysid.residuals.onset_delay import find_unprompted_output
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.residual_tests import ResidualTests
+from sysid.residuals.sandwich import MIN_REPEATS, count_repeats
 from sysid.search.island import get_island_settings
 from sysid.simulation.metrics import compute_mean
 from sysid.simulation.problem import Problem
@@ -78,6 +79,7 @@ def collect_warnings(
     messages += about_units
     messages += _warn_active_bounds(analysis)
     messages += _warn_no_prediction(problem)
+    messages += _warn_few_repeats(problem, analysis)
     messages += warn_constant_outputs(problem)
     messages += _warn_worse_than_line(problem, simulated)
     messages += _warn_constant_inputs(problem, analysis.estimates)
@@ -161,6 +163,23 @@ def _warn_no_prediction(problem: Problem) -> list[str]:
     return [
         f"no output ({names}) is a state by itself, so one-step predictions equal the free run. "
         "To start each step from the measured output, write it as a state: outputs: {y: x}."
+    ]
+
+
+def _warn_few_repeats(problem: Problem, analysis: Analysis) -> list[str]:
+    """Warn about samples of repeats whose spread says too little of the errors."""
+    uncertainty, repeats = analysis.uncertainty, count_repeats(problem)
+    if not repeats or uncertainty is None or uncertainty.noise_colour == "clustered":
+        return []
+    needed = max(MIN_REPEATS, len(uncertainty.names) + 2)
+    cause = (
+        f"too few for errors by repeat. Record at least {needed}"
+        if repeats < needed
+        else "one of which alone tells of a parameter"
+    )
+    return [
+        f"the samples are pooled from {repeats} repeats, {cause}. The standard errors are those of "
+        "one record. They ignore what the samples of a repeat have in common, and may be far off."
     ]
 
 

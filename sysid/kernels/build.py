@@ -68,6 +68,7 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
         [parameter.name for parameter in model.parameters],
         model.equations,
         starts,
+        model.histories,
         model.order,
         model.memory,
         replace(model.solver, step=None),
@@ -82,5 +83,6 @@ def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
 def _digest_emitters() -> str:
     """Digest of the code generator: a new version makes new kernels."""
     package = Path(__file__).parents[1]
-    sources = (*package.glob("kernels/*.py"), package / "language" / "functions.py")
+    language = (package / "language" / name for name in ("functions.py", "tables.py"))
+    sources = (*package.glob("kernels/*.py"), *language)
     return digest_files(sources, package)

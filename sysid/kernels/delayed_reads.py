@@ -163,9 +163,15 @@ class DirectReader:
     """
 
     def __init__(
-        self, lanes: VectorBuilder, history: StateHistory, delay: IrValue, cubic: bool
+        self,
+        lanes: VectorBuilder,
+        history: StateHistory,
+        delay: IrValue,
+        places: set[int],
+        cubic: bool,
     ) -> None:
-        self._lanes, self._history, self._delay, self._cubic = lanes, history, delay, cubic
+        self._lanes, self._history, self._delay = lanes, history, delay
+        self._places, self._cubic = sorted(places), cubic
 
     def open_loop(self, loop: KernelLoop) -> None:
         """Create the values that are carried from step to step."""
@@ -173,12 +179,10 @@ class DirectReader:
     def begin_step(self, time_step: TimeStep) -> None:
         """Read the values that the step needs."""
         self._time_step = time_step
-        self._finished: dict[int, IrValue] = {}
+        self._finished = {halves: self._interpolate(halves) for halves in self._places}
 
     def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at `halves` half steps."""
-        if halves not in self._finished:
-            self._finished[halves] = self._interpolate(halves)
         if halves <= 0:
             return self._finished[halves]
         inside = interpolate_inside_step(self._lanes, self._delay, halves, now, stage)

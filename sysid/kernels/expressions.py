@@ -125,14 +125,10 @@ def _emit_clip(lanes: VectorBuilder, value: IrValue, lower: IrValue, upper: IrVa
 
 
 def _emit_modulo(lanes: VectorBuilder, value: IrValue, divisor: IrValue) -> IrValue:
-    """Emit x - y floor(x/y), corrected where the quotient was rounded to the next whole number."""
-    zero = lanes.make_number(0.0)
-    whole = lanes.call_intrinsic("floor", lanes.div(value, divisor))
-    rest = lanes.sub(value, lanes.mul(whole, divisor))
-    is_outside = lanes.compare("<", lanes.mul(rest, divisor), zero)
-    rest = lanes.select(is_outside, lanes.add(rest, divisor), rest)
-    size, limit = (lanes.call_intrinsic("fabs", number) for number in (rest, divisor))
-    return lanes.select(lanes.compare(">=", size, limit), lanes.sub(rest, divisor), rest)
+    """Emit the remainder with the sign of the divisor; fmod, which is exact, has that of x."""
+    rest = lanes.rem(value, divisor)
+    is_outside = lanes.compare("<", lanes.mul(rest, divisor), lanes.make_number(0.0))
+    return lanes.select(is_outside, lanes.add(rest, divisor), rest)
 
 
 _INSTRUCTIONS: Mapping[str, Callable[..., IrValue]] = {

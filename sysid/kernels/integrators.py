@@ -7,10 +7,10 @@ from sysid.kernels import reads
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.expressions import Environment, emit_expression
 from sysid.kernels.signal_readers import SignalReaders
-from sysid.kernels.signals import ParameterEnvironment, States
+from sysid.kernels.signals import HistoryEnvironment, ParameterEnvironment, States
 from sysid.kernels.vectors import DOUBLE, IrValue, VectorBuilder
 from sysid.language.delays import has_varying_delay
-from sysid.language.tree import PastValue, Symbol
+from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import Model
 
 
@@ -58,7 +58,25 @@ class StepEnvironment(Environment):
             return self._emit_sample(past.name, -halves // 2)
         now = self.states.now[past.name]
         reader = self.signals.get_reader(past, halves)
-        return reader.read_value(halves, now, self.values.get(past.name, now))
+        value = reader.read_value(halves, now, self.values.get(past.name, now))
+        history = self.model.find_history(past.name)
+        return value if history is None else self._emit_history(past, halves, history, value)
+
+    def _emit_history(
+        self, past: PastValue, halves: int, history: Expression, value: IrValue
+    ) -> IrValue:
+        """Emit a delayed state: its history function before the start, else `value`."""
+        lanes, delay = self.lanes, self.signals.get_state_delay(past)
+        steps = lanes.builder.sitofp(self.time_step.index, DOUBLE)
+        place = lanes.add(steps, lanes.make_number(halves / 2))
+        is_before = lanes.compare("<", place, delay)
+
+        def emit_before() -> list[IrValue]:
+            time = lanes.mul(lanes.sub(place, delay), self.parameters.period)
+            scope = HistoryEnvironment(self.parameters.values, self.parameters.period, time)
+            return [lanes.select(is_before, emit_expression(lanes, history, scope), value)]
+
+        return lanes.branch(lanes.test_any(is_before), emit_before, [value])[0]
 
     @property
     def is_in_equation(self) -> bool:

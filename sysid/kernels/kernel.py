@@ -112,7 +112,7 @@ class _Block:
             step,
         )
         start = self._emit_start(scope)
-        states = States(lanes, model, experiment, self.arguments["work"], start)
+        states = States(lanes, model, experiment, self.arguments["work"], start, scope)
         row = states.fill_history()
         delays = Delays(lanes, model, scope, step)
         signals = SignalReaders(lanes, model, experiment, states, delays, self.variant.one_step)

@@ -41,7 +41,7 @@ class SignalReaders:
                 continue
             history = states.get_history(past[0])
             if one_step or cubic:
-                self._add_reader(past, places, DirectReader(lanes, history, delay, cubic))
+                self._add_reader(past, places, DirectReader(lanes, history, delay, places, cubic))
                 continue
             for chain in _group_state_places(places):
                 reader = LinearReader(lanes, history, delay, chain, experiment.get_head("reach"))
@@ -82,6 +82,12 @@ class SignalReaders:
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
+
+    def get_state_delay(self, past: PastValue) -> IrValue:
+        """Return the delay of a delayed state, in integration steps, however long."""
+        if past.delay is None:
+            raise AssertionError(f"{past.name} is read without delay")
+        return self._delays.to_steps(past.delay)
 
     def read_varying_input(
         self, past: PastValue, halves: int, time_step: TimeStep, scope: Environment

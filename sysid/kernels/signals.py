@@ -112,6 +112,19 @@ class StartEnvironment(ParameterEnvironment):
         return self.first_inputs[past.name]
 
 
+@dataclass(frozen=True, slots=True)
+class HistoryEnvironment(ParameterEnvironment):
+    """Environment of a history function: parameters, and a time before the start."""
+
+    time: IrValue
+
+    def emit_symbol(self, symbol: Symbol) -> IrValue:
+        """Emit the time, or the value of a parameter."""
+        if symbol.kind == "time":
+            return self.time
+        return ParameterEnvironment.emit_symbol(self, symbol)
+
+
 class Delays:
     """Delays in integration steps; each expression is emitted once."""
 
@@ -160,6 +173,7 @@ class States:
         experiment: ExperimentHead,
         work: IrValue,
         start: list[IrValue],
+        scope: ParameterEnvironment,
     ) -> None:
         self._lanes, self._model = lanes, model
         self.names = [state.name for state in model.states]
@@ -168,6 +182,12 @@ class States:
         self._before = {
             n: lanes.splat(lanes.make_number(0.0)) if zero else v for n, v in self.now.items()
         }
+        for history in model.histories:
+            # A cubic through four samples after the start has at most one before it.
+            last = lanes.sub(lanes.make_number(0.0), scope.period)
+            environment = HistoryEnvironment(scope.values, scope.period, last)
+            value = emit_expression(lanes, history.expression, environment)
+            self._before[history.state] = lanes.splat(value)
         self._reach, self._rows = experiment.get_head("reach"), experiment.get_head("rows")
         size = lanes.builder.mul(self._rows, lanes.make_integer(lanes.width))
         self._histories: dict[tuple[str, Expression | None], StateHistory] = {}

@@ -149,6 +149,10 @@ class VectorBuilder:
         """Emit a / b."""
         return self._emit_arithmetic("fdiv", a, b)
 
+    def rem(self, a: IrValue, b: IrValue) -> IrValue:
+        """Emit the exact remainder of a / b, with the sign of a, as fmod."""
+        return self._emit_arithmetic("frem", a, b)
+
     def compare(self, operator: str, a: IrValue, b: IrValue) -> IrValue:
         """Emit a comparison; false if either value is ``nan``, except ``!=``."""
         left, right = self.match_shapes(a, b)

@@ -43,6 +43,7 @@ from sysid.language.tree import (
 MAX_NODES = 10_000
 """Numbers, names, operators and functions of a model; compiling takes milliseconds for each."""
 
+_MAX_PLACE, _MIN_GAP = 1e100, 1e-100  # of the x of a table: squares of gaps must be numbers
 _PI = 3.141592653589793
 _ZERO = Number(0.0)
 
@@ -271,8 +272,9 @@ class _ExpressionChecker:
                 detail = "the x of a table are numbers; only its y may have parameters"
                 return self._add_fault(item.column, detail)
             value = evaluate_expression(tree, {})
-            if not isfinite(value):
-                return self._add_fault(item.column, "this x of the table is not a finite number")
+            if not abs(value) <= _MAX_PLACE:
+                detail = f"this x of the table is {value:g}; need a number within ±{_MAX_PLACE:g}"
+                return self._add_fault(item.column, detail)
             return Number(value)
         if read or any(symbol.kind in ("time", "index") for symbol in symbols):
             return self._add_fault(
@@ -280,16 +282,21 @@ class _ExpressionChecker:
                 "the y of a table are numbers, parameters and constants; "
                 "they do not change in time",
             )
+        if not symbols and not isfinite(value := evaluate_expression(tree, {})):
+            detail = f"this y of the table is {value:g}; need a finite number"
+            return self._add_fault(item.column, detail)
         return tree
 
     def _check_increase(self, x: Sequence[tuple[Expression, int]]) -> None:
         """Check that the places of a table increase."""
         for (before, _), (place, column) in pairwise(x):
             if isinstance(before, Number) and isinstance(place, Number):
-                if place.value > before.value:
+                if place.value - before.value >= _MIN_GAP:
                     continue
                 low, high = format_number(before.value), format_number(place.value)
-                self._add_fault(column, f"the x of a table must increase, but {high} follows {low}")
+                need = f", by {_MIN_GAP:g} or more" if place.value > before.value else ""
+                detail = f"the x of a table must increase{need}, but {high} follows {low}"
+                self._add_fault(column, detail)
 
     def _check_past_value(self, node: Apply, depth: int) -> Expression:
         if len(node.arguments) != 1:
@@ -300,7 +307,7 @@ class _ExpressionChecker:
         self.uses = []
         index = self.check_value(argument, depth + 1)
         inside, self.uses = self.uses, outside
-        if (fault := self._describe_varying_delay(node.name, inside)) is not None:
+        if (fault := self._find_delay_fault(node, inside)) is not None:
             return self._add_fault(*fault)
         if len(self._faults) > faults_before:
             return _ZERO
@@ -313,33 +320,32 @@ class _ExpressionChecker:
             return self._insert_tree(shifted, node.column, depth)
         return self._add_use(node.name, *past_index, node.column)
 
-    def _describe_varying_delay(
-        self, name: str, read: Sequence[SignalUse]
-    ) -> tuple[int, str] | None:
-        """Describe why a delay must not read these signals; None if it may.
+    def _find_delay_fault(self, node: Apply, read: Sequence[SignalUse]) -> TextFault | None:
+        """Find why a delay must not read these signals; None if it may.
 
         The lag of an input may change with the present values of inputs.
         """
+        name = node.name
         for value, column in read:
             if value.kind == "state":
                 detail = (
                     f"the delay depends on {value.name!r}; a delay consists of parameters, "
                     "constants and present inputs, not of states"
                 )
-                return column, detail
+                return TextFault(column, detail)
             if value.offset or value.delay is not None:
                 detail = f"a delay reads present inputs only; write {value.name} without a past"
-                return column, detail
+                return TextFault(column, detail)
         if read and name not in self._scope.inputs:
             detail = (
                 f"the lag of {name!r} changes with {read[0].value.name!r}; "
                 "only an input may have such a lag"
             )
-            return read[0].column, detail
+            return TextFault(read[0].column, detail)
         tree = self._scope.intermediates.get(name, _ZERO)
         if any(map(has_varying_delay, collect_past_values(tree))):
             detail = f"{name!r} contains a lag that changes with an input, so it has no past here"
-            return 1, detail
+            return TextFault(node.column, detail)
         return None
 
     def _add_use(self, name: str, offset: int, delay: Expression | None, column: int) -> PastValue:

@@ -59,16 +59,22 @@ def check_delays(
 
 
 def list_trees(model: Model) -> list[Expression]:
-    """List the expressions of equations, outputs and starts."""
+    """List the expressions of equations, outputs, starts and histories."""
     outputs = [output.expression for output in model.outputs]
     starts = [start.expression for start in model.initial if isinstance(start, DerivedInitial)]
-    return [*model.equations, *outputs, *starts]
+    histories = [history.expression for history in model.histories]
+    return [*model.equations, *outputs, *starts, *histories]
 
 
 def list_past_values(model: Model) -> list[PastValue]:
     """List every past value that an equation or an output reads."""
     trees = (*model.equations, *(output.expression for output in model.outputs))
     return [value for tree in trees for value in collect_past_values(tree)]
+
+
+def has_known_past(model: Model, past: PastValue) -> bool:
+    """Whether a value before the start follows from a history function, however long ago."""
+    return past.kind == "state" and model.find_history(past.name) is not None
 
 
 def compute_longest_delay(
@@ -86,6 +92,8 @@ def check_record_length(
 ) -> None:
     """Raise if a past value may lie further back than the record lasts.
 
+    The past of a state with a history function is known.
+
     Parameters
     ----------
     spans : mapping of str to (lower, upper)
@@ -102,6 +110,8 @@ def check_record_length(
         If so; the message names the parameters of the delay, their bounds and a value that is
         short enough.
     """
+    if has_known_past(model, past):
+        return
     longest = compute_longest_delay(model, past, spans, step)
     if has_varying_delay(past):
         _check_varying_delay(model, past, spans, step)

@@ -153,7 +153,7 @@ class MeasuredInitial:
 class DerivedInitial:
     """Initial value of a state that follows from parameters and the inputs' first values.
 
-    `text` is what the document says: an expression such as ``K*u0``, or ``steady``. In
+    `text` is what the document says: an expression such as ``K*u0``, ``steady`` or ``history``. In
     `expression`, an input without delay is its value at the start of the record.
     """
 
@@ -162,6 +162,17 @@ class DerivedInitial:
 
 
 InitialState = FixedInitial | EstimatedInitial | MeasuredInitial | DerivedInitial
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryFunction:
+    """Past of a state before the start, which its delayed reads take there.
+
+    `expression` is a function of ``t`` < 0 (s) and parameters, without signals.
+    """
+
+    state: str
+    expression: Expression
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +189,7 @@ class Solver:
         Integration steps in one grid step. In the difference form `k` counts these steps and `h`
         is their length. So a stiff recursion may be finer than the sampling.
     history : {"constant", "zero"}
-        States before the start: their initial value, or zero.
+        States before the start that have no history function: their initial value, or zero.
     interpolation : {"linear", "cubic", "nearest"}
         Interpolation between two grid points.
     """
@@ -199,7 +210,8 @@ class Model:
     difference form a tree may read another state at the present sample. `order` (indices into
     `states`) is the order of computation. `memory` is the largest fixed offset of any past value
     (difference form): the first `memory` samples are measured or initial values. `document` is
-    the normal form, from which the model can be built again.
+    the normal form, from which the model can be built again. `histories` are those of states with a
+    history function, in the states' order.
 
     `terms` are the terms of a polynomial, in the order of their coefficients. With a `rule` they
     are candidates. `sysid.selection.select.select_model_terms` selects among them on records. Its
@@ -222,6 +234,11 @@ class Model:
     terms: tuple[Term, ...] = ()
     rule: TermRule | None = None
     selection: Selection | None = field(default=None, compare=False)
+    histories: tuple[HistoryFunction, ...] = ()
+
+    def find_history(self, state: str) -> Expression | None:
+        """Find the history function of a state; None if it has none."""
+        return next((one.expression for one in self.histories if one.state == state), None)
 
 
 def replace_substeps(model: Model, substeps: int) -> Model:

@@ -46,6 +46,7 @@ def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
             p.name: _write_parameter(p, declared) for p in model.parameters if p.name in declared
         },
         "constants": {k: float(v) for k, v in (fields.get("constants") or {}).items()},
+        **_write_histories(fields.get("history"), model),
         "initial": {
             state.name: _write_initial_state(start)
             for state, start in zip(model.states, model.initial, strict=True)
@@ -58,6 +59,12 @@ def _write_intermediates(declared: Mapping[str, Any] | None) -> dict[str, Any]:
     if not declared:
         return {}  # so that the normal form of other models has no such field
     return {"let": {name: _write_text(text) for name, text in declared.items()}}
+
+
+def _write_histories(declared: Mapping[str, Any] | None, model: Model) -> dict[str, Any]:
+    if not model.histories or declared is None:
+        return {}
+    return {"history": {one.state: _write_text(declared[one.state]) for one in model.histories}}
 
 
 def _write_equations(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:

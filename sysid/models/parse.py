@@ -10,6 +10,7 @@ from sysid.language.scope import EquationForm, Scope
 from sysid.language.tree import Expression, Number, PastValue, match_plain_state
 from sysid.models import equations
 from sysid.models.documents import DocumentReader, quote_value
+from sysid.models.histories import derive_starts, read_histories
 from sysid.models.intermediates import read_intermediates
 from sysid.models.model import (
     DerivedInitial,
@@ -51,6 +52,7 @@ _COMMON_FIELDS = (
     "constants",
     "let",
     "initial",
+    "history",
     "solver",
 )
 _FORMS = ("difference", "differential", "polynomial")
@@ -111,7 +113,8 @@ def _check_size(reader: DocumentReader, model: Model) -> None:
     starts = (start.expression for start in model.initial if isinstance(start, DerivedInitial))
     outputs = (output.expression for output in model.outputs)
     place = "/terms" if model.form == "polynomial" else "/equations"
-    equations.check_size(reader, (*model.equations, *outputs, *starts), place)
+    histories = (history.expression for history in model.histories)
+    equations.check_size(reader, (*model.equations, *outputs, *starts, *histories), place)
 
 
 def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
@@ -173,7 +176,10 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
     _, trees = equations.read_equations(reader, fields.get("equations"), scope)
     _, outputs = equations.read_outputs(reader, fields.get("outputs"), scope, states)
     _check_output_names(reader, outputs, scope)
-    initial = read_initial_states(reader, fields.get("initial"), scope, FixedInitial(0.0))
+    histories = read_histories(reader, fields.get("history"), scope)
+    begun = [history.state for history in histories]
+    initial = read_initial_states(reader, fields.get("initial"), scope, FixedInitial(0.0), begun)
+    initial = derive_starts(reader, dict(zip(scope.states, initial, strict=True)), histories)
     solver = read_solver(reader, fields.get("solver"), form)
     reader.raise_faults()
     initial = _solve_steady_starts(reader, initial, trees, scope)
@@ -192,6 +198,7 @@ def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> M
         memory=equations.compute_memory(trees) if form == "difference" else 0,
         solver=solver,
         document={},
+        histories=histories,
     )
 
 
@@ -303,7 +310,9 @@ def _read_polynomial_model(reader: DocumentReader, fields: Mapping[str, Any]) ->
     intermediates = read_intermediates(reader, fields.get("let"), scope)
     scope = replace(scope, intermediates=intermediates)
     equation = expand_polynomial(reader, fields, scope)
+    read_histories(reader, fields.get("history"), scope)
     initial = read_initial_states(reader, fields.get("initial"), scope, MeasuredInitial())
+    initial = derive_starts(reader, {output.name: initial[0]}, ())
     solver = read_solver(reader, fields.get("solver"), "polynomial")
     reader.raise_faults()
     named = {parameter.name: get_interval(parameter) for parameter in equation.coefficients}

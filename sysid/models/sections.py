@@ -1,7 +1,7 @@
 """Sections of a model document that all forms share: names, parameters, initial, solver."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast, get_args
 
@@ -29,6 +29,9 @@ from sysid.models.parameters import BoundsRule, Parameter, ParameterScale
 
 STEADY = "steady"
 """A start at which the equations rest with the inputs' first values."""
+
+HISTORY = "history"
+"""A start at which the history function of the state ends."""
 
 MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
@@ -143,9 +146,17 @@ def get_interval(parameter: Parameter) -> tuple[float, float]:
 
 
 def read_initial_states(
-    reader: DocumentReader, value: object, scope: Scope, default: InitialState
+    reader: DocumentReader,
+    value: object,
+    scope: Scope,
+    default: InitialState,
+    with_history: Collection[str] = (),
 ) -> tuple[InitialState, ...]:
-    """Read the initial value of each state; the expressions of steady ones are still open."""
+    """Read the initial value of each state.
+
+    The expressions of starts that are steady, or follow from a history, are still open. The latter
+    is the default of a state `with_history`.
+    """
     states = scope.states
     fields = (
         dict.fromkeys(states, STEADY) if value == STEADY else reader.read_section(value, "/initial")
@@ -158,7 +169,7 @@ def read_initial_states(
     return tuple(
         _read_initial_state(reader, fields[name], join_pointer("initial", name), scope)
         if name in fields
-        else default
+        else (DerivedInitial(Number(0.0), HISTORY) if name in with_history else default)
         for name in states
     )
 
@@ -171,7 +182,8 @@ def _read_initial_state(
     if isinstance(value, str):
         text = " ".join(value.split())
         return DerivedInitial(
-            Number(0.0) if text == STEADY else _read_start(reader, text, place, scope), text
+            Number(0.0) if text in (STEADY, HISTORY) else _read_start(reader, text, place, scope),
+            text,
         )
     if isinstance(value, Mapping):
         fields = reader.read_section(value, place, ("lower", "upper", "bounds"))

@@ -1,7 +1,8 @@
 """Unit checks: delays, time constants, and the channels of records.
 
 A model treats units as labels. ``u(t - L)`` reads L in seconds, whatever its unit. A delay in
-minutes would be estimated in seconds and reported in minutes, so it is refused.
+minutes would be estimated in seconds and reported in minutes, so it is refused. So is ``V/q`` of a
+volume in m³ and a flow in m³/h.
 
 dx/dt is per second, so ``(u - x)/T`` reads T in seconds. Equations that convert T, such as
 ``(u - x)/(60*T)``, multiply it, or the sum that contains it, by a number. Equations that read T
@@ -26,9 +27,17 @@ from sysid.core.units import (
 )
 from sysid.data.records import Channel, Record
 from sysid.language.delays import collect_past_values
-from sysid.language.monomials import Monomial, collect_terms
+from sysid.language.monomials import Monomial, collect_terms, to_expression
+from sysid.language.printer import format_expression
 from sysid.language.scope import EquationForm
-from sysid.language.tree import Binary, Expression, PastValue, Symbol, find_children
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    PastValue,
+    Symbol,
+    find_children,
+)
 from sysid.models.documents import DocumentReader
 from sysid.models.model import Model
 
@@ -37,40 +46,59 @@ _SECONDS = "s"
 
 
 def check_delay_units(reader: DocumentReader, model: Model) -> None:
-    """Add a fault for each parameter that is a delay without a factor, in a wrong unit."""
-    units = {signal.name: signal.unit for signal in model.parameters}
+    """Add a fault for each term of a delay that has no factor and a wrong unit."""
+    inputs = {signal.name: signal.unit for signal in model.inputs}
+    units = inputs | {parameter.name: parameter.unit for parameter in model.parameters}
     form: EquationForm = "differential" if model.form == "differential" else "difference"
     reported = set()
     for tree in (*model.equations, *(signal.expression for signal in model.outputs)):
         for past in collect_past_values(tree):
-            for name, in_periods in _find_bare_delays(past):
-                size = find_conversion_factor(units.get(name, "1"), _SECONDS)
+            for factors, in_periods in _find_bare_delays(past):
+                unit = _multiply_factors(factors, units)
+                size = None if unit is None else find_conversion_factor(unit, _SECONDS)
                 in_seconds = form == "differential" or in_periods
-                if size is None or (size == 1.0 and in_seconds) or name in reported:
+                if size is None or (size == 1.0 and in_seconds) or factors in reported:
                     continue
-                reported.add(name)
-                detail = _describe_delay_unit(name, units[name], size, form, in_periods=in_periods)
-                reader.add_fault(join_pointer("parameters", name, "unit"), detail)
+                reported.add(factors)
+                text = format_expression(to_expression({factors: 1.0}), "t")
+                detail = _describe_delay_unit(text, unit or "", size, form, in_periods=in_periods)
+                name = _find_quantity(factors[0][0])
+                place = ("inputs", name) if name in inputs else ("parameters", name, "unit")
+                reader.add_fault(join_pointer(*place), detail)
 
 
-def _find_bare_delays(past: PastValue) -> Iterator[tuple[str, bool]]:
-    """Find parameters that a delay adds without a factor, and if they are divided by h."""
+def _find_bare_delays(past: PastValue) -> Iterator[tuple[Monomial, bool]]:
+    """Find products that a delay adds without a factor, and if they are divided by h."""
     if past.delay is None:
         return
     for monomial, coefficient in collect_terms(past.delay).items():
-        name = _match_single_parameter(
-            tuple(factor for factor in monomial if factor != _INVERSE_PERIOD)
-        )
-        if name is not None and coefficient == 1.0:
-            yield name, _INVERSE_PERIOD in monomial
+        factors = tuple(factor for factor in monomial if factor != _INVERSE_PERIOD)
+        if coefficient == 1.0:
+            yield factors, _INVERSE_PERIOD in monomial
 
 
-def _match_single_parameter(monomial: Monomial) -> str | None:
-    match monomial:
-        case ((Symbol(name, "parameter"), 1),):
-            return name
-        case _:
+def _multiply_factors(factors: Monomial, units: Mapping[str, str]) -> str | None:
+    """Multiply the units of factors; None if one is missing or is that of a plain number."""
+    above: list[str] = []
+    below: list[str] = []
+    for factor, power in factors:
+        unit = units.get(_find_quantity(factor), "1")
+        if is_blank_unit(unit):
             return None
+        grouped = f"({unit})" if set(unit) & set("/·*") else unit
+        (above if power > 0 else below).extend([grouped] * abs(power))
+    return "/".join(["·".join(above) or "1", *below])
+
+
+def _find_quantity(factor: Expression) -> str:
+    """Find the parameter or input whose unit a factor has, also inside its limits; else empty."""
+    match factor:
+        case Symbol(name, "parameter") | PastValue(name, "input", 0, None):
+            return name
+        case FunctionCall("max" | "min" | "clip" | "abs", (limited, *_)):
+            return _find_quantity(limited)
+        case _:
+            return ""
 
 
 def _describe_delay_unit(
@@ -82,7 +110,8 @@ def _describe_delay_unit(
     right = f"{clock} - {size:.12g}*{name}" + ("" if form == "differential" else "/h")
     if form == "difference" and not in_periods:
         return f"found {unit!r}, but this delay is in samples: write {right}, or the unit samples"
-    return f"found {unit!r}, but this delay is in seconds: give it in s, or write {right}"
+    given = "give it in s, or " if name.isidentifier() else ""
+    return f"found {unit!r}, but this delay is in seconds: {given}write {right}"
 
 
 def list_time_unit_warnings(model: Model) -> list[str]:

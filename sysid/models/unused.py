@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 from sysid.core.errors import Fault, join_pointer
 from sysid.language.parser import tokenize_expression
 from sysid.language.tree import PastValue, walk
-from sysid.models.delays import find_unused_settings, list_trees
+from sysid.models.delays import find_unused_settings, list_past_values, list_trees
 from sysid.models.model import Model
 from sysid.models.ties import apply_ties, resolve_ties
 
-_READING_FIELDS = ("equations", "outputs", "initial", "lags", "terms")
+_READING_FIELDS = ("equations", "outputs", "initial", "history", "lags", "terms")
 """Fields of a document whose expressions may have names of `let` and constants."""
 
 
@@ -25,8 +25,17 @@ def find_unused_names(model: Model) -> list[Fault]:
     return [
         *find_unused_settings(tied, model.parameters, None),
         *_make_faults("inputs", [one.name for one in model.inputs if one.name not in read]),
+        *_find_unread_histories(model),
         *_find_unused_definitions(model),
     ]
+
+
+def _find_unread_histories(model: Model) -> Iterator[Fault]:
+    delayed = {past.name for past in list_past_values(model) if past.delay is not None}
+    for history in model.histories:
+        if history.state not in delayed:
+            detail = f"no lag reads {history.state!r} before the record; remove it, or use it"
+            yield Fault(join_pointer("history", history.state), detail)
 
 
 def _find_unused_definitions(model: Model) -> Iterator[Fault]:

@@ -60,6 +60,12 @@ def space_residuals(times: FloatArray, values: FloatArray) -> SpacedResiduals:
     )
 
 
+def keep_in_order(values: FloatArray) -> SpacedResiduals:
+    """Take residuals (N,) as evenly spaced, in their order."""
+    present = np.ones(values.size, dtype=np.bool_)
+    return SpacedResiduals(np.arange(float(values.size)), values, present, 1.0, is_regular=True)
+
+
 @lru_cache(maxsize=2)
 def _find_time_grid(time_bytes: bytes) -> _TimeGrid | None:
     """Find the grid of times (n,), passed as bytes; None if they are on no grid.

@@ -22,14 +22,13 @@ from sysid.core.distributions import chi_square_tail
 from sysid.core.jit import jit_compile
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray, IntArray
-from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
+from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness, keep_in_order
 
 MAX_POLE = 0.97
 """Limit on an autoregressive pole: beyond, it follows a single drift (Andrews and Monahan 1992)."""
 
 _SEARCH_STARTS = ((0.6, -1.5), (1.5, 0.0))
-_MAX_EVALUATIONS = 80  # of each search
-_SEARCH_TOLERANCE = 0.02  # of the likelihood, and of its two arguments
+_SEARCH_OPTIONS = {"maxfev": 80, "xatol": 0.02, "fatol": 0.02}  # evaluations; tolerances
 _DIFFERENCE_STEP = 0.1  # of the two arguments, for finite differences
 _MIN_CURVATURE = 0.05  # a flatter likelihood counts as having this curvature
 _MIN_CHANCE = 0.05  # least p-value of the innovations for whiteness
@@ -90,17 +89,7 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
     if values.size <= basis.shape[1] + 2:
         return None
     solutions = [
-        minimize(
-            _compute_deviance,
-            start,
-            (series,),
-            method="Nelder-Mead",
-            options={
-                "maxfev": _MAX_EVALUATIONS,
-                "xatol": _SEARCH_TOLERANCE,
-                "fatol": _SEARCH_TOLERANCE,
-            },
-        )
+        minimize(_compute_deviance, start, (series,), method="Nelder-Mead", options=_SEARCH_OPTIONS)
         for start in _SEARCH_STARTS
     ]
     best = min(solutions, key=lambda solution: float(solution.fun)).x
@@ -180,8 +169,7 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
 
 
 def _are_white(values: FloatArray) -> bool:
-    present = np.ones(values.size, dtype=np.bool_)
-    spaced = SpacedResiduals(np.arange(float(values.size)), values, present, 1.0, is_regular=True)
+    spaced = keep_in_order(values)
     return float(chi_square_tail(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _MIN_CHANCE
 
 

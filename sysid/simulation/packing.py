@@ -22,7 +22,7 @@ from sysid.kernels.reads import (
 )
 from sysid.language.functions import Interval
 from sysid.language.intervals import bound_expression
-from sysid.models.delays import check_record_length
+from sysid.models.delays import check_record_length, has_known_past
 from sysid.models.model import Model
 from sysid.simulation.grid import Grid, is_on_grid
 
@@ -62,7 +62,8 @@ def find_largest_delays(
 ) -> dict[str, float]:
     """Find the largest delay of each delayed signal of a kind, in integration steps.
 
-    The delays are bounded by the bounds of the parameters.
+    The delays are bounded by the bounds of the parameters. Those of a state with a history function
+    need the record at most: before it the function is read.
 
     Raises
     ------
@@ -77,6 +78,8 @@ def find_largest_delays(
         check_record_length(model, past, parameters, step, grid.duration)
         upper = bound_expression(past.delay, parameters, step)[1]
         steps = upper if is_difference(model) else upper / step
+        if has_known_past(model, past):
+            steps = min(steps, grid.last_step + 1.0)
         largest[past.name] = max(steps, largest.get(past.name, 0.0))
     return largest
 

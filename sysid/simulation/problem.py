@@ -307,6 +307,12 @@ class Problem:
             self.evaluator, _check_population(theta, len(self.free_parameters))
         )
 
+    def compute_residuals(self, theta: FloatArray) -> FloatArray:
+        """Compute the weighted residuals w(ŷ - y) of the scored samples, (P, D) → (P, n)."""
+        rows, evaluator = self.scored_rows, self.evaluator
+        errors = self.predict(theta)[:, rows] - evaluator.measured[rows]
+        return np.asarray(evaluator.weight[rows] * errors)
+
     def split_by_output(self, values: FloatArray) -> list[dict[str, FloatArray]]:
         """Split values (M,) into one array for each output of each experiment."""
         parts: list[dict[str, FloatArray]] = []

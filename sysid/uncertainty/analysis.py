@@ -8,9 +8,9 @@ With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the 
 M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹. Here ψ = e/√(1 + (e/s)²) and
 K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly.
 
-If residuals of a free run are clearly not white, the covariance of coloured residuals is used
-(`sysid.residuals.coloured`). If residuals of outputs are clearly correlated, that of a common noise
-is used (`sysid.residuals.correlated_outputs`). Under a noise model, e and S are whitened first
+If the residuals are clearly not one white noise, the covariance is a sandwich
+(`sysid.residuals.sandwich`): of coloured residuals of a free run, of unequal variances, of outputs
+that share their noise, or of whole repeats. Under a noise model, e and S are whitened first
 (`sysid.identification.generalised_least_squares`).
 
 A time lag that is rounded to whole samples has plateaus of width w on which the output does not
@@ -41,8 +41,8 @@ from sysid.identifiability.combinations import (
 from sysid.identifiability.exchange import ExchangeGroups
 from sysid.identifiability.scaling import find_scalings
 from sysid.identifiability.translations import find_translations
-from sysid.residuals.coloured import ColouredCovariance, iterate_parts
-from sysid.residuals.correlated_outputs import estimate_joint_covariance
+from sysid.residuals.sandwich import Sandwich, estimate_sandwich
+from sysid.residuals.series import iterate_parts
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_influence, compute_loss_weight
 from sysid.simulation.problem import Problem
@@ -134,9 +134,7 @@ def _analyse_without_sensitivities(
     """
     error = spent.residuals
     if error is None:
-        weight = problem.evaluator.weight
-        errors = weight * (problem.predict(theta[None])[0] - problem.evaluator.measured)
-        error = errors[weight > 0]
+        error = problem.compute_residuals(theta[None])[0]
     criteria = compute_criteria(
         problem, error if whitening is None else whitening.whiten(error), whitening
     )
@@ -185,7 +183,7 @@ def _analyse_sensitivities(
     columns, retained = moving, retained.copy()
     retained[d - n_symmetries :] = False
     inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
-    colour = estimate_joint_covariance(problem, influence, columns)
+    colour = estimate_sandwich(problem, influence, columns)
     covariance, noise, middle = _estimate_covariance(
         error, columns, inverse, problem.loss_scale, colour
     )
@@ -195,6 +193,7 @@ def _analyse_sensitivities(
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     blocks = find_unidentified(directions)
     names = problem.free_names
+    degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
@@ -209,12 +208,12 @@ def _analyse_sensitivities(
             for block in blocks
             for g in express_combinations(block, names, theta, scale, physical)
         ),
+        degrees=float(np.min(degrees)),
     )
     combined = {name for group in uncertainty.groups for name in group.members}
     statuses = _classify_parameters(
         place, blocks, is_pulled, np.array([name in combined for name in names])
     )
-    degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     statistics = LocalStatistics(
         theta,
         statuses,
@@ -245,7 +244,7 @@ def _analyse_sensitivities(
         active_bounds,
         linear,
         decomposition=decomposition,
-        likelihood=LikelihoodModel(error, columns, middle, float(np.min(degrees)), whitening),
+        likelihood=LikelihoodModel(error, columns, middle, uncertainty.degrees, whitening),
     )
 
 
@@ -379,7 +378,7 @@ def _estimate_covariance(
     columns: FloatArray,
     inverse: FloatArray,
     scale: float,
-    colour: ColouredCovariance | None,
+    colour: Sandwich | None,
 ) -> tuple[FloatArray, float, FloatArray | None]:
     """Estimate the covariance in unit coordinates, and the standard deviation of the noise.
 
@@ -403,7 +402,7 @@ def _estimate_covariance(
 
 
 def _compute_degrees_of_freedom(
-    n: int, inverse: FloatArray, colour: ColouredCovariance | None, whitening: Whitening | None
+    n: int, inverse: FloatArray, colour: Sandwich | None, whitening: Whitening | None
 ) -> FloatArray:
     """Compute the degrees of freedom (D,) of the intervals; `inverse` (D, D) is (SᵀS)⁻¹.
 
@@ -421,9 +420,7 @@ def _compute_degrees_of_freedom(
     )
 
 
-def _classify_noise_colour(
-    colour: ColouredCovariance | None, whitening: Whitening | None
-) -> NoiseColour:
+def _classify_noise_colour(colour: Sandwich | None, whitening: Whitening | None) -> NoiseColour:
     if colour is None or colour.is_white:
         return "white" if whitening is None else "first-order"
     if colour.is_clustered:

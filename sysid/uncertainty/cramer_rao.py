@@ -8,7 +8,7 @@ the parameters can keep estimates below the bound, which ignores such limits.
 
 The bound applies to the noise that a job adds. `sysid.data.noise` draws it independently for each
 output. A measured record may have noise of its own, also correlated between outputs
-(`sysid.residuals.correlated_outputs`). That noise is in the standard errors, not in the bound.
+(`sysid.residuals.sandwich`). That noise is in the standard errors, not in the bound.
 """
 
 from dataclasses import dataclass

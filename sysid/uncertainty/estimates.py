@@ -1,6 +1,7 @@
 """Estimates: standard errors, intervals, statuses, information criteria, posterior."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 from sysid.core.types import FloatArray
@@ -11,6 +12,7 @@ EstimateStatus = Literal[
     "identified",
     "not settled",
     "not validated",
+    "order-dependent",
     "ambiguous",
     "group",
     "at bound",
@@ -87,7 +89,7 @@ class Uncertainty:
     `noise_colour` is the colour of residuals that the covariance assumes. If they drift over the
     whole record, the covariance is a lower bound. `correlation` belongs to this covariance.
     `sensitivity_correlation` belongs to (SᵀS)⁻¹: it compares the sensitivities S, for residuals of
-    any colour.
+    any colour. `degrees` is the least number of degrees of freedom of all intervals.
     """
 
     names: tuple[str, ...]
@@ -99,6 +101,7 @@ class Uncertainty:
     noise_sd: float
     groups: tuple[IdentifiableCombination, ...] = ()
     noise_colour: NoiseColour = "white"
+    degrees: float = inf
 
 
 @dataclass(frozen=True, slots=True)

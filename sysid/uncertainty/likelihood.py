@@ -89,13 +89,8 @@ class Likelihood:
         if self._model.middle is None and self._model.whitening is None:
             loss = self._problem.n_scored * self._problem.evaluate_fitness(theta) ** 2
             return np.asarray(self._share * (loss - self._loss))
-        rows = self._problem.scored_rows
-        weight, measured = (
-            values[rows]
-            for values in (self._problem.evaluator.weight, self._problem.evaluator.measured)
-        )
         with np.errstate(all="ignore"):  # diverged simulations
-            residuals = weight * (self._problem.predict(theta)[:, rows] - measured)
+            residuals = self._problem.compute_residuals(theta)
             if self._model.whitening is not None:
                 residuals = self._model.whitening.whiten(residuals)
             loss = np.sum(compute_loss(residuals, self._problem.loss_scale), axis=1)

@@ -60,8 +60,8 @@ class ParameterSpread(NamedTuple):
     ----------
     names : tuple of str
     covariance : FloatArray, shape (D, D)
-    degrees : float
-        Degrees of freedom of the t distribution.
+    degrees, noise_degrees : float
+        Degrees of freedom of the estimates, and of the variance of the noise.
     samples : FloatArray, shape (m, D), or None
         Samples of the posterior.
     """
@@ -69,6 +69,7 @@ class ParameterSpread(NamedTuple):
     names: tuple[str, ...]
     covariance: FloatArray
     degrees: float
+    noise_degrees: float
     samples: FloatArray | None = None
 
 
@@ -85,7 +86,10 @@ def compute_output_bands(
     """
     columns = [spread.names.index(name) for name in problem.free_names]
     simulated = problem.predict(theta[None])[0]
-    quantile = float(student_quantile(max(spread.degrees, 1.0), 0.975))
+    quantile, noise_quantile = (
+        float(student_quantile(max(degrees, 1.0), 0.975))
+        for degrees in (spread.degrees, spread.noise_degrees)
+    )
     if spread.samples is None:
         covariance = spread.covariance[np.ix_(columns, columns)]
         half = quantile * _compute_deviations(problem, theta, covariance)
@@ -104,7 +108,9 @@ def compute_output_bands(
                 channel.times,
                 simulated[rows],
                 confidence[rows],
-                _add_noise(simulated[rows], confidence[rows], quantile * noise[e, channel.name]),
+                _add_noise(
+                    simulated[rows], confidence[rows], noise_quantile * noise[e, channel.name]
+                ),
                 source,
             )
             for channel in record.outputs

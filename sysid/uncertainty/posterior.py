@@ -22,12 +22,13 @@ import numpy as np
 
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
 from sysid.identifiability.exchange import ExchangeGroups, order_exchangeable
-from sysid.residuals.coloured import CHI_SQUARE_95
+from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit, to_unit
 from sysid.uncertainty.analysis import Analysis
-from sysid.uncertainty.estimates import Posterior, PosteriorParameter
+from sysid.uncertainty.estimates import Estimate, Posterior, PosteriorParameter
 from sysid.uncertainty.likelihood import Likelihood, LikelihoodModel
 
 _RANDOM_STREAM = 2**63 + 1
@@ -41,6 +42,7 @@ _FIRST_STEPS, _GROWTH = 200, 1.25  # steps before the first test of convergence;
 _BURN_IN = 5  # the first of so many parts is left out
 _MIN_TIMES = 50.0  # autocorrelation times that a converged chain is long
 _WINDOW = 5.0  # autocorrelation times over which correlations are summed
+_ALIKE = 2.0  # ratio of the widths of two intervals
 _SAME_PLACE = 1e-3  # of the range: a minimum nearer to the estimate is the estimate
 _MIN_STEPS = 20  # of a chain that is worth reporting
 _MAX_SIMULATIONS = 200_000
@@ -82,8 +84,8 @@ def _make_empty_posterior(d: int, reason: str, evaluations: int = 0) -> Posterio
     return Posterior((), nothing[:0], nothing, 0, 0, 0.0, evaluations, False, reason)
 
 
-def describe_posterior(posterior: Posterior) -> list[str]:
-    """Describe why there are no samples, or what is wrong with them."""
+def describe_posterior(posterior: Posterior, estimates: Sequence[Estimate] = ()) -> list[str]:
+    """Describe why there are no samples, what is wrong with them, or where errors differ."""
     if not posterior.parameters:
         return [f"no posterior was sampled: {posterior.reason}"]
     described = []
@@ -98,7 +100,29 @@ def describe_posterior(posterior: Posterior) -> list[str]:
             f"{posterior.gain:.3g}). The search missed a better minimum: search longer, or with "
             "another seed"
         )
-    return described
+    return [*described, *_describe_differences(posterior, estimates)]
+
+
+def _describe_differences(posterior: Posterior, estimates: Sequence[Estimate]) -> list[str]:
+    """Describe the parameters whose interval has another width than that of the samples."""
+    by_name = {one.name: one for one in estimates if one.stderr and one.interval95 is not None}
+    differences = []
+    for sampled in posterior.parameters if posterior.is_converged else ():
+        low, high = sampled.interval95
+        if sampled.name in by_name and high > low:
+            stated = by_name[sampled.name].interval95 or (0.0, 0.0)
+            if not 1.0 / _ALIKE <= (stated[1] - stated[0]) / (high - low) <= _ALIKE:
+                unit = format_unit(sampled.unit)
+                differences.append(
+                    f"{sampled.name} is from {low:.4g} to {high:.4g}{unit} by the posterior, from "
+                    f"{stated[0]:.4g} to {stated[1]:.4g}{unit} by the standard error"
+                )
+    if not differences:
+        return []
+    return [
+        f"{'; '.join(differences)}. The posterior follows bounds and curved valleys, the standard "
+        "error a linear model. Take the posterior if the bounds are physical limits"
+    ]
 
 
 def _find_obstacle(problem: Problem, theta: FloatArray, analysis: Analysis) -> str:

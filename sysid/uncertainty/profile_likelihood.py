@@ -12,7 +12,7 @@ again (the ratio test of an M-estimator, Hampel et al. 1986, ch. 7). ψ and K ar
 `sysid.uncertainty.analysis`. The scale is 1 if no residual is an outlier.
 
 If the residuals are coloured, the ratio is divided by the factor by which this widens the square of
-the interval (`sysid.residuals.coloured`). So profile and standard error assume the same noise.
+the interval (`sysid.residuals.sandwich`). So profile and standard error assume the same noise.
 
 The others are estimated by least squares from a neighbouring value. A time lag that is rounded to
 samples changes the output in jumps only, so it is held while another parameter is profiled.
@@ -26,8 +26,7 @@ import numpy as np
 from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.identifiability.exchange import ExchangeGroups, find_exchanges, order_exchangeable
-from sysid.residuals.coloured import CHI_SQUARE_95
-from sysid.residuals.correlated_outputs import estimate_joint_covariance
+from sysid.residuals.sandwich import CHI_SQUARE_95, estimate_sandwich
 from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.loss import compute_influence
 from sysid.simulation.problem import Problem
@@ -247,7 +246,7 @@ class _ProfileSearch:
         """Compute the factor that makes n ln(R/R₀) follow χ², also for coloured residuals."""
         scale = self._problem.loss_scale
         influence = compute_influence(error, scale)
-        colour = estimate_joint_covariance(self._problem, influence, columns)
+        colour = estimate_sandwich(self._problem, influence, columns)
         factor = _compute_robust_factor(error, scale)
         if colour is None or not norm > 0:
             return factor

@@ -12,20 +12,24 @@ deviations are scaled so that J at the estimate is the plain RMS error.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.core.units import format_unit
-from sysid.residuals.coloured import ResidualPart, iterate_parts
-from sysid.residuals.variances import estimate_variances, have_unequal_variances
-from sysid.search.least_squares import ScoredSamples, compute_residuals, fill_jacobian
+from sysid.residuals.autocorrelation import MIN_SAMPLES
+from sysid.residuals.series import (
+    ResidualPart,
+    count_used_degrees,
+    have_unequal_variances,
+    iterate_parts,
+)
 from sysid.search.refine import refine_candidates
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import to_unit
+from sysid.uncertainty.sensitivities import BudgetSpentError, compute_sensitivities
 
 _MAX_ROUNDS = 12
 _TOLERANCE = 0.01  # relative: deviations that differ by less
@@ -34,17 +38,8 @@ _NO_NOISE = 1e-4  # of the output: smaller residuals are of the solver
 _MOST_TOLD = 4  # series whose noise a note lists
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReweightedFit:
-    """A fit whose problem weighs residuals by the estimated noise.
-
-    Attributes
-    ----------
-    problem : Problem
-    theta : FloatArray, shape (D,)
-    rms : float
-    evaluations : int
-    """
+class ReweightedFit(NamedTuple):
+    """A fit (D,) whose problem weighs residuals by the estimated noise, with its RMS there."""
 
     problem: Problem
     theta: FloatArray
@@ -67,21 +62,26 @@ def fit_unequal_noise(
         return None
     left = 2**62 if max_simulations is None else max_simulations
     most, fit, rows = left, None, problem.scored_rows
+    measured = problem.evaluator.measured[rows]
+    varies = np.array([np.ptp(measured[part.rows]) > 0 for part in parts])
     for _ in range(_MAX_ROUNDS):
-        left -= 1 + theta.size
-        if left < 0 or (is_late is not None and is_late()):
+        try:
+            error, columns, *_, count = compute_sensitivities(problem, theta, left)
+        except BudgetSpentError:
             break
-        error, columns = _linearise(problem, theta)
+        left -= count
         series = [error[part.rows] for part in parts]
         rms = sqrt(float(error @ error) / error.size)
+        shows_noise = varies | [values @ values > rms**2 * values.size for values in series]
         if fit is None and (
-            rms <= _NO_NOISE * problem.output_scale or not have_unequal_variances(series)
+            rms <= _NO_NOISE * problem.output_scale
+            or not have_unequal_variances([series[i] for i in np.flatnonzero(shows_noise)])
         ):
             return None
-        variances = estimate_variances(series, [columns[part.rows] for part in parts])
+        used = count_used_degrees([columns[part.rows] for part in parts])
         plain = error * problem.plain_weight[rows] / problem.evaluator.weight[rows]
-        ratios = _compute_ratios(series, variances, float(plain @ plain))
-        if np.ptp(np.log(ratios)) <= _TOLERANCE:
+        ratios = _estimate_ratios(series, used, shows_noise, float(plain @ plain))
+        if np.ptp(np.log(ratios)) <= _TOLERANCE or (is_late is not None and is_late()):
             break
         problem = _divide_weights(problem, parts, ratios)
         (end,) = refine_candidates(problem, [theta], left, is_late)
@@ -91,22 +91,19 @@ def fit_unequal_noise(
     return fit
 
 
-def _linearise(problem: Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Compute the weighted residuals (n,) and their slopes (n, D)."""
-    rows, place = problem.scored_rows, to_unit(problem.evaluator, theta[None])
-    scored = ScoredSamples(problem.evaluator, rows, problem.evaluator.weight[rows])
-    error = compute_residuals(scored, place)[0]
-    columns = np.empty((theta.size, error.size))
-    fill_jacobian(scored, place[0], error, columns)
-    return error, columns.T
-
-
-def _compute_ratios(
-    series: Sequence[FloatArray], variances: FloatArray, total: float
+def _estimate_ratios(
+    series: Sequence[FloatArray], used: FloatArray, shows_noise: BoolArray, total: float
 ) -> FloatArray:
-    """Compute the deviation of each series relative to its present one; Σe² becomes `total`."""
+    """Estimate the deviation of each series relative to its present one; Σe² becomes `total`.
+
+    The parameters take the degrees of freedom `used` from each series. A short series has the
+    common variance. So has one that shows no noise: a sensor at rest, which the model follows.
+    """
+    sizes = np.array([values.size for values in series])
     powers = np.array([float(values @ values) for values in series])
-    deviations = np.sqrt(variances)
+    left = np.maximum(sizes - used, 1.0)
+    own = shows_noise & (sizes >= MIN_SAMPLES)
+    deviations = np.sqrt(np.where(own, powers / left, np.sum(powers) / np.sum(left)))
     deviations = np.maximum(deviations, _LEAST_DEVIATION * np.max(deviations))
     return np.asarray(deviations * np.sqrt(np.sum(powers / deviations**2) / total))
 

@@ -34,6 +34,15 @@ def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
     assert state_of(database, got.job.id) is JobState.CANCELLED
 
 
+def test_of_two_wishes_to_cancel_the_first_gives_the_reason(database):
+    got, _ = claimed(database)
+    for reason in ("as told", None):
+        with database.write_session() as session:
+            JobRepository(session).cancel(got.job.id, reason)
+    finish(database, got.lease, JobState.CANCELLED)
+    assert job_of(database, got.job.id).error == "as told"
+
+
 def test_cancelling_twice_is_as_cancelling_once(database):
     job_id = submit(database)
     for _ in range(2):

@@ -1,5 +1,6 @@
 """A dispatcher with several jobs: each is claimed, cancelled and lost by itself."""
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -126,3 +127,18 @@ def test_deaths_counted_by_an_earlier_dispatcher_go_with_their_run(stand: Stand)
     entries = JobRuns(stand.place.database, claim, stand.place.store).iterate_runs()
     found = {entry.run: entry.kills for entry in entries if isinstance(entry, QueuedRun)}
     assert (found[first], found[second]) == (0, 1)
+
+
+def test_while_a_dispatcher_works_modules_are_not_searched_for_garbage(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spared, before = [], gc.get_threshold()
+
+    def note_once(working: dispatcher.Dispatcher) -> None:
+        spared.append(gc.get_freeze_count())
+        working.stopping.set()
+
+    monkeypatch.setattr(dispatcher.Dispatcher, "run_round", note_once)
+    stand.dispatcher.run_until_stopped()
+    assert spared[0] > dispatcher.NEW_OBJECTS
+    assert (gc.get_freeze_count(), gc.get_threshold()) == (0, before)

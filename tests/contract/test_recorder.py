@@ -68,9 +68,9 @@ class Desk:
         self.runs = [run.id for run in place.runs(self.job)]
         self.recorder = self.claim()
 
-    def claim(self) -> RunRecorder:
+    def claim(self, n_runs: int = N_RUNS) -> RunRecorder:
         with self.place.database.write_session() as session:
-            claim = LeaseQueue(session).claim_job("d1")
+            claim = LeaseQueue(session).claim_job("d1", choose_size=lambda job: n_runs)
         assert claim is not None
         assert claim.job.id == self.job
         return RunRecorder(
@@ -94,11 +94,11 @@ class Desk:
         reported = {name: one for name, one in told.items() if one is not None}
         self.recorder.record_results(encode_results(results, self.place.database, reported))
 
-    def claim_again(self) -> RunRecorder:
-        """Give the job back and claim it under the next attempt."""
+    def claim_again(self, n_runs: int = N_RUNS) -> RunRecorder:
+        """Give the job back and claim it, or its first runs, under the next attempt."""
         with self.place.database.write_session() as session:
             LeaseQueue(session).release_job(self.recorder.lease)
-        return self.claim()
+        return self.claim(n_runs)
 
     def write_after(self, seconds: float) -> None:
         """Let time pass, then write what is due."""
@@ -243,6 +243,20 @@ def test_the_end_of_a_parcel_is_written_beside_what_goes_on(
     assert desk.place.job(desk.job).n_done == N_RUNS
     desk.recorder.finish_job()
     assert desk.place.job(desk.job).state is JobState.SUCCEEDED
+
+
+def test_a_recorder_writes_nothing_after_its_parcel(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_STARTED", 0)  # starts are left for later
+    first, *_ = desk.runs
+    desk.recorder = desk.claim_again(1)
+    desk.recorder.record_start(first)
+    desk.recorder.record_failure(first, RunFailure("as told"))
+    desk.recorder.end_parcel()
+    assert desk.recorder.has_ended
+    desk.write_after(RESULTS_SECONDS + 0.1)
+    assert desk.states() == [JobState.FAILED] + [JobState.QUEUED] * (N_RUNS - 1)
 
 
 def test_nothing_is_written_while_nothing_happens(desk: Desk) -> None:

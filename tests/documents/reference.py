@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import lagid
+from service.pages.guides import list_notebooks, make_notebook
 from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
 from sysid.models.equation_display import format_equations
+from tests.documents.painter import CHROMIUM, open_painter
+from tests.documents.responses import describe_case, draw_response
 from tests.repository import ROOT
 
 Document = Mapping[str, Any]
@@ -23,11 +26,12 @@ TITLES = {
 }
 PROJECT = ("ARCHITECTURE", "CONTRIBUTING", "SECURITY", "CHANGELOG")
 """Pages of the top level of the repository that the site has, too."""
+HAS_BROWSER = CHROMIUM.exists()
 LIBRARY = ("identify", "simulate", "read_recording", "load_model", "catalogue")
 
 
 def write_reference(folder: Path) -> None:
-    """Write all pages into a folder, and those of the top level of the repository."""
+    """Write all pages into a folder, those of the top level of the repository, and notebooks."""
     folder.mkdir(exist_ok=True)
     contract = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))
     pages = {
@@ -40,6 +44,11 @@ def write_reference(folder: Path) -> None:
     pages |= {name.lower(): _copy_page(name) for name in PROJECT}
     for name, text in pages.items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
+    _draw_catalogue(folder)
+    for path in list_notebooks():
+        target = folder / "notebooks" / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(make_notebook(path) or "", encoding="utf-8")
 
 
 def _copy_page(name: str) -> str:
@@ -64,6 +73,7 @@ def _describe_commands() -> str:
     from service.cli.main import build_program
 
     command = typer.main.get_command(build_program())
+    _shorten_help(command)
     text = get_docs_for_click(
         obj=command, ctx=typer.Context(command), name="lagid", title="The command line"
     )
@@ -74,6 +84,13 @@ def _describe_commands() -> str:
         text.replace("&#x27;", "'"),
         flags=re.M,
     )
+
+
+def _shorten_help(command: Any) -> None:
+    """Let a list of commands have the first sentence of each help text, not its first words."""
+    for each in getattr(command, "commands", {}).values():
+        each.short_help = (each.help or "").partition("\n\n")[0]
+        _shorten_help(each)
 
 
 def _describe_rest(contract: Document) -> Iterator[str]:
@@ -144,20 +161,51 @@ def _describe_result(contract: Document) -> Iterator[str]:
 
 
 def _describe_catalogue() -> Iterator[str]:
-    yield "# The catalogue of models\n\n`lagid models show NAME` prints the whole document.\n"
+    yield (
+        "# The catalogue of models\n\n`lagid models show NAME` prints the whole document. Bounds "
+        "that are *data* follow from [your recording](../model.md#bounds-from-the-data).\n"
+    )
+    yield "\n| model | what it describes |\n|---|---|\n"
     for name in catalogue():
-        document = copy_catalogue_document(name)
-        yield f"\n## {name}: {document['title']}\n\n{document.get('description', '').strip()}\n"
-        if source := document.get("source"):
-            yield f"\nSource: {source}\n"
-        for equation in format_equations(load_model(name)):
-            yield f'\n<div style="overflow-x: auto; margin: .6rem 0">{equation.mathml}</div>\n'
-        if parameters := document.get("parameters"):
-            yield "\n| parameter | unit | from | to | meaning |\n|---|---|--:|--:|---|\n"
-            for parameter, given in parameters.items():
-                unit, meaning = given.get("unit", "1"), _as_cell(given.get("description", ""))
-                yield f"| `{parameter}` | {unit} | {given.get('lower', '')} "
-                yield f"| {given.get('upper', '')} | {meaning} |\n"
+        title = copy_catalogue_document(name)["title"]
+        yield f"| [`{name}`](#{_name_heading(name, title)}) | {_as_cell(title)} |\n"
+    for name in catalogue():
+        yield from _describe_model(name)
+
+
+def _describe_model(name: str) -> Iterator[str]:
+    document = copy_catalogue_document(name)
+    yield f"\n## {name}: {document['title']}\n\n{document.get('description', '').strip()}\n"
+    if source := document.get("source"):
+        yield f"\nSource: {source}\n"
+    for equation in format_equations(load_model(name)):
+        yield f'\n<div class="equation" tabindex="0">{equation.mathml}</div>\n'
+    if HAS_BROWSER:
+        yield f"\n![Response of {name}](pictures/{name}.svg)\n"
+        yield f"\n*With {describe_case(name)}.*\n"
+    if parameters := document.get("parameters"):
+        yield "\n| parameter | unit | from | to | meaning |\n|---|---|--:|--:|---|\n"
+        for parameter, given in parameters.items():
+            unit, meaning = given.get("unit", "1"), _as_cell(given.get("description", ""))
+            lower, upper = (f"{given[end]:g}" for end in ("lower", "upper"))
+            if "bounds" in given:
+                lower = upper = "data"
+            yield f"| `{parameter}` | {unit} | {lower} | {upper} | {meaning} |\n"
+
+
+def _name_heading(name: str, title: str) -> str:
+    """Name the anchor of the heading of a model."""
+    words = re.sub(r"[^\w\- ]", "", f"{name} {title}".lower())
+    return words.replace(" ", "-")
+
+
+def _draw_catalogue(folder: Path) -> None:
+    """Draw how each model answers; without a browser the page has no pictures."""
+    if not HAS_BROWSER:
+        return
+    with open_painter() as draw:
+        for name in catalogue():
+            draw(folder / "pictures" / f"{name}.svg", draw_response(name))
 
 
 def _describe_python() -> Iterator[str]:

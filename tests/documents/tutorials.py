@@ -18,12 +18,13 @@ import urllib.error
 import urllib.request
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import chdir, contextmanager, redirect_stdout
+from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from tests.documents.painter import open_painter
 from tests.repository import ROOT
 
 FOLDERS = ("tutorials", "howto", "answers")
@@ -145,13 +146,18 @@ def _list_commands(source: str) -> Iterator[str]:
     yield from re.findall(r"^\$ (?:.*\\\n)*.*\n", source, re.M)
 
 
+def find_free_port() -> int:
+    """Find a port for a service of a page."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
 class _Shell:
     """Runs commands of a page; what they start behind ``&`` ends with the page."""
 
     def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
+        self._port = find_free_port()
         self._url = f"http://127.0.0.1:{self._port}"
         self._before = dict(os.environ)
         os.environ["LAGID_URL"] = self._url
@@ -221,31 +227,10 @@ def _mask(text: str) -> str:
     return text
 
 
-@contextmanager
-def _open_painter() -> Iterator[Callable[[Path, Any], None]]:
-    """Write figures of Plotly as pictures, with the browser."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium")
-
-        def draw(path: Path, figure: Any) -> None:
-            width, height = 900, figure.layout.height or 500
-            page = browser.new_page(viewport={"width": width, "height": height})
-            page.set_content(figure.to_html(include_plotlyjs=True, config={"staticPlot": True}))
-            page.wait_for_selector(".plot-container .main-svg")
-            path.parent.mkdir(exist_ok=True)
-            page.screenshot(path=path)
-            page.close()
-
-        yield draw
-        browser.close()
-
-
 def main() -> None:
     """Write the pages that are named, else all."""
     pages = [Path(name).resolve() for name in sys.argv[1:]] or list_tutorials()
-    with _open_painter() as draw:
+    with open_painter() as draw:
         for page in pages:
             write_page(page, draw)
 

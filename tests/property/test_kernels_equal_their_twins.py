@@ -65,7 +65,7 @@ def test_a_recursion_finer_than_its_samples_equals_its_twin(hold: Any) -> None:
     [
         ("linear", 1, False, "first"),
         ("linear", 3, True, "zero"),
-        ("cubic", 1, False, "band-limited"),
+        ("cubic", 2, False, "band-limited"),
         ("nearest", 2, True, "first"),
     ],
 )
@@ -96,9 +96,30 @@ def test_a_lag_that_changes_with_an_input_equals_its_twin(
     assert_equal(Problem.build(model, [record(24, hold=hold)]))
     if method != "euler":
         return
-    recursion = {"x": "0.5*x(k-1) + u(k-1 - L/h*(1 + 0.5*tanh(u))) + mod(u(k - abs(u)), 3)"}
+    recursion = {
+        "x": "0.5*x(k-1) + u(k-1 - L/h*(1 + 0.5*tanh(u))) + mod(u(k - abs(u)), 3) + mod(-1e17*c, 3)"
+    }
     model = difference(recursion, "x", solver={"interpolation": "linear"})
     assert_equal(Problem.build(model, [record(24, hold=hold)]))
+
+
+@pytest.mark.parametrize(
+    ("method", "interpolation", "step"),
+    [
+        ("rk4", "cubic", 0.017),
+        ("rk4", "linear", "sample"),
+        ("euler", "cubic", "sample"),
+        ("semi-implicit", "nearest", "sample"),
+    ],
+)
+def test_a_history_function_equals_its_twin(method: str, interpolation: str, step: Any) -> None:
+    solver = {"method": method, "interpolation": interpolation, "step": step, "substeps": 2}
+    history = {"x": "c*exp(b*t/9) - t**2", "v": "where(t < -0.1, c, sin(9*t)) + 0.3"}
+    start = {"v": {"lower": -1, "upper": 1}}
+    model = differential(LAGGED, "x(t-L) + v", solver=solver, history=history, initial=start)
+    assert_equal(Problem.build(model, [record(24, hold="zero"), record(20, irregular=True)]))
+    if interpolation == "linear":
+        assert_equal(Problem.build(model, [record(24)], prediction="one-step"), one_step=True)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])

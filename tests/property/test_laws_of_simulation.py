@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem
@@ -110,6 +111,34 @@ def test_a_delay_differential_equation_has_its_known_solution(interpolation: str
     t = times
     expected = np.where(t <= 1, 1 - t, 1 - t + (t - 1) ** 2 / 2)
     np.testing.assert_allclose(found.channels[0].values, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_history_function_gives_the_known_solution(interpolation: str) -> None:
+    """dx/dt = -x(t - 1) by steps: the integral of the history, then of that solution."""
+    parameters = {name: {"lower": -2, "upper": 2} for name in "ab"}
+    a, b, t = 1.3, 0.7, 0.1 * np.arange(21)
+
+    def solve(history: str) -> FloatArray:
+        model = differential(
+            {"x": "-x(t - 1)"},
+            "x",
+            inputs={},
+            parameters=parameters,
+            initial={},
+            history={"x": history},
+            solver={"interpolation": interpolation, "substeps": 10},
+        )
+        return simulate(model, [], {"a": a, "b": b}, times=t).channel("y").values
+
+    expected = a - a * (np.exp(b * (t - 1)) - np.exp(-b)) / b
+    np.testing.assert_allclose(solve("a*exp(b*t)")[t <= 1], expected[t <= 1], atol=1e-10)
+    if interpolation == "cubic":  # the solution is a parabola, then a cubic: read without error
+        s = t - 1
+        first = a - a * t - b * (t**2 / 2 - t)
+        second = b / 2 - (a * s - a * s**2 / 2 - b * (s**3 / 6 - s**2 / 2))
+        expected = np.where(t <= 1, first, second)
+        np.testing.assert_allclose(solve("a + b*t"), expected, atol=1e-12)
 
 
 def largest_errors(interpolation: str, lag: float) -> np.ndarray:

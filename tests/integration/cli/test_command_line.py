@@ -138,6 +138,10 @@ def test_a_command_without_its_words_shows_the_help() -> None:
         (["--set", "validation={datasets: [other]}"], "--validation FILE"),
         (["--set", "datasets=[other]"], "DATA"),
         (["--set", "model=tube"], "--model"),
+        (
+            ["--set", "initial.x.upper=9"],
+            "is a parameter: --set 'parameters.x(0).upper=9'",
+        ),
         (["--set", f"algorithm.stagnation={10**30}"], "lagid: --set algorithm.stagnation: "),
         (["--set", f"algorithm.stagnation={'9' * 5000}"], "lagid: "),
         (["--validation", "{data}"], "this is the estimation recording"),

@@ -58,6 +58,16 @@ def test_headings_have_anchors_as_on_a_forge(client: TestClient) -> None:
     assert '<h2 id="lagged-states">Lagged states</h2>' in page
 
 
+def test_a_page_with_code_is_a_notebook_too(client: TestClient) -> None:
+    page = client.get("/guides/tutorials/first_time_lag.md").text
+    assert '<a href="first_time_lag.ipynb" download>' in page
+    notebook = client.get("/guides/tutorials/first_time_lag.ipynb")
+    assert notebook.headers["Content-Type"] == "application/x-ipynb+json"
+    assert notebook.json()["nbformat"] == 4
+    assert ".ipynb" not in client.get("/guides/howto/choose_a_model.md").text
+    assert client.get("/guides/howto/choose_a_model.ipynb").status_code == 404
+
+
 def test_a_folder_has_one_address_where_its_links_lead_to_its_pages(client: TestClient) -> None:
     asked = client.get("/guides/howto", follow_redirects=False)
     assert (asked.status_code, asked.headers["Location"]) == (307, "/guides/howto/")

@@ -258,6 +258,21 @@ equations: {x: 0.9*x(k-1) + 0.1*u(k - 1 - d/(1.2 + q)) + 0.1*u(k - L*abs(q)/h)}
 outputs: {y: x}
 initial: {x: 0.2}
 """
+# Histories before the start, and outputs that are named as what a program needs itself.
+HISTORY = """
+name: past_of_states
+form: differential
+inputs: {u: "1", q: "1"}
+states: {x: "1", w: "1"}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 1, unit: s}}
+equations:
+  x: (K*u(t - L) - x - 0.5*x(t - 2*L))/T + 0.1*q
+  w: x(t - L/2) - w - w(t - 0.11)
+outputs: {ramp: x(t - L) + w(t - 3*L), between: "u(t - L)", dt: x, y: w}
+history: {x: K*exp(t/T) - 0.2, w: "where(t < -0.1, T, 3*sin(9*t)) + 0.3"}
+initial: {w: {lower: -1, upper: 1}}
+"""
+_HISTORY = Case({"K": 0.5, "T": 0.2, "L": 0.0737, "w(0)": 0.4})
 _RESTING = Case({"K": 1.5, "T": 0.2, "L": 0.0737})
 WRITTEN: dict[str, tuple[Model, Case]] = {
     "rk4": (written(TWO), _TWO),
@@ -277,6 +292,11 @@ WRITTEN: dict[str, tuple[Model, Case]] = {
     "flow_euler_nearest": (written(FLOW, method="euler", interpolation="nearest"), _FUNCTIONS),
     "recursion_of_flow": (written(RECURSION_OF_FLOW), _RECURSION),
     "functions": (written(FUNCTIONS), _FUNCTIONS),
+    "history": (written(HISTORY), _HISTORY),
+    "history_linear": (written(HISTORY, interpolation="linear", substeps=2), _HISTORY),
+    "history_own_step": (written(HISTORY, step=0.017, history="zero"), _HISTORY),
+    "history_euler_cubic": (written(HISTORY, method="euler", interpolation="cubic"), _HISTORY),
+    "history_semi_implicit": (written(HISTORY, method="semi-implicit"), _HISTORY),
     "steady_substeps": (starting(RESTING, "steady", substeps=2), _RESTING),
     "steady_own_step": (starting(RESTING, "steady", step=0.017), _RESTING),
     "steady_off_samples": (starting(RESTING, "steady", step=0.0171), _RESTING),
@@ -335,6 +355,16 @@ def test_exported_programs_compute_what_the_simulation_does(
         assert np.ptp(told) > 0
         for one in found:
             np.testing.assert_allclose(one, told, rtol=1e-9, atol=1e-9 * np.max(np.abs(told)))
+
+
+def test_a_lag_without_a_value_is_none() -> None:
+    """0/0 on other inputs than those of the record: as a kernel and C read it."""
+    document = {**yaml.safe_load(FLOW), "equations": {"x": "u(t - abs(u)/q) - x"}, "let": {}}
+    model = parse_model(document | {"outputs": {"y": "x"}})
+    text = sysid.export_model(model, {"K": 1, "T": 1, "L": 0}, "python")
+    times, u, q = 0.1 * np.arange(9), np.ones(9), np.ones(9)
+    u[4] = q[4] = 0.0
+    assert np.all(np.isfinite(in_python(text, times, [u, q])[0]))
 
 
 def case_of(name: str) -> tuple[Model, Case]:

@@ -1,7 +1,5 @@
-"""docs/notebooks.md and its notebook: every snippet and every cell runs, one after the other."""
+"""docs/notebooks.md: every snippet runs, one after the other."""
 
-import ast
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,12 +10,12 @@ import pytest
 
 from sysid import Identification
 from sysid.control.linear_form import IdentifiedModel
+from tests.documents.tutorials import run_cell
 from tests.repository import ROOT
 
 PAGE = (ROOT / "docs/notebooks.md").read_text(encoding="utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 README = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
-NOTEBOOK = json.loads((ROOT / "docs/notebooks/first_time_lag.ipynb").read_text(encoding="utf-8"))
 TRUTH = {"K": 0.8, "T": 40.0, "L": 12.0, "y0": 20.0, "x(0)": 0.0}
 
 
@@ -32,22 +30,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_cell(source: str, names: dict[str, Any]) -> Any:
-    """Run a cell as a notebook does; gives the value of its last line."""
-    *body, last = ast.parse(source).body
-    ends_in_value = isinstance(last, ast.Expr)
-    exec(compile(ast.Module(body if ends_in_value else [*body, last], []), "cell", "exec"), names)
-    if not isinstance(last, ast.Expr):
-        return None
-    return eval(compile(ast.Expression(last.value), "cell", "eval"), names)
-
-
 def test_four_lines_give_the_answer_and_its_plot(folder: Path) -> None:
     [lines] = [one for one in README if "read_recording" in one]
     assert lines.strip() in SNIPPETS[0]
     assert len([line for line in lines.splitlines() if line]) == 4
     names: dict[str, Any] = {}
-    figure = run_cell(lines, names)
+    _, figure = run_cell(lines, names)
     assert isinstance(figure, go.Figure)
     for name in ("K", "T", "L"):
         estimate = names["found"][name]
@@ -77,23 +65,3 @@ def test_the_text_of_a_result_on_the_page_is_the_one_that_is_printed(folder: Pat
     assert words[0] == words[1]
     numbers = [[float(one) for one in re.findall(number, text)] for text in (shown, printed)]
     assert numbers[0] == pytest.approx(numbers[1], rel=0.02, abs=1e-3)
-
-
-def test_the_notebook_has_ten_cells_without_outputs() -> None:
-    assert len(NOTEBOOK["cells"]) == 10
-    assert not any(cell.get("outputs") for cell in NOTEBOOK["cells"])
-
-
-def test_the_cells_of_the_notebook_run(folder: Path) -> None:
-    names: dict[str, Any] = {}
-    values = [
-        run_cell("".join(cell["source"]), names)
-        for cell in NOTEBOOK["cells"]
-        if cell["cell_type"] == "code"
-    ]
-    _, found, distances, figure, checked = values
-    assert isinstance(found, Identification)
-    assert all(abs(distance) < 4 for distance in distances.values())
-    assert isinstance(figure, go.Figure)
-    assert isinstance(checked, go.Figure)
-    assert names["checked"].fit_percent_validation > 90

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom, t
 
 import sysid
 from sysid.core.errors import InvalidSettings, RecordTooShort
-from sysid.core.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.bands import pool_noise
@@ -133,7 +134,9 @@ def test_bands_hold_the_output_and_a_new_measurement_in_95_percent_of_the_draws(
         assert uncertainty is not None
         degrees = drawn.n_scored - 3
         deviation = {(0, "y"): end.rms * np.sqrt(drawn.n_scored / degrees)}
-        spread = ParameterSpread(uncertainty.names, uncertainty.covariance, degrees)
+        spread = ParameterSpread(
+            uncertainty.names, uncertainty.covariance, uncertainty.degrees, degrees
+        )
         [[bands]] = compute_output_bands(drawn, end.theta, spread, deviation)
         k = int(random.integers(15, 120))
         new = clean[k] + noise * random.standard_normal()
@@ -141,6 +144,22 @@ def test_bands_hold_the_output_and_a_new_measurement_in_95_percent_of_the_draws(
             hits[i] += ends[k, 0] <= value <= ends[k, 1]
     low, high = binom.interval(0.998, draws, 0.95)
     assert np.all((low <= hits) & (hits <= high)), hits
+
+
+def test_a_band_is_as_wide_as_the_interval_where_few_samples_count() -> None:
+    """At the beginning the output is its initial state, under noise as slow as the record."""
+    slow = lfilter([0.1], [1.0, -0.9], np.random.default_rng(5).standard_normal(N))
+    record = make_line(0.0)
+    noisy = replace(record.outputs[0], values=record.outputs[0].values + slow)
+    found = identify(LINE, Record((), (noisy,)), QUICK, loss=Loss(noise_model="white"))
+    assert found.uncertainty is not None
+    assert found.uncertainty.degrees < 20
+    interval = found["x(0)"].interval95
+    assert interval is not None
+    [bands] = found.compute_bands()
+    widest = np.ptp(bands.confidence[0])
+    assert np.ptp(interval) == pytest.approx(widest, rel=0.15)
+    assert np.ptp(interval) <= widest * (1 + 1e-9)
 
 
 def test_bands_on_new_inputs_surround_what_simulate_gives(lag: Identification) -> None:

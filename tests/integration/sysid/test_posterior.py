@@ -47,6 +47,9 @@ def test_the_lag_of_a_tube_of_3_m_is_known_better_than_its_standard_error_says()
     low, high = by_name["L"].interval95
     assert 0.0 <= low < lag.value < high < 0.03
     assert np.ptp(lag.interval95) > 5.0 * (high - low)
+    (told,) = [text for text in found.warnings if "by the posterior" in text]
+    assert "; L is from " in told
+    assert "K is from" not in told
     samples = found.posterior.samples
     assert np.all(samples[:, 1:] >= [0.001, 0.0])  # T and L inside their bounds
     assert found.posterior.correlation[1, 2] < -0.5

@@ -3,6 +3,7 @@
 Records come from exact responses of first-order parts to held inputs.
 """
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -13,9 +14,11 @@ from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.process_order import warn_other_order
+from sysid.identification.process_order import mark_order_dependent, warn_other_order
 from sysid.identification.result import Identification, OrderComparison, OrderFit
 from sysid.identification.summary import describe_order
+from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.estimates import Criteria, Estimate, NoiseColour, Uncertainty
 
 PERIOD, COUNT, FINE = 0.2, 300, 50
 QUICK = GeneticAlgorithm(generations=60)
@@ -93,6 +96,11 @@ def test_a_missing_time_constant_is_told_with_the_dead_time_of_the_other_order(
     assert second.delay_stderr is not None
     assert abs(second.delay - 1.33) < 3 * second.delay_stderr
     assert found.delay_range == (second.delay, second.delay)
+    assert missing["L"].status == "order-dependent"
+    value = f"{second.delay:.4f} ± {second.delay_stderr:.4f} s"
+    assert missing["L"].reason == f"it is {value} with sopdt, which the data prefer"
+    assert missing["K"].status == "identified"
+    assert missing.verdict.text == "trustworthy, but L depends on the model's order"
     assert second.values["r"] * second.values["T1"] == pytest.approx(0.3, abs=0.05)
     [warning] = find_order_warnings(missing)
     assert warning.startswith("the data prefer sopdt (order 2) to fopdt (order 1): its BIC is ")
@@ -112,6 +120,7 @@ def test_the_order_and_noise_of_the_plant_are_preferred_and_nothing_is_warned() 
         assert [fit.model for fit in compared.fits if fit is not compared.own_fit] == others
         assert compared.own_fit.delay == pytest.approx(found["L"].value, abs=0.01)
         assert find_order_warnings(found) == []
+        assert found["L"].status == "identified"
 
 
 def test_the_reported_criterion_is_that_of_the_model_alone() -> None:
@@ -181,6 +190,15 @@ def write_fits(*bics: float) -> OrderComparison:
     return OrderComparison("sopdt", "L", "s", "white", fits)
 
 
+def analyse(estimate: Estimate, colour: NoiseColour = "white") -> Analysis:
+    """An analysis with one estimate under noise of this colour."""
+    nothing = np.zeros((1, 1))
+    uncertainty = Uncertainty(
+        ("L",), nothing, nothing, nothing, 1.0, np.ones(1), 0.0, noise_colour=colour
+    )
+    return Analysis((estimate,), uncertainty, 0.0, 0, Criteria(0.0, 0.0, 0.0, 9, 1))
+
+
 def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     open_orders = write_fits(16.1, 10.0, 16.0)
     assert [fit.model for fit in open_orders.open_fits] == ["sopdt", "topdt"]
@@ -195,6 +213,15 @@ def test_orders_within_six_of_the_lowest_criterion_are_open() -> None:
     assert warn_other_order(write_fits(16.1, 10.0, 16.1), "sopdt") == []
     assert write_fits(10.0, 16.1, 30.0).preferred_model == "fopdt"
     assert warn_other_order(None, "sopdt") == []
+    lag = Estimate("L", "s", 1.4, 0.0, 5.0, 0.05, (1.3, 1.5), "identified")
+    wide = replace(lag, interval95=(1.2, 1.58))
+    at_bound = replace(lag, status="at bound")
+    prefers_first = write_fits(10.0, 16.1, 30.0)
+    for one, orders in ((lag, open_orders), (wide, prefers_first), (at_bound, prefers_first)):
+        assert mark_order_dependent(analyse(one), orders) == (one,)
+    [marked] = mark_order_dependent(analyse(lag), prefers_first)
+    assert marked.status == "order-dependent"
+    assert mark_order_dependent(analyse(lag, "clustered"), prefers_first) == (lag,)
     assert describe_order(write_fits(16.1, 10.0, 16.1)) == (
         "order: the data prefer sopdt to fopdt and topdt; L is 1.400 ± 0.010 s with sopdt"
     )

@@ -69,6 +69,13 @@ def test_help_shows_the_groups_and_the_examples() -> None:
     assert run_lagid("runs", "-h").stdout == run_lagid("runs", "--help").stdout
 
 
+def test_the_terminal_alone_breaks_the_lines_of_a_help_text() -> None:
+    texts = [PROGRAM.help, *(command.help for command in COMMANDS.values())]
+    assert all(texts)
+    assert any("\n\n" in text for text in texts)
+    assert [text for text in texts if re.search(r"(?<!\n)\n(?!\n)", text)] == []
+
+
 def test_json_is_a_switch_and_quiet_and_limit_mean_the_same_everywhere() -> None:
     kinds: dict[str, set[Any]] = {}
     for _, option in OPTIONS:

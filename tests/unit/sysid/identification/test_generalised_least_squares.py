@@ -11,13 +11,11 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification import deadline
 from sysid.identification.conclude import conclude_run
-from sysid.identification.generalised_least_squares import (
-    fit_generalised_least_squares,
-    make_whitening,
-)
+from sysid.identification.generalised_least_squares import fit_generalised_least_squares
 from sysid.identification.identify import identify
 from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
+from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem

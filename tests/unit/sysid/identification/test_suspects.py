@@ -44,7 +44,10 @@ def draw_output(kind: str, seed: int) -> tuple[FloatArray, FloatArray]:
 
 
 def name_suspects(kind: str, seed: int, *, are_white: bool = False) -> list[str]:
-    u, y = draw_output(kind, seed)
+    return list_suspects(*draw_output(kind, seed), are_white=are_white)
+
+
+def list_suspects(u: FloatArray, y: FloatArray, *, are_white: bool = False) -> list[str]:
     record = Record((Channel("u", TIMES, u),), (Channel("y", TIMES, y),))
     problem = Problem.build(MODEL, [record])
     end = refine_candidates(problem, [np.array([1.0, 0.5])])[0]
@@ -82,3 +85,10 @@ def test_nothing_is_suspected_of_white_noise() -> None:
 def test_of_white_residuals_only_single_values_are_suspected() -> None:
     assert name_suspects("a drift", 1, are_white=True) == []
     assert name_suspects("outliers", 1, are_white=True)[0].startswith("outliers of y")
+
+
+def test_inputs_and_outputs_that_never_move_are_no_suspects() -> None:
+    random = np.random.default_rng(1)
+    slow = np.asarray(lfilter([0.1], [1, -0.95], random.normal(size=N)))
+    assert list_suspects(np.ones(N), 1.0 + slow)[0].startswith("slow noise")
+    assert not any("limit" in name for name in list_suspects(slow, np.full(N, 50.0)))

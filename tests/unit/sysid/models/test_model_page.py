@@ -25,12 +25,14 @@ FIELDS = (
     "equations",
     "outputs",
     "initial",
+    "history",
 )
 
 
 def test_the_example_of_the_page_is_a_model() -> None:
-    whole, *part = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
+    whole, growth, part = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
     assert parse_model(parse_yaml(whole)).name == "valve-and-oven"
+    assert parse_model(parse_yaml(growth)).find_history("x") is not None
     names = ("k", "E", "V", "F", "tau", "H")
     rest = {
         "name": "reactor",
@@ -40,7 +42,7 @@ def test_the_example_of_the_page_is_a_model() -> None:
         "parameters": {name: {"lower": 1, "upper": 2} for name in names},
         "outputs": {"y": "T"},
     }
-    assert parse_model(rest | parse_yaml("".join(part))).name == "reactor"
+    assert parse_model(rest | parse_yaml(part)).name == "reactor"
 
 
 @pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])

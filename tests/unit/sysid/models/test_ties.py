@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.control.closed_loop import close_loop
+from sysid.control.controllers import PidControl
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.identify import identify
@@ -13,7 +15,7 @@ from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from tests.models import difference, differential, individuals, lag_element, record
+from tests.models import PARAMETERS, difference, differential, individuals, lag_element, record
 from tests.searching import DUFFING, noisy
 from tests.searching import record as duffing_record
 
@@ -48,6 +50,28 @@ def test_ties_of_ties_and_of_fixed_parameters_are_resolved() -> None:
     np.testing.assert_allclose(
         problem.predict(theta), Problem.build(plain, [record()]).predict(theta), rtol=1e-13
     )
+
+
+def test_a_tie_may_use_constants_and_intermediate_names() -> None:
+    constants, let = {"two": 2}, {"double": "two*b", "state": "x"}
+    model = lag_element(constants=constants, let=let)
+    theta = individuals(Problem.build(model, [record()], parameters={"c": {"tied": "double"}}), 5)
+    found, expected = (
+        Problem.build(model, [record()], parameters={"c": {"tied": text}}).predict(theta)
+        for text in ("double + 1", "2*b + 1")
+    )
+    np.testing.assert_array_equal(found, expected)
+    with pytest.raises(InvalidSettings, match=r"column 5 of '2 \* state': this reads 'x'"):
+        Problem.build(model, [record()], parameters={"c": {"tied": "2 * state"}})
+    recursion = difference({"x": "0.5*x(k-1) + c"}, "x", let={"step": "b*h"})
+    with pytest.raises(InvalidSettings, match="'step' changes with time or the sampling"):
+        Problem.build(recursion, [record()], parameters={"c": {"tied": "step"}})
+    bounds = PARAMETERS | {"c": {"lower": 0, "upper": 9, "tied": "double"}}
+    plant = lag_element(constants=constants, let=let, parameters=bounds)
+    loop = close_loop(plant, PidControl("u", "y", 0.5))
+    assert {p.name: p.tied for p in loop.model.parameters}["c"] == "2*b"
+    with pytest.raises(InvalidSettings, match="circular, b → b"):
+        Problem.build(model, [record()], parameters={"b": {"tied": "double"}})
 
 
 def by_name(estimates: tuple[Estimate, ...]) -> dict[str, Estimate]:

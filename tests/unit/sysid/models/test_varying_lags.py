@@ -103,6 +103,36 @@ def test_what_a_varying_lag_may_not_read_is_named(equation: str, part: str) -> N
         piped(equations={"x": equation}, let={"late": "u(t - V/q)", "state": "2*x"})
 
 
+@pytest.mark.parametrize(
+    ("equation", "place", "found", "cure"),
+    [
+        ("u(t - V/q) - x/T", "/inputs/q", "m3/(m3/h)", "write t - 3600*V/q"),
+        ("u(t - V/max(q, 0.1)) - x/T", "/inputs/q", "m3/(m3/h)", "t - 3600*V/max(q, 0.1)"),
+        ("x(t - T*D) - x", "/parameters/D/unit", "%·s", "write t - 0.01*D*T"),
+    ],
+)
+def test_a_lag_whose_units_are_no_seconds_is_refused(
+    equation: str, place: str, found: str, cure: str
+) -> None:
+    percent = PIPE["parameters"] | {"D": {"lower": 0, "upper": 1, "unit": "%"}}
+    hourly = {"inputs": {"u": "degC", "q": "m3/h"}, "parameters": percent}
+    with pytest.raises(InvalidModel) as caught:
+        piped(**hourly, equations={"x": equation})
+    [fault] = caught.value.faults
+    assert fault.pointer == place
+    assert f"found {found!r}" in fault.detail
+    assert cure in fault.detail
+    assert piped(**hourly, equations={"x": "u(t - 3600*V/q) - x/T"}).name == "pipe"
+    unknown = hourly | {"inputs": {"u": "degC", "q": "1"}}
+    assert piped(**unknown, equations={"x": "u(t - V/q) - x/T"}).name == "pipe"
+
+
+def test_the_column_of_a_varying_lag_of_a_name_is_that_of_the_name() -> None:
+    with pytest.raises(InvalidModel) as caught:
+        piped(equations={"x": "-x/T + late(t - T)"}, let={"late": "u(t - V/q)"})
+    assert [fault.column for fault in caught.value.faults] == [8]
+
+
 def test_a_polynomial_a_loop_and_a_transfer_function_need_constant_lags() -> None:
     polynomial = {
         "name": "p",

@@ -10,13 +10,9 @@ from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
-from sysid.residuals import coloured as coloured_module
+from sysid.residuals import sandwich
 from sysid.residuals.autocorrelation import space_residuals
-from sysid.residuals.coloured import (
-    ColouredCovariance,
-    estimate_coloured_covariance,
-    estimate_spectrum_root,
-)
+from sysid.residuals.sandwich import Sandwich, estimate_sandwich, estimate_spectrum_root
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
@@ -153,9 +149,9 @@ def unequal(
 
 def covariance(
     lengths: tuple[int, ...], deviations: tuple[float, ...], seed: int = 5
-) -> ColouredCovariance | None:
+) -> Sandwich | None:
     problem, residuals = unequal(lengths, deviations, seed)
-    return estimate_coloured_covariance(problem, residuals, np.ones((residuals.size, 1)))
+    return estimate_sandwich(problem, residuals, np.ones((residuals.size, 1)))
 
 
 def test_records_of_one_noise_are_not_taken_for_unequal_however_long_each_is() -> None:
@@ -206,6 +202,6 @@ def test_a_drift_has_a_recursion_of_first_order(monkeypatch: pytest.MonkeyPatch)
         for pole in (0.999, 0.9)
     )
     before = estimate_spectrum_root(wander)[0], estimate_spectrum_root(slow)[0]
-    monkeypatch.setattr(coloured_module, "_fit_recursion", lambda values: np.array([0.5, 0.2]))
+    monkeypatch.setattr(sandwich, "_fit_recursion", lambda values: np.array([0.5, 0.2]))
     np.testing.assert_array_equal(estimate_spectrum_root(wander)[0], before[0])
     assert np.max(np.abs(estimate_spectrum_root(slow)[0] - before[1])) > 0

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.parse import parse_model
-from sysid.residuals.correlated_outputs import estimate_joint_covariance
+from sysid.residuals.sandwich import estimate_sandwich
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
@@ -87,9 +87,7 @@ def test_of_independent_outputs_nothing_is_taken_for_common() -> None:
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
     seeds = draw_seeds(gate=30, night=300)
     drawn = ([noise(seed, one).ravel() for seed in seeds] for one in (0.0, 0.9))
-    free, common = (
-        [estimate_joint_covariance(problem, e, columns) is None for e in one] for one in drawn
-    )
+    free, common = ([estimate_sandwich(problem, e, columns) is None for e in one] for one in drawn)
     assert sum(free) >= bound_count(len(seeds), 0.99)[0]
     assert not any(common)
 
@@ -135,7 +133,7 @@ def test_the_same_noise_in_two_outputs_counts_once() -> None:
     columns = np.random.default_rng(0).standard_normal((2 * TIMES.size, 4))
     data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
-    found = estimate_joint_covariance(problem, noise(0, 1.0).ravel(), columns)
+    found = estimate_sandwich(problem, noise(0, 1.0).ravel(), columns)
     assert found is not None
     assert found.equivalent_samples == pytest.approx(TIMES.size)
     assert found.degrees == pytest.approx(TIMES.size - 4)
@@ -150,7 +148,7 @@ def test_the_middle_has_the_cross_terms_of_samples_at_the_same_times(late: int) 
     first, second = noise(2, 0.9)
     errors = np.concatenate([first, second[late:]])
     columns = draw.standard_normal((errors.size, 4))
-    found = estimate_joint_covariance(problem, errors, columns)
+    found = estimate_sandwich(problem, errors, columns)
     assert found is not None
     same = n - late  # samples of y from `late` on have the times of all of z
     cross = columns[late:n].T @ columns[n:] * (errors[late:n] @ errors[n:]) / same

@@ -11,7 +11,7 @@ from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Record, Recording, Segment
 from sysid.identification.identify import identify
 from sysid.models.parse import parse_model
-from sysid.residuals.repeats import estimate_repeat_covariance
+from sysid.residuals.sandwich import count_repeats, estimate_sandwich
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate
 from tests.models import LINE
@@ -66,7 +66,7 @@ def test_the_covariance_is_that_of_the_jackknife_over_repeats() -> None:
         ]
     )
     move = left_out - np.linalg.lstsq(columns, y, rcond=None)[0]
-    found = estimate_repeat_covariance(problem, error, columns)
+    found = estimate_sandwich(problem, error, columns)
     assert found is not None
     inverse = np.linalg.inv(columns.T @ columns)
     widening = found.equivalent_samples / found.degrees
@@ -93,14 +93,43 @@ def test_intervals_of_pooled_repeats_cover_the_truth() -> None:
     assert sum(plain) < 0.8 * len(plain)
 
 
-def test_too_few_repeats_and_other_samples_have_no_such_covariance() -> None:
-    few = Problem.build(MODEL, [pool(draw_repeats(3, 2))])
-    columns, error, _ = fit_line(few)
-    assert estimate_repeat_covariance(few, error, columns) is None
-    record = pool(draw_repeats(9, 2))
-    alone = replace(record, outputs=(replace(record.outputs[0], repeats=None),))
-    problem = Problem.build(MODEL, [record, alone])
-    assert estimate_repeat_covariance(problem, np.zeros(216), np.zeros((216, 2))) is None
+def forget_repeats(record: Record) -> Record:
+    return replace(record, outputs=(replace(record.outputs[0], repeats=None),))
+
+
+def is_clustered(problem: Problem, columns: FloatArray, error: FloatArray) -> bool:
+    found = estimate_sandwich(problem, error, columns)
+    return found is not None and found.is_clustered
+
+
+def test_a_record_that_was_not_pooled_is_one_repeat() -> None:
+    pooled, alone = pool(draw_repeats(9, 2)), forget_repeats(pool(draw_repeats(1, 3)))
+    whole = Problem.build(MODEL, [pooled, alone])
+    parts = [fit_line(Problem.build(MODEL, [one]))[0] for one in (pooled, pool(draw_repeats(1, 3)))]
+    columns = np.vstack(parts)
+    error = np.random.default_rng(1).standard_normal(len(columns))
+    found = estimate_sandwich(whole, error, columns)
+    assert found is not None
+    assert found.is_clustered
+    # Two repeats of equal samples say as much as one degree of freedom, and not as two samples.
+    assert 4.0 < found.compute_degrees(np.linalg.inv(columns.T @ columns)[0]) < 9.0
+    # What the record alone tells of a parameter of its own has no spread over repeats.
+    own = np.zeros((len(columns), 1))
+    own[-EACH:] = 1.0
+    assert not is_clustered(whole, np.hstack([columns, own]), error)
+    assert count_repeats(whole) == 10
+    assert count_repeats(Problem.build(MODEL, [alone])) == 0
+
+
+def test_a_result_says_that_there_are_too_few_repeats_for_its_errors() -> None:
+    few = pool(draw_repeats(3, 2))
+    problem = Problem.build(MODEL, [few])
+    columns, error, _ = fit_line(problem)
+    assert not is_clustered(problem, columns, error)
+    (told,) = [text for text in identify(LINE, few).warnings if "repeats" in text]
+    assert "pooled from 3 repeats" in told
+    assert "at least 5" in told
+    assert not any("repeats" in text for text in identify(LINE, forget_repeats(few)).warnings)
 
 
 def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -> None:
@@ -113,6 +142,22 @@ def test_a_result_says_that_its_errors_are_by_repeat_and_stays_in_the_bounds() -
     assert interval is not None
     assert interval[0] >= 0.97
     assert interval[1] <= 1.5
+
+
+def test_the_posterior_has_the_errors_of_whole_repeats() -> None:
+    found = identify(LINE, pool(draw_repeats(12, 1)), posterior=True)
+    assert found.posterior is not None
+    for sampled in found.posterior.parameters:
+        interval = found[sampled.name].interval95
+        assert interval is not None
+        assert np.ptp(sampled.interval95) == pytest.approx(np.ptp(interval), rel=0.1)
+    assert not any("by the posterior" in text for text in found.warnings)
+
+
+def test_bands_cover_pooled_samples_that_were_kept_for_validation() -> None:
+    record = pool(draw_repeats(8, 3))
+    [bands] = identify(LINE, record, validation_fraction=0.3).compute_bands()
+    np.testing.assert_array_equal(bands.times, record.outputs[0].times)
 
 
 def test_pooled_samples_keep_the_number_of_their_repeat_when_they_are_cut() -> None:

@@ -8,7 +8,6 @@ from scipy.special import chdtrc
 
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness, space_residuals
-from sysid.residuals.coloured import _are_spaced_coloured
 from sysid.residuals.restricted_likelihood import (
     _compute_deviance,
     _compute_middle,
@@ -16,6 +15,7 @@ from sysid.residuals.restricted_likelihood import (
     _to_pole_and_share,
     fit_noise_colour,
 )
+from sysid.residuals.series import ResidualPart, is_coloured
 from tests.profiles import draw_seeds
 
 PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
@@ -140,11 +140,13 @@ def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
 
 def test_short_slow_noise_is_recognised_by_its_neighbours_and_white_noise_no_more_often() -> None:
     columns, times = regressors(100), np.arange(100.0)
+    part = ResidualPart(0, "y", slice(0, 100), times, 1.0)
     counts, seeds = [], draw_seeds(gate=200, night=2000)
     for pole in (0.5, 0.0):
         every = [space_residuals(times, residuals(slow(100, pole, s), columns)) for s in seeds]
         by_all = sum(chdtrc(one.n_lags, compute_whiteness(one).statistic) < 1e-3 for one in every)
-        counts.append((sum(_are_spaced_coloured(one, 1.0) for one in every), by_all))
+        seen = sum(is_coloured(part, one.values) for one in every)
+        counts.append((seen, by_all))
     (slow_seen, slow_by_all), (white_seen, white_by_all) = counts
     assert slow_seen > 0.8 * len(seeds) > slow_by_all
     assert white_seen <= white_by_all + 0.005 * len(seeds)

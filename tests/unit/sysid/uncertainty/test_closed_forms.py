@@ -9,8 +9,8 @@ from scipy import stats
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.generalised_least_squares import make_whitening
 from sysid.models.parse import parse_model
+from sysid.residuals.series import make_whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate

@@ -2,11 +2,16 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from sysid.core.settings import Loss
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
 from sysid.language.functions import Interval
 from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.intervals import mark_poor_intervals
+from tests.models import LINE
 from tests.searching import example
 
 PROBLEM = example(n=80)
@@ -50,3 +55,23 @@ def test_an_interval_around_zero_that_covers_much_of_the_range_says_little(
     status, found = scaled(lower, upper, scale, interval)
     assert status == ("unidentifiable" if reason else "identified")
     assert found.startswith(reason) if reason else not found
+
+
+def test_an_interval_of_one_degree_of_freedom_is_not_identified_and_stays_in_the_bounds() -> None:
+    """The standard error is small beside the range, but the residuals are a single drift."""
+    times = 0.1 * np.arange(200)
+    u = times / times[-1]
+    drift = 0.2 * np.sin(3.0 * np.pi * u)
+    noise = 0.002 * np.random.default_rng(1).standard_normal(200)
+    record = Record(
+        (Channel("u", times, u),), (Channel("y", times, 2.0 * u + 1.0 + drift + noise),)
+    )
+    bounds = {"a": {"lower": 1.0, "upper": 3.0}}
+    found = identify(LINE, record, parameters=bounds, loss=Loss(noise_model="white"))
+    slope = found["a"]
+    assert found.uncertainty is not None
+    assert found.uncertainty.degrees < 1.1
+    assert slope.stderr is not None
+    assert slope.stderr < 0.2 * (slope.upper - slope.lower)
+    assert (slope.status, slope.interval95) == ("unidentifiable", (1.0, 3.0))
+    assert slope.reason.endswith("its 95 % interval is wider than its range")

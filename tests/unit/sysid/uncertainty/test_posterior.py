@@ -11,8 +11,8 @@ from scipy import signal
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.generalised_least_squares import make_whitening
 from sysid.models.parse import parse_model
+from sysid.residuals.series import make_whitening
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis, analyse_estimate
@@ -77,7 +77,10 @@ def test_a_linear_model_has_the_multivariate_t_distribution() -> None:
     problem = pose(white(n))
     posterior, analysis = sample(problem)
     assert posterior.is_converged
-    assert describe_posterior(posterior) == []
+    assert describe_posterior(posterior, analysis.estimates) == []
+    far = [replace(one, interval95=(-9.0, 9.0)) for one in analysis.estimates]
+    (told,) = describe_posterior(posterior, far)
+    assert told.count("from -9 to 9 by the standard error") == 2
     columns, y = build_columns(n), problem.records[0].outputs[0].values
     mean, squares = np.linalg.lstsq(columns, y, rcond=None)[:2]
     degrees = n - 2

@@ -9,7 +9,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.residuals.coloured import CHI_SQUARE_95
+from sysid.residuals.sandwich import CHI_SQUARE_95
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import analyse_estimate

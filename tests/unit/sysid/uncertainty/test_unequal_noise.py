@@ -1,5 +1,6 @@
 """Records of unequal noise count by their own variances, which are estimated with the rest."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,21 @@ def test_intervals_under_unequal_noise_cover_the_truth() -> None:
             held.append(one.interval95[0] <= true <= one.interval95[1])
     least, most = bound_count(len(held), 0.94, 0.97)
     assert least <= sum(held) <= most
+
+
+def test_a_sensor_at_rest_says_nothing_of_the_noise() -> None:
+    moving, (record, columns) = (draw(60, 0.05, 5), draw(60, 1.0, 6)), draw(60, 0.0, 11)
+    values = zip((*record.inputs, *record.outputs), (0.0, 1.0), strict=True)
+    u, y = (replace(channel, values=np.full(60, value)) for channel, value in values)
+    resting = Record((u,), (y,)), columns
+    for others in (moving, moving[:1]):
+        theta, found = fit_line(pose(*others, resting))
+        assert (found is None) == (len(others) == 1)
+        if found is not None:
+            deviations = np.ravel(found.problem.settings.deviations or ())
+            assert deviations[0] < deviations[2] < deviations[1]
+            assert found.theta[0] == pytest.approx(2.0, abs=0.05)
+        assert np.all(np.isfinite(theta))
 
 
 def test_j_and_fit_stay_those_of_equal_weights() -> None:
