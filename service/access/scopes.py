@@ -15,7 +15,7 @@ _PUBLIC = re.compile(
     r"/(healthz|readyz|docs|openapi\.json|sign-in|sign-out|problems/[^/]*|static/[^/]*|guides/.*)"
 )
 """Paths without anything of a project: health, texts of the program, and the way in."""
-_ADMIN = re.compile(r"/v1/audit|/keys(/.*)?")
+_ADMIN = re.compile(r"/v1/audit|/keys(/.*)?|/settings")
 _COMPUTING = re.compile(r"/v1/(models:check|runs:compare|runs/[^/]+:(validate|profile))")
 """Paths that compute an answer to a body, and store nothing."""
 

@@ -76,7 +76,7 @@ def check_ready(parts: PartsDep) -> ReadyOut:
 
     It needs no key. So it tells nothing of addresses, and writes to the store now and then only.
     """
-    failures = list(_collect_failures(parts))
+    failures = list(collect_failures(parts))
     if failures:
         detail = "; ".join(failure.detail for failure in failures)
         raise Unavailable(detail, failures)
@@ -96,7 +96,8 @@ def explain_problem(kind: str) -> str:
     return PROBLEM_KINDS.get(kind, "This server has no problem of that type.")
 
 
-def _collect_failures(parts: Parts) -> Iterator[FieldError]:
+def collect_failures(parts: Parts) -> Iterator[FieldError]:
+    """Check every part of the service, and yield what fails at its pointer."""
     if not parts.probe.is_writable():
         yield FieldError("/store", "store: objects cannot be written")
     try:

@@ -1,21 +1,23 @@
 """Parts that the routes of all stored items share: filters of lists, ETags, edits, deletions."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from fastapi import Depends, Header, Query, Response
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
+from service.core.states import JobState
 from service.datasets.datasets import resolve_dataset
 from service.items.deletion import delete_item, describe_item
 from service.items.editing import edit_item
 from service.items.items import ItemRow, compute_etag
 from service.items.schemas import DeletedOut, EditIn, ItemOut
+from service.repositories.jobs import JOB_ORDERS, JobOrder
 from service.repositories.search import ItemKind, ListFilter, Term, list_label_terms
 
 MAX_TERMS = 10
@@ -103,9 +105,12 @@ def read_job_form(
     fields: Annotated[dict[str, str], Depends(read_dataset_form)],
     model: FormText = "",
     recording: FormText = "",
+    state: FormText = "",
+    sort: FormText = "",
 ) -> dict[str, str]:
-    """Read the filled fields of the form that filters jobs."""
-    more = {"model": model.strip(), "recording": recording.strip()}
+    """Read the filled fields of the form that filters and sorts jobs."""
+    texts = {"model": model, "recording": recording, "state": state, "sort": sort}
+    more = {field: text.strip() for field, text in texts.items()}
     return {**fields, **{field: text for field, text in more.items() if text}}
 
 
@@ -141,6 +146,35 @@ def parse_form(session: Session, form: Mapping[str, str]) -> ListFilter:
                     f"?{field}", f"found {form[field]!r:.80}; need a date, such as 2026-01-31"
                 ) from None
     return _build_filter(terms, form.get("name"), moments.get("since"), moments.get("until"))
+
+
+def parse_states(form: Mapping[str, str]) -> list[JobState]:
+    """Return the state that a form selects, if it selects one.
+
+    Raises
+    ------
+    InvalidRequest
+        If there is no such state.
+    """
+    return [JobState(_choose(form, "state", tuple(JobState)))] if "state" in form else []
+
+
+def parse_order(form: Mapping[str, str]) -> JobOrder:
+    """Return the order of a list of jobs that a form selects.
+
+    Raises
+    ------
+    InvalidRequest
+        If there is no such order.
+    """
+    return cast(JobOrder, _choose(form, "sort", JOB_ORDERS)) if "sort" in form else "newest"
+
+
+def _choose(form: Mapping[str, str], field: str, choices: Sequence[str]) -> str:
+    if form[field] not in choices:
+        found, listed = f"{form[field]!r:.80}", ", ".join(choices)
+        raise InvalidRequest.from_fault(f"?{field}", f"found {found}; need one of {listed}")
+    return form[field]
 
 
 def set_etag(response: Response, row: ItemRow) -> None:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import (
     FileResponse,
     HTMLResponse,
@@ -12,19 +12,29 @@ from fastapi.responses import (
     Response,
 )
 
-from service.api.dependencies import Cursor, PartsDep, ReadSession
+from service.api.dependencies import CallerDep, Cursor, PartsDep, ReadSession
 from service.api.figures import csv_response, figure_response
+from service.api.health import collect_failures
 from service.api.html import HtmlPage
-from service.api.items import DatasetFormDep, JobFormDep, parse_form
+from service.api.items import (
+    DatasetFormDep,
+    FormText,
+    JobFormDep,
+    parse_form,
+    parse_order,
+    parse_states,
+)
 from service.api.jobs import CellFilter
 from service.core.errors import NotFound
 from service.core.root_path import to_address
-from service.core.states import JobState
-from service.pages import guides, pages
+from service.pages import guides, health, model_pages, pages, reference_pages, results
 from service.pages import render as assets
 from service.pages.bounds import propose_bounds
 from service.pages.figures import ComparisonChoice, load_comparison_figure
+from service.pages.results import ResultChoice
 from service.pages.simulate import simulate_page as simulate
+from sysid.figures.plotly import apply_theme
+from sysid.figures.theme import Theme
 from sysid.trends.trend import OutlierRule
 
 router = APIRouter()
@@ -33,7 +43,6 @@ CACHE_FOREVER = "public, max-age=31536000, immutable"
 
 
 HIDDEN: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
-StateFilter = Annotated[JobState | None, Query()]
 ComparedRuns = Annotated[list[str] | None, Query(max_length=50)]
 
 
@@ -60,13 +69,13 @@ def jobs_page(
     session: ReadSession,
     request: Request,
     form: JobFormDep,
-    state: StateFilter = None,
     cursor: Cursor = None,
 ) -> Response:
     """Show the list of jobs, and the form of a new identification."""
-    chosen = parse_form(session, form)
-    url = str(request.base_url)
-    return HtmlPage(pages.jobs_page(session, state, cursor, chosen, form, url))
+    selection = pages.JobSelection(
+        parse_form(session, form), parse_states(form), parse_order(form), form
+    )
+    return HtmlPage(pages.jobs_page(session, selection, cursor, str(request.base_url)))
 
 
 @router.get("/new/noise-sweep", **HIDDEN)
@@ -115,7 +124,7 @@ def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
 
 @router.get("/compare", **HIDDEN)
 def compare_page(session: ReadSession, run: ComparedRuns = None) -> Response:
-    """Compare runs of several models on the same data."""
+    """Compare runs of any jobs, on the same data or on others."""
     return HtmlPage(pages.compare_page(session, run or []))
 
 
@@ -126,6 +135,90 @@ def comparison_figure(
     """Draw the identified outputs of several runs over the measured ones."""
     figure = load_comparison_figure(session, parts.store, choice)
     return figure_response(figure, "comparison", choice)
+
+
+def read_result_choice(
+    session: ReadSession,
+    form: JobFormDep,
+    parameter: FormText = "",
+    over: FormText = "",
+    runs: FormText = "",
+    cursor: Cursor = None,
+) -> ResultChoice:
+    """Read which results are shown, and of which runs; a form sends empty fields too."""
+    more = {"parameter": parameter.strip(), "over": over.strip(), "runs": runs.strip()}
+    filled = {**form, **{name: text for name, text in more.items() if text}}
+    return ResultChoice(
+        chosen=parse_form(session, form),
+        parameter=more["parameter"],
+        over=more["over"] or results.ORDER,
+        only_best=more["runs"] == "best",
+        form=filled,
+        cursor=cursor,
+    )
+
+
+ResultChoiceDep = Annotated[ResultChoice, Depends(read_result_choice)]
+
+
+@router.get("/results", **HIDDEN)
+def results_page(session: ReadSession, choice: ResultChoiceDep) -> Response:
+    """Show one parameter over the runs of any jobs."""
+    return HtmlPage(results.results_page(session, choice))
+
+
+@router.get("/pages/results/figure", **HIDDEN)
+def results_figure(
+    session: ReadSession, choice: ResultChoiceDep, theme: Theme = "light"
+) -> Response:
+    """Draw one parameter over the runs of any jobs."""
+    return JSONResponse(apply_theme(results.load_results_figure(session, choice), theme))
+
+
+@router.get("/pages/results.csv", **HIDDEN)
+def results_csv(session: ReadSession, choice: ResultChoiceDep) -> Response:
+    """Export one parameter over the runs of any jobs."""
+    return csv_response(results.write_results_csv(session, choice), "results")
+
+
+@router.get("/models", **HIDDEN)
+def models_page(session: ReadSession, name: FormText = "", cursor: Cursor = None) -> Response:
+    """Show the gallery of models."""
+    form = {"name": name.strip()} if name.strip() else {}
+    return HtmlPage(model_pages.models_page(session, form, cursor))
+
+
+@router.get("/models/{name}", **HIDDEN)
+def model_page(name: str, session: ReadSession) -> Response:
+    """Show one model: equations, parameters, jobs that used it."""
+    return HtmlPage(model_pages.model_page(session, name))
+
+
+@router.get("/references", **HIDDEN)
+def references_page(session: ReadSession, form: DatasetFormDep, cursor: Cursor = None) -> Response:
+    """List the references in use."""
+    chosen = parse_form(session, form)
+    return HtmlPage(reference_pages.references_page(session, cursor, chosen, form))
+
+
+@router.get("/references/{name}", **HIDDEN)
+def show_reference_page(name: str, session: ReadSession) -> Response:
+    """Show one reference, and what is compared with it."""
+    return HtmlPage(reference_pages.reference_page(session, name))
+
+
+@router.get("/health", **HIDDEN)
+def health_page(parts: PartsDep, caller: CallerDep) -> Response:
+    """Show which parts of the service work, its queue and its dispatchers."""
+    failures = {fault.pointer: fault.detail for fault in collect_failures(parts)}
+    is_admin = "admin" in caller.scopes
+    return HtmlPage(health.health_page(parts.database, parts.settings, failures, is_admin=is_admin))
+
+
+@router.get("/settings", **HIDDEN)
+def settings_page(parts: PartsDep) -> Response:
+    """Show the settings in effect, to who may administrate."""
+    return HtmlPage(health.settings_page(parts.settings))
 
 
 @router.get("/datasets", **HIDDEN)
@@ -157,13 +250,13 @@ def show_bounds(
 @router.get("/pages/models/{name}.yaml", **HIDDEN)
 def model_text(name: str, session: ReadSession) -> Response:
     """Return a model as the text that the form shows."""
-    return PlainTextResponse(pages.model_text(session, name))
+    return PlainTextResponse(model_pages.model_text(session, name))
 
 
 @router.get("/pages/jobs/{job_id}/model.yaml", **HIDDEN)
 def job_model_text(job_id: str, session: ReadSession) -> Response:
     """Return the model of a job as the text that the form shows for a clone."""
-    return PlainTextResponse(pages.job_model_text(session, job_id))
+    return PlainTextResponse(model_pages.job_model_text(session, job_id))
 
 
 @router.get("/static/{name}", **HIDDEN)

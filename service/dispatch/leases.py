@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from datetime import timedelta
 from functools import partial
+from importlib.metadata import version
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -85,6 +86,7 @@ class HeldLeases:
         """Register the dispatcher and start the heartbeat; later calls change what it tells."""
         description: Document = {
             LEASE_SECONDS_KEY: self._length.total_seconds(),
+            "version": version("lagid"),
             **describe_process(),
             **details,
         }

@@ -7,7 +7,7 @@ without a row, are removed later (`service.upkeep`).
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict
@@ -18,6 +18,7 @@ from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import LineageRepository
 from service.repositories.models import ModelRepository
+from service.repositories.outcomes import record_best_run
 from service.repositories.search import ItemKind, delete_terms
 from service.storage.columns import utc_now
 from service.storage.errors import RowNotFound
@@ -164,8 +165,8 @@ def _delete_run(session: Session, item: Item) -> None:
     elif run.state is JobState.CANCELLED:
         job.n_done += 1
     session.flush()
-    best = select(func.min(Run.best_rms)).where(Run.job_id == run.job_id, Run.best_rms.is_not(None))
-    job.best_rms = session.scalar(best)
+    job.best_rms = None
+    record_best_run(session, job)
     session.execute(delete(StoredSummary).where(StoredSummary.job_id == run.job_id))
     delete_terms(session, run.id)
     record_action(session, "run.delete", run.id)

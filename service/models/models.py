@@ -34,7 +34,7 @@ def list_models(
     part = (chosen.name or "").lower()
     is_first = not (cursor or chosen.terms or chosen.since or chosen.until)
     built_in = [model for model in list_catalogue() if part in model.name] if is_first else []
-    return ModelPage(items=built_in + [_to_own_out(row) for row in stored.items], next=stored.next)
+    return ModelPage(items=built_in + [to_own_out(row) for row in stored.items], next=stored.next)
 
 
 def get_model(session: Session, reference: str) -> ModelOut:
@@ -47,7 +47,7 @@ def get_model(session: Session, reference: str) -> ModelOut:
     """
     if reference in load.catalogue():
         return to_builtin_out(reference, with_document=True)
-    return _to_own_out(_get_own_model(session, reference), with_document=True)
+    return to_own_out(_get_own_model(session, reference), with_document=True)
 
 
 def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
@@ -64,7 +64,7 @@ def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
             "/name", f"{model.name!r} is the name of a built-in model; choose another"
         )
     stored = ModelRepository(session).add(model.name, dict(model.document))
-    return _to_own_out(stored.model, with_document=True)
+    return to_own_out(stored.model, with_document=True)
 
 
 def resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
@@ -128,7 +128,8 @@ def _list_names(session: Session) -> set[str]:
     return {*load.catalogue(), *(row.name for row in stored)}
 
 
-def _to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
+def to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
+    """Convert a stored model to an answer."""
     document = row.document if with_document else None
     answer = to_model_out(parse_model(row.document), row.version, document)
     return answer.model_copy(update={"note": row.note, "tags": row.tags or []})

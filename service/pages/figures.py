@@ -104,7 +104,7 @@ MAX_OVERLAID_RUNS = 8
 def load_comparison_figure(
     session: Session, store: ObjectStore, choice: ComparisonChoice
 ) -> Figure:
-    """Draw the identified outputs of several runs over the measured ones, the best first.
+    """Draw the identified outputs of several runs, each over what it was fitted to.
 
     Raises
     ------
@@ -113,13 +113,13 @@ def load_comparison_figure(
     NotFound
         If the requested experiment does not exist.
     """
-    ordered = load_compared_runs(session, choice.run)
+    ordered = load_compared_runs(session, choice.run, same_data=False)
     titles = build_titles(ordered)
     read = {
         titles[stored.run.id]: read_plain_experiments(session, store, stored)
         for stored in ordered[:MAX_OVERLAID_RUNS]
     }
-    experiments = next((many for many in read.values() if many), [])
+    experiments = max(read.values(), key=len)
     if not experiments:
         return plotly.empty_figure()
     _check_experiment(choice.experiment, len(experiments))

@@ -1,15 +1,15 @@
 """Render the pages: jobs, runs, datasets, comparisons, and the forms of recipes."""
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pprint import pformat
 from typing import Any
 from urllib.parse import urlencode
 
-import yaml
 from sqlalchemy.orm import Session
 
-from service.core.root_path import to_address
 from service.core.states import JobState
 from service.datasets.rms_unit import find_rms_unit
 from service.figures.noise import noise_group_keys, noise_sweep_height
@@ -27,6 +27,7 @@ from service.pages.diagnostics import to_diagnostics
 from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
+from service.pages.lineage import BOX_HEIGHT, BOX_WIDTH, draw_lineage
 from service.pages.render import render_template
 from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
@@ -41,12 +42,12 @@ from service.pages.views import (
 from service.queue.dispatchers import DispatcherRepository, describe_wait
 from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.lineage import LineageRepository, find_tombstones
+from service.repositories.jobs import JobOrder, JobRepository
+from service.repositories.lineage import describe_items
 from service.repositories.references import ReferenceRepository
 from service.repositories.runs import RunRepository
 from service.repositories.search import NO_FILTER, ListFilter
-from service.runs.comparison import compare_runs
+from service.runs.comparison import compare_runs, have_same_data
 from service.runs.runs import parse_filters
 from service.storage.tables import Dataset, Job, Run
 from service.sweeps.schemas import NoiseSweepIn
@@ -58,6 +59,7 @@ from sysid.figures.posterior import posterior_height
 from sysid.figures.residuals import residuals_height
 from sysid.trends.trend import OutlierRule
 
+DATASET_ID = re.compile(r"\bds_[0-9a-z]{26}\b")
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
 EVENTS_SHOWN = 100
@@ -92,30 +94,59 @@ JOB_FILTER_FIELDS = (
     ("model", "Model", ""),
     ("recording", "Recording", "id or name"),
     *DATASET_FILTER_FIELDS[1:],
+    ("state", "State", ""),
+    ("sort", "Sort by", ""),
 )
 """Fields of the filter of a list: name, label and hint."""
+JOB_FILTER_CHOICES: Mapping[str, Sequence[tuple[str, str]]] = {
+    "state": [("", "any"), *((one.value, one.value) for one in JobState)],
+    "sort": [
+        ("", "newest first"),
+        ("oldest", "oldest first"),
+        ("name", "name"),
+        ("fit", "best fit first"),
+        ("worst-fit", "worst fit first"),
+        ("rms", "smallest RMS first"),
+    ],
+}
+"""Values and texts of the fields that are chosen from a list."""
+JOB_HEADINGS: Sequence[tuple[str, str, Sequence[tuple[JobOrder, str]]]] = (
+    ("State", "", ()),
+    ("Job", "", (("name", "ascending"),)),
+    ("Result", "", ()),
+    ("Fit", "n", (("fit", "descending"), ("worst-fit", "ascending"))),
+    ("RMS", "n", (("rms", "ascending"),)),
+    ("Warnings", "n", ()),
+    ("Took", "n", ()),
+    ("Age", "n", (("newest", "ascending"), ("oldest", "descending"))),
+)
+"""Columns of the list of jobs: text, class, and the orders that a click on it goes through."""
 
 
-def jobs_page(
-    session: Session,
-    state: JobState | None,
-    cursor: str | None,
-    chosen: ListFilter = NO_FILTER,
-    form: Mapping[str, str] | None = None,
-    base_url: str = "",
-) -> str:
+@dataclass(frozen=True, slots=True)
+class JobSelection:
+    """Which jobs a list shows, and in which order; `form` has the same as the user typed it."""
+
+    chosen: ListFilter = NO_FILTER
+    states: Sequence[JobState] = ()
+    order: JobOrder = "newest"
+    form: Mapping[str, str] = field(default_factory=dict)
+
+
+def jobs_page(session: Session, selection: JobSelection, cursor: str | None, base_url: str) -> str:
     """Render the list of jobs and the form of a new identification.
 
     Parameters
     ----------
-    form : mapping of str to str, optional
-        The filter as the user typed it.
     base_url : str
         Address of the service, for the first steps of a new user.
     """
-    states = [state] if state else []
     page = JobRepository(session).list_page(
-        cursor=cursor, limit=JOBS_PER_PAGE, states=states, chosen=chosen
+        cursor=cursor,
+        limit=JOBS_PER_PAGE,
+        states=selection.states,
+        chosen=selection.chosen,
+        order=selection.order,
     )
     now = datetime.now(UTC)
     outcomes = read_outcomes(session, page.items)
@@ -123,26 +154,46 @@ def jobs_page(
         to_job_view(job, find_rms_unit(session, job.spec), now, outcomes.get(job.id))
         for job in page.items
     ]
-    typed = dict(form or {})
-    query = {**typed, "state": state.value} if state else typed
+    typed = dict(selection.form)
+    stateless = {name: text for name, text in typed.items() if name != "state"}
     return render_template(
         "jobs.html",
         jobs=jobs,
         flags=count_trend_flags(session, page.items),
-        state=state.value if state else "",
-        states=[(one.value, _encode_query({**typed, "state": one.value})) for one in JobState],
-        query_without_state=_encode_query(typed),
+        state=typed.get("state", ""),
+        states=[(one.value, _encode_query({**stateless, "state": one.value})) for one in JobState],
+        query_without_state=_encode_query(stateless),
+        headings=_link_headings(selection),
         form=typed,
         filter_fields=JOB_FILTER_FIELDS,
+        filter_choices=JOB_FILTER_CHOICES,
         any_open=any(job.is_open for job in jobs),
         address=base_url.rstrip("/"),
         cursor=cursor,
-        filter_query=_encode_query(query),
-        next=_encode_query({**query, "cursor": page.next}) if page.next else "",
+        filter_query=_encode_query(typed),
+        next=_encode_query({**typed, "cursor": page.next}) if page.next else "",
         choices=list_choices(),
         defaults=DEFAULTS,
         recording_suffixes=",".join(SUFFIXES),
     )
+
+
+def _link_headings(selection: JobSelection) -> list[dict[str, str]]:
+    """Link each heading to the order that a click on it gives; "" where there is none."""
+    headings = []
+    for text, look, orders in JOB_HEADINGS:
+        names = [name for name, _ in orders]
+        place = names.index(selection.order) if selection.order in names else -1
+        query = {**selection.form, "sort": names[(place + 1) % len(names)]} if names else {}
+        headings.append(
+            {
+                "text": text,
+                "look": look,
+                "query": _encode_query(query),
+                "sorted": orders[place][1] if place >= 0 else "none",
+            }
+        )
+    return headings
 
 
 def job_page(
@@ -200,7 +251,7 @@ def _describe_obstacle(session: Session, job: Job) -> str:
 
 
 def compare_page(session: Session, runs: Sequence[str]) -> str:
-    """Render a comparison of runs of several models; of fewer than two, how to choose them.
+    """Render a comparison of runs of any jobs; of fewer than two, how to choose them.
 
     Raises
     ------
@@ -209,7 +260,7 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     """
     if len(runs) < 2:
         return render_template("compare.html", comparison=None)
-    comparison = compare_runs(session, runs)
+    comparison = compare_runs(session, runs, same_data=False)
     rows = []
     for parameter in comparison.parameters:
         texts_by_run = {
@@ -230,12 +281,27 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     return render_template(
         "compare.html",
         comparison=comparison,
+        same_data=have_same_data(ordered),
+        units=[stored.rms_unit(session) for stored in ordered],
         parameters=rows,
         verdicts=[read_verdict(stored.result) for stored in ordered],
-        differences=list_differences([stored.body for stored in ordered]),
+        differences=_name_datasets(session, [stored.body for stored in ordered]),
         query=urlencode([("run", run) for run in runs]),
         height=signals.response_height(len(first.outputs), len(first.inputs)),
     )
+
+
+def _name_datasets(
+    session: Session, bodies: Sequence[Mapping[str, Any]]
+) -> list[tuple[str, list[str]]]:
+    """List the settings that differ, with the names of datasets in the place of their ids."""
+    rows = list_differences(bodies)
+    ids = DATASET_ID.findall(" ".join(text for _, texts in rows for text in texts))
+    names = {item.id: item.name for item in describe_items(session, ids)}
+    return [
+        (field, [DATASET_ID.sub(lambda id_: names.get(id_[0], id_[0]), text) for text in texts])
+        for field, texts in rows
+    ]
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:
@@ -267,50 +333,15 @@ def datasets_page(
 def dataset_page(session: Session, dataset_id: str) -> str:
     """Render a dataset: its signals, channels, and lineage."""
     dataset = DatasetRepository(session).get(dataset_id)
-    lineage = LineageRepository(session)
-    edges = [
-        ("from", edge.parent, edge.relation)
-        for edge in lineage.list_ancestors(dataset.id)
-        if edge.child == dataset.id
-    ]
-    edges += [
-        ("for", edge.child, edge.relation)
-        for edge in lineage.list_descendants(dataset.id)
-        if edge.parent == dataset.id
-    ]
-    deleted = {one.id: one.name for one in find_tombstones(session, [name for _, name, _ in edges])}
     return render_template(
         "dataset.html",
         dataset=dataset,
         etag=compute_etag(dataset),
         height=signals.signals_height(dataset.n_channels),
         has_history=any(channel["history_samples"] for channel in dataset.channels),
-        lineage=[
-            {
-                "direction": direction,
-                "id": name,
-                "relation": relation,
-                "href": _object_href(name),
-                "deleted": deleted.get(name),
-            }
-            for direction, name, relation in edges
-        ],
+        lineage=draw_lineage(session, dataset),
+        box=(BOX_WIDTH, BOX_HEIGHT),
     )
-
-
-def model_text(session: Session, name: str) -> str:
-    """Return a model as YAML, to read and change in the form."""
-    return _to_yaml(models.get_model(session, name).document)
-
-
-def job_model_text(session: Session, job_id: str) -> str:
-    """Return the model document of a job as YAML, for the form of its clone."""
-    model = JobRepository(session).get(job_id).spec["model"]
-    return _to_yaml(models.get_model(session, model).document if isinstance(model, str) else model)
-
-
-def _to_yaml(document: dict[str, Any] | None) -> str:
-    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 
 def load_run_row(session: Session, stored: StoredRun) -> RunView:
@@ -390,12 +421,6 @@ def _request_commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]
         'client.wait(job["id"])\n'
     )
     return [("as-curl", "The same with curl", curl), ("as-python", "The same in Python", python)]
-
-
-def _object_href(name: str) -> str:
-    kind = name.partition("_")[0]
-    folder = {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/")
-    return to_address(folder + name)
 
 
 def _encode_query(values: dict[str, Any]) -> str:

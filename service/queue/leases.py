@@ -40,6 +40,7 @@ from service.queue.admission import Admission, count_running_jobs, is_open
 from service.queue.clocks import Clock, choose_database_clock
 from service.repositories.events import EventKind, EventRepository
 from service.repositories.jobs import end_open_runs, lock_parcels, notify_queue
+from service.repositories.outcomes import record_best_run
 from service.storage.columns import Document, UtcDateTime
 from service.storage.errors import LeaseLost, RowConflict
 from service.storage.statements import RETURNING_OPTIONS
@@ -374,7 +375,7 @@ class LeaseQueue:
         self.lock_lease(lease)
         lock_parcels(self._session, lease.job_id)
         job = self._lock_job(lease.job_id)
-        self._correct_best_rms(job)
+        record_best_run(self._session, job)
         if state is JobState.SUCCEEDED:
             self._check_runs_finished(job.id, range(job.n_runs))
         self._end_job(job, state, error)
@@ -465,13 +466,6 @@ class LeaseQueue:
         self._session.execute(changed, execution_options=RETURNING_OPTIONS)
         query = select(Job).where(Job.id == job_id).options(_DEFER_SPEC)
         return self._session.scalars(query, execution_options=_FRESH).one()
-
-    def _correct_best_rms(self, job: Job) -> None:
-        """Take the best RMS from the results; a running run reports its fitness only."""
-        of_job = Run.job_id == job.id, Run.best_rms.is_not(None)  # as in its index
-        best = self._session.scalar(select(func.min(Run.best_rms)).where(*of_job))
-        if best is not None:
-            job.best_rms = best
 
     def _check_runs_finished(self, job_id: str, runs: range) -> None:
         """Check that all these runs have finished, including those that are not created yet."""
@@ -639,6 +633,13 @@ def _choose_by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnEl
     by_owner = {owner: literal(time, UtcDateTime()) for owner, time in times.items()}
     otherwise = literal(other, UtcDateTime())
     return case(by_owner, value=Parcel.lease_owner, else_=otherwise) if by_owner else otherwise
+
+
+def count_held_parcels(session: Session) -> dict[str, int]:
+    """Count the parcels that each dispatcher holds, by its name."""
+    held = Parcel.lease_owner.is_not(None)
+    query = select(Parcel.lease_owner, func.count()).where(held).group_by(Parcel.lease_owner)
+    return {str(owner): n for owner, n in session.execute(query)}
 
 
 def choose_smaller_rms(rms: float) -> ColumnElement[Any]:

@@ -1,10 +1,10 @@
 """Jobs as users see them: submit, read, list, cancel, resume, delete."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
-from sqlalchemy import delete, select, text, update
+from sqlalchemy import ColumnElement, case, delete, func, or_, select, text, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -12,9 +12,9 @@ from service.core.states import OPEN_STATES, JobState
 from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
 from service.repositories.projects import DAY
-from service.repositories.search import NO_FILTER, ListFilter, select_ids
+from service.repositories.search import NO_FILTER, ListFilter, select_ids, select_matches
 from service.storage.columns import Document, utc_now
-from service.storage.errors import KeyReused, RowConflict, RowNotFound
+from service.storage.errors import InvalidCursor, KeyReused, RowConflict, RowNotFound
 from service.storage.sessions import find_project
 from service.storage.statements import (
     RETURNING_OPTIONS,
@@ -24,6 +24,20 @@ from service.storage.statements import (
     new_id,
 )
 from service.storage.tables import IdempotencyKey, Job, Parcel, Run, StoredSummary
+
+JobOrder = Literal["newest", "oldest", "name", "fit", "worst-fit", "rms"]
+JOB_ORDERS: tuple[JobOrder, ...] = get_args(JobOrder)
+"""Orders of a list of jobs; `fit` has the best fit first."""
+# The RMS of a batch, or before the end, compares with no other. It has no fit then.
+_FINAL_RMS = case((Job.fit_estimation.is_not(None), Job.best_rms))
+_ORDERS: Mapping[JobOrder, tuple[ColumnElement[Any], bool]] = {
+    "oldest": (Job.id.expression, True),
+    "name": (func.lower(Job.name), True),
+    "fit": (Job.fit_estimation.expression, False),
+    "worst-fit": (Job.fit_estimation.expression, True),
+    "rms": (_FINAL_RMS, True),
+}
+"""Value by which each order sorts, and whether the smallest comes first."""
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -105,6 +119,11 @@ class JobRepository:
             raise RowNotFound("job", job_id)
         return job
 
+    def list_some(self, job_ids: Collection[str]) -> Sequence[Job]:
+        """List those of these jobs that are not deleted, latest first."""
+        query = select(Job).where(Job.id.in_(job_ids), *self._filter_project())
+        return self._session.scalars(query.order_by(Job.id.desc())).all()
+
     def get_state(self, job_id: str) -> JobState:
         """Return only the state of an undeleted job; else raise `RowNotFound`."""
         query = select(Job.state).where(Job.id == job_id, *self._filter_project())
@@ -120,11 +139,14 @@ class JobRepository:
         limit: int = 50,
         states: Sequence[JobState] = (),
         chosen: ListFilter = NO_FILTER,
+        order: JobOrder = "newest",
     ) -> RowPage[Job]:
-        """List the jobs that meet a filter, latest first.
+        """List the jobs that meet a filter, latest first, or in another order.
 
         The pages do not shift while new jobs arrive.
         """
+        if order != "newest":
+            return self._sort_page(order, chosen, states, cursor, limit)
         if chosen:
             return self._search_page(chosen, states, cursor, limit)
         query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
@@ -151,6 +173,36 @@ class JobRepository:
         query = select(Job).where(Job.id.in_(list(self._session.scalars(ids))))
         rows = sorted(self._session.scalars(query), key=lambda job: job.id, reverse=True)
         return make_page(rows, limit, (job.id for job in rows))
+
+    def _sort_page(
+        self,
+        order: JobOrder,
+        chosen: ListFilter,
+        states: Sequence[JobState],
+        cursor: str | None,
+        limit: int,
+    ) -> RowPage[Job]:
+        """List jobs by a value. Those without one come last, and of equal ones the latest first.
+
+        The cursor is a job. Its value is read again, so that a page begins where it stands now.
+        """
+        value, is_rising = _ORDERS[order]
+        ids = select_matches(Job, self._project_id, chosen)
+        if states:
+            ids = ids.where(Job.state.in_(states))
+        if cursor is not None:
+            after = self._session.execute(
+                select(value).where(Job.id == cursor, Job.project_id == self._project_id)
+            ).first()
+            if after is None:
+                raise InvalidCursor(cursor)
+            ids = ids.where(_comes_after(value, after[0], cursor, is_rising=is_rising))
+        first = value.asc() if is_rising else value.desc()
+        ids = ids.order_by(value.is_(None), first, Job.id.desc()).limit(limit + 1)
+        places = {job: place for place, job in enumerate(self._session.scalars(ids))}
+        rows = self._session.scalars(select(Job).where(Job.id.in_(places)))
+        ordered = sorted(rows, key=lambda job: places[job.id])
+        return make_page(ordered, limit, (job.id for job in ordered))
 
     def cancel(self, job_id: str, reason: str | None = None) -> Job:
         """Cancel a queued job at once, or ask the dispatcher of a running one to stop.
@@ -319,6 +371,16 @@ class JobRepository:
         if used.request_hash != request_hash:
             raise KeyReused(key)
         return self._session.get_one(Job, used.job_id)
+
+
+def _comes_after(
+    value: ColumnElement[Any], last: object, job: str, *, is_rising: bool
+) -> ColumnElement[bool]:
+    """Test whether a row follows that of a job with this value in the order of a list."""
+    if last is None:
+        return value.is_(None) & (Job.id < job)
+    following = value > last if is_rising else value < last
+    return or_(following, (value == last) & (Job.id < job), value.is_(None))
 
 
 def lock_parcels(session: Session, job_id: str) -> None:

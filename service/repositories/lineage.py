@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal, NamedTuple
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import Select, func, or_, select
 from sqlalchemy.orm import Session, aliased
 
 from service.storage.sessions import find_project
@@ -23,6 +23,8 @@ from service.storage.tables import (
     RunHistory,
 )
 
+MAX_LINKS = 1000
+"""Most edges that are listed at once."""
 Relation = Literal[
     "derived",
     "merged",
@@ -75,6 +77,25 @@ class LineageRepository:
             children.update(self._session.scalars(query))
         return sorted(children)
 
+    def list_links_to_children(
+        self, parents: Collection[str], limit: int = MAX_LINKS
+    ) -> list[LineageLink]:
+        """List the edges from any of these objects to what was made from it, latest first."""
+        query = select(LineageEdge).where(LineageEdge.parent.in_(parents))
+        return self._list_links(query.order_by(LineageEdge.child.desc()), limit)
+
+    def list_links_to_parents(
+        self, children: Collection[str], limit: int = MAX_LINKS
+    ) -> list[LineageLink]:
+        """List the edges from any of these objects to what it was made from, latest first."""
+        query = select(LineageEdge).where(LineageEdge.child.in_(children))
+        return self._list_links(query.order_by(LineageEdge.parent.desc()), limit)
+
+    def _list_links(self, query: Select[LineageEdge], limit: int) -> list[LineageLink]:
+        of_project = query.where(LineageEdge.project_id == self._project_id).limit(limit)
+        edges = self._session.scalars(of_project)
+        return [LineageLink(row.child, row.parent, row.relation) for row in edges]
+
     def list_ancestors(self, identity: str) -> list[LineageLink]:
         """List every edge on the paths from the raw files to this object."""
         return self._walk_edges(identity, upward=True)
@@ -102,34 +123,37 @@ class LineageRepository:
         return sorted(LineageLink(row.child, row.parent, row.relation) for row in edges)
 
 
-class Tombstone(NamedTuple):
-    """What is left of a deleted item of the lineage."""
+class LineageItem(NamedTuple):
+    """An object of the lineage by its name; `deleted_at` is None unless it was deleted."""
 
     id: str
     name: str
     deleted_at: datetime | None
 
 
-def find_tombstones(session: Session, identities: Collection[str]) -> list[Tombstone]:
-    """Find those of the objects that were deleted, the earliest first."""
-    found: list[Tombstone] = []
+def describe_items(session: Session, identities: Collection[str]) -> list[LineageItem]:
+    """Read the names of these objects, and when they were deleted, the earliest first."""
+    found: list[LineageItem] = []
     project = find_project(session)
     for table in (Dataset, Job, ModelVersion):
         query = select(table.id, table.name, table.deleted_at).where(
-            table.id.in_(identities), table.project_id == project, table.deleted_at.is_not(None)
+            table.id.in_(identities), table.project_id == project
         )
-        found += [Tombstone(*row) for row in session.execute(query)]
-    query = select(Run.id, Job.name, func.coalesce(Run.deleted_at, Job.deleted_at)).join(
-        Job, Job.id == Run.job_id
-    )
-    gone = or_(Run.deleted_at.is_not(None), Job.deleted_at.is_not(None))
+        found += [LineageItem(*row) for row in session.execute(query)]
+    deleted_at = func.coalesce(Run.deleted_at, Job.deleted_at)
+    runs = select(Run.id, Run.number, Job.name, deleted_at).join(Job, Job.id == Run.job_id)
     found += [
-        Tombstone(run, f"run of {name}", moment)
-        for run, name, moment in session.execute(
-            query.where(Run.id.in_(identities), Run.project_id == project, gone)
+        LineageItem(run, f"run {number + 1} of {name}", moment)
+        for run, number, name, moment in session.execute(
+            runs.where(Run.id.in_(identities), Run.project_id == project)
         )
     ]
-    return sorted(found)
+    return sorted(found, key=lambda item: item.id)
+
+
+def find_tombstones(session: Session, identities: Collection[str]) -> list[LineageItem]:
+    """Find those of the objects that were deleted, the earliest first."""
+    return [item for item in describe_items(session, identities) if item.deleted_at is not None]
 
 
 class WrittenProgress(NamedTuple):

@@ -1,11 +1,12 @@
-"""Read what lists of jobs tell of results: parts of the result of one run for each job."""
+"""What lists of jobs tell of results: one run stands for each job, and parts of its result."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
 
-from sqlalchemy import select
+from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
+from service.core.job_fields import DATASETS_PATH
 from service.core.states import JobState
 from service.storage.columns import Document
 from service.storage.tables import Job, Run
@@ -30,7 +31,9 @@ def read_outcome_rows(
     job. No other result is read.
     """
     single = [job.id for job in jobs if job.n_runs == 1 and job.n_done]
-    chosen = [_find_best(session, job.id) for job in jobs if job.n_runs > 1 and job.n_done]
+    chosen = [
+        session.scalar(select_best_run(job.id)) for job in jobs if job.n_runs > 1 and job.n_done
+    ]
     condition = (Run.job_id.in_(single) & (Run.number == 0)) | Run.id.in_(filter(None, chosen))
     columns = [Run.result.expression[part] for part in parts]
     query = select(Run.job_id, Run.id, Run.fit_estimation, Run.fit_validation, *columns).where(
@@ -42,8 +45,31 @@ def read_outcome_rows(
     ]
 
 
-def _find_best(session: Session, job: str) -> str | None:
+def read_parameters(session: Session, runs: Collection[str]) -> dict[str, list[Any]]:
+    """Read the entries ``parameters`` of the results of these runs, and nothing else of them."""
+    parameters = Run.result.expression["parameters"]
+    query = select(Run.id, parameters).where(Run.id.in_(runs), Run.deleted_at.is_(None))
+    return {run: entries or [] for run, entries in session.execute(query)}
+
+
+def record_best_run(session: Session, job: Job) -> None:
+    """Take RMS and fit of a job from the result of its best run.
+
+    Before the end, runs report their fitness only. The runs of a batch see different recordings, so
+    it has no fit. Without any result, the RMS stays.
+    """
+    columns = Run.best_rms, Run.fit_estimation, Run.cell
+    best = session.execute(select_best_run(job.id).with_only_columns(*columns)).first()
+    if best is None:
+        job.fit_estimation = None
+        return
+    is_of_batch = any(path.startswith(DATASETS_PATH) for path in best.cell)
+    job.best_rms, job.fit_estimation = best.best_rms, None if is_of_batch else best.fit_estimation
+
+
+def select_best_run(job: str) -> Select[str]:
+    """Select the run of a job with the smallest RMS."""
     query = select(Run.id).where(
         Run.job_id == job, Run.best_rms.is_not(None), Run.deleted_at.is_(None)
     )
-    return session.scalar(query.order_by(Run.best_rms, Run.number).limit(1))
+    return query.order_by(Run.best_rms, Run.number).limit(1)

@@ -1,6 +1,6 @@
 """Accepted references: the run that is the reference of a name, and the previous ones."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from sqlalchemy import ColumnElement, func, select
@@ -129,6 +129,17 @@ class ReferenceRepository:
         )
         references = [CurrentReference(*row) for row in self._session.execute(query)]
         return make_page(references, limit, (reference.accepted.name for reference in references))
+
+    def list_of_jobs(self, jobs: Collection[str]) -> Sequence[CurrentReference]:
+        """List the acceptances of runs of these jobs, latest last; earlier ones are among them."""
+        query = (
+            select(AcceptedReference, Run.job_id, Run.labels, Run.estimates)
+            .join(Run, Run.id == AcceptedReference.run_id)
+            .where(AcceptedReference.project_id == self._project_id, Run.job_id.in_(jobs))
+            .order_by(AcceptedReference.number)
+            .limit(_MAX_NAMES)
+        )
+        return [CurrentReference(*row) for row in self._session.execute(query)]
 
     def list_names(self) -> Sequence[str]:
         """List the names of references in use."""

@@ -61,6 +61,16 @@ def select_ids(
     With a term, its range of the primary key is walked in this order; other terms are looked up.
     Without one, an index that has the names is walked.
     """
+    _, prefix = _TABLES[table]
+    query = select_matches(table, project_id, chosen)
+    (order,) = query.selected_columns
+    if cursor is not None:
+        query = query.where(order < check_id_cursor(cursor, prefix))
+    return query.order_by(order.desc()).limit(limit + 1)
+
+
+def select_matches(table: SearchedTable, project_id: str, chosen: ListFilter) -> Select[str]:
+    """Select the identifiers of undeleted items that meet a filter, in no order."""
     item, prefix = _TABLES[table]
     conditions = [table.project_id == project_id, table.deleted_at.is_(None)]
     if not chosen.terms:
@@ -81,9 +91,7 @@ def select_ids(
     if chosen.until is not None:
         bound = make_id_bound(prefix, chosen.until + CLOCK_SLACK)
         conditions += [order < bound, table.created_at < chosen.until]
-    if cursor is not None:
-        conditions.append(order < check_id_cursor(cursor, prefix))
-    return query.where(*conditions).order_by(order.desc()).limit(limit + 1)
+    return query.where(*conditions)
 
 
 def select_items_with(kind: ItemKind, project_id: str, term: Term) -> Select[str]:

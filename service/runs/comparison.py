@@ -1,4 +1,4 @@
-"""Use case of a comparison: several model structures on the same data, side by side."""
+"""Use case of a comparison: several runs side by side, on the same data or on others."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,8 +30,13 @@ _DATA_DIFFERENCES = {
 }
 
 
-def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
-    """Compare runs, the best RMS first.
+def compare_runs(session: Session, runs: Sequence[str], *, same_data: bool = True) -> ComparisonOut:
+    """Compare runs, the best RMS first, or as they are named if their data differ.
+
+    Parameters
+    ----------
+    same_data : bool
+        Whether runs on different data are refused. Else the notes tell what does not compare.
 
     Raises
     ------
@@ -39,7 +44,7 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
         If a run is missing, has no result, is named twice, or was fitted to other data than
         the first.
     """
-    ordered = load_compared_runs(session, runs)
+    ordered = load_compared_runs(session, runs, same_data=same_data)
     titles = build_titles(ordered)
     parameters = list(_compare_parameters(ordered, titles))
     return ComparisonOut(
@@ -47,12 +52,14 @@ def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
         runs=[_to_compared_run(stored, titles[stored.run.id]) for stored in ordered],
         parameters=parameters,
         notes=[parameter.note for parameter in parameters if parameter.differs]
-        + list(_list_notes(ordered)),
+        + [*_list_data_notes(ordered, titles), *_list_notes(ordered)],
     )
 
 
-def load_compared_runs(session: Session, runs: Sequence[str]) -> list[StoredRun]:
-    """Load runs that can be compared, the best RMS first.
+def load_compared_runs(
+    session: Session, runs: Sequence[str], *, same_data: bool = True
+) -> list[StoredRun]:
+    """Load runs that can be compared, the best RMS first, or as named if their data differ.
 
     Raises
     ------
@@ -61,7 +68,10 @@ def load_compared_runs(session: Session, runs: Sequence[str]) -> list[StoredRun]
         the first.
     """
     candidates = _read_candidates(session, runs)
-    _check_same_data(candidates)
+    if same_data:
+        _check_same_data(candidates)
+    elif not have_same_data(candidates):
+        return candidates
     return sorted(candidates, key=lambda stored: _rank_rms(stored.result.get("rms")))
 
 
@@ -100,24 +110,31 @@ def _collect_data_settings(stored: StoredRun) -> dict[str, Any]:
     }
 
 
+def have_same_data(candidates: Sequence[StoredRun]) -> bool:
+    """Test whether all runs were fitted to the same data, so that their RMS compare."""
+    return not any(_describe_data_difference(candidates[0], other) for other in candidates[1:])
+
+
 def _check_same_data(candidates: Sequence[StoredRun]) -> None:
-    first = _collect_data_settings(candidates[0])
-    faults = []
-    for number, candidate in enumerate(candidates[1:], 1):
-        other = _collect_data_settings(candidate)
-        differences = [
-            text for name, text in _DATA_DIFFERENCES.items() if other[name] != first[name]
-        ]
-        if differences:
-            faults.append(
-                FieldError(
-                    f"/runs/{number}",
-                    f"run {candidate.run.id!r} has {' and '.join(differences)} than "
-                    f"{candidates[0].run.id!r}. Only runs on the same data can be compared",
-                )
-            )
+    first = candidates[0]
+    faults = [
+        FieldError(
+            f"/runs/{number}",
+            f"run {candidate.run.id!r} has {difference} than {first.run.id!r}. Only runs on the "
+            "same data can be compared",
+        )
+        for number, candidate in enumerate(candidates[1:], 1)
+        if (difference := _describe_data_difference(first, candidate))
+    ]
     if faults:
         raise InvalidRequest(faults)
+
+
+def _describe_data_difference(first: StoredRun, other: StoredRun) -> str:
+    """Describe how the data of two runs differ; empty if they do not."""
+    ours, theirs = _collect_data_settings(first), _collect_data_settings(other)
+    texts = (text for name, text in _DATA_DIFFERENCES.items() if theirs[name] != ours[name])
+    return " and ".join(texts)
 
 
 def build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
@@ -233,6 +250,18 @@ def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
         outputs = {entry["output"] for entry in agreement}
         units.add(agreement[0]["unit"] if len(outputs) == 1 else "1")
     return units.pop() if len(units) == 1 else "1"
+
+
+def _list_data_notes(ordered: Sequence[StoredRun], titles: Mapping[str, str]) -> Iterator[str]:
+    """Report which runs were fitted to other data than the first."""
+    first = ordered[0]
+    for other in ordered[1:]:
+        if difference := _describe_data_difference(first, other):
+            title = titles[other.run.id]
+            yield (
+                f"{title} has {difference} than {titles[first.run.id]}. "
+                "Their RMS, fits and criteria do not compare"
+            )
 
 
 def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:

@@ -168,9 +168,10 @@ class LineageEdge(Base):
     """`child` was made from `parent`; the prefix of an identifier tells its kind."""
 
     __tablename__ = "lineage_edges"
+    __table_args__ = (Index("ix_lineage_edges_parent_child", "parent", "child"),)
 
     child: Mapped[str] = mapped_column(primary_key=True)
-    parent: Mapped[str] = mapped_column(primary_key=True, index=True)
+    parent: Mapped[str] = mapped_column(primary_key=True)
     relation: Mapped[str] = mapped_column(primary_key=True)
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
@@ -199,7 +200,8 @@ class Job(Base):
 
     `attempt` counts the claims of its parcels and gives each claim its fencing token. `lost_leases`
     is that of the parcel that was lost last. `evaluations`, `generation` and `seconds_left` are the
-    progress over all runs. `best_rms` is the smallest RMS of any run so far. `n_reused` counts the
+    progress over all runs. `best_rms` is the smallest RMS of any run so far. `fit_estimation` is
+    the fit (%) of that run once the job has ended; a batch has none. `n_reused` counts the
     runs taken over from other jobs. `floors` is the document that `service.dispatch.cramer_rao`
     computes for a job with noise. `evaluations_before` is the part of `evaluations` that was made a
     day or more before the job was resumed: it does not count for the limit of a day.
@@ -234,6 +236,17 @@ class Job(Base):
             "evaluations",
         ),
         _partial_index("ix_jobs_named", "deleted_at IS NULL", "project_id", "id", "name"),
+        # It holds all columns by which a list is sorted, so that no row is read to sort them all.
+        Index(
+            "ix_jobs_sorted",
+            "project_id",
+            "deleted_at",
+            "fit_estimation",
+            "best_rms",
+            "name",
+            "state",
+            "id",
+        ),
         _partial_index(
             "ix_jobs_ended",
             "deleted_at IS NULL AND finished_at IS NOT NULL",
@@ -259,6 +272,7 @@ class Job(Base):
     n_failed: Mapped[int] = mapped_column(default=0)
     n_reused: Mapped[int] = mapped_column(default=0)
     best_rms: Mapped[float | None]
+    fit_estimation: Mapped[float | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
     evaluations_before: Mapped[int] = mapped_column(LargeInteger, default=0, server_default="0")
     generation: Mapped[int] = mapped_column(default=0)

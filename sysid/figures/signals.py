@@ -1,8 +1,8 @@
 """Draw signals over time: measured against identified output, and the channels of a dataset."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from sysid.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTra
 from sysid.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 from sysid.figures.theme import MAX_POINTS, thin_indices, window_slice
 
+T = TypeVar("T")
 _GAP_PX = 20
 _HISTORY_FRACTION = 0.1  # drawn input history before the record, as a share of its duration
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
@@ -53,57 +54,172 @@ def plot_comparison(
     start: float | None = None,
     stop: float | None = None,
 ) -> Figure:
-    """Draw identified outputs of several results over the same measured ones.
+    """Draw identified outputs of several results, each over the measured one it was fitted to.
+
+    Results on one record share its measured output. Records that begin at different times are
+    drawn from zero.
 
     Parameters
     ----------
     compared : sequence of (name, experiment)
-        Results on the same record. Outputs with other samples than those of the first are left
-        out.
+        Results of one experiment each. Outputs of the same place and unit share a plot, and so do
+        inputs.
     start, stop : float, optional
         Draw only this range (s).
     """
-    first = compared[0][1]
-    figure = stack_plots(_response_heights(len(first.outputs), len(first.inputs)))
-    for number, output in enumerate(first.outputs):
-        span = window_slice(output.measured.times, start, stop)
-        unit = output.measured.unit
-        upper, lower = f"y{2 * number + 1}", f"y{2 * number + 2}"
-        figure["data"].append(_output_traces(output, span, upper, number == 0)[0])
-        for place, (name, experiment) in enumerate(compared):
-            same = _find_same_output(experiment, output)
-            if same is not None:
-                look = {"legendgroup": name, "line": theme.series_style(place)}
-                identified = _output_traces(same, span, upper, number == 0)[-1]
-                hover = f"%{{y:.6~g}}{plain_unit(unit)}<extra>{name}</extra>"
-                figure["data"] += [
-                    {**identified, **look, "name": name, "hovertemplate": hover},
-                    {
-                        **_residual_trace(same, span, lower, False),
-                        **look,
-                        "name": name,
-                        "hovertemplate": hover.replace("</extra>", ", residual</extra>"),
-                    },
-                ]
-        name_axis(figure, 2 * number + 1, f"{output.measured.name}{bracket_unit(unit)}")
-        name_axis(figure, 2 * number + 2, f"residual<br>{bracket_unit(unit)}")
-    for number, signal in enumerate(first.inputs, 2 * len(first.outputs) + 1):
-        span = window_slice(signal.times, start, stop)
-        figure["data"].append(signal_line(signal, span, f"y{number}", theme.GREY, legend=False))
-        name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
-    figure["layout"].update(_validation_shading(first))
-    figure["layout"]["meta"] = {"thinned": _is_thinned([one.measured for one in first.outputs])}
+    aligned = _align_starts(compared)
+    outputs = _group_plots(
+        (one.measured, _Compared(place, name, number, one))
+        for place, (name, experiment) in enumerate(aligned)
+        for number, one in enumerate(experiment.outputs)
+    )
+    inputs = _group_plots(
+        (one, _Compared(place, name, number, one))
+        for place, (name, experiment) in enumerate(aligned)
+        for number, one in enumerate(experiment.inputs)
+    )
+    figure = stack_plots(_response_heights(len(outputs), len(inputs)))
+    for number, plot in enumerate(outputs):
+        figure["data"] += _compare_outputs(plot, number, (start, stop))
+        unit = bracket_unit(plot[0][0].unit)
+        name_axis(figure, 2 * number + 1, f"{_join_names(plot)}{unit}")
+        name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
+    for number, drives in enumerate(inputs, 2 * len(outputs) + 1):
+        figure["data"] += _compare_inputs(drives, f"y{number}", (start, stop))
+        name_axis(figure, number, f"{_join_names(drives)}{bracket_unit(drives[0][0].unit)}")
+    if len({signal.times[-1] for plot in outputs for signal, _ in plot}) == 1:
+        figure["layout"].update(_validation_shading(aligned[0][1]))
+    if aligned is not compared:
+        figure["layout"]["xaxis"]["title"]["text"] = "time since the start of each record [s]"
+    measured = [signal for plot in outputs for signal, _ in plot]
+    figure["layout"]["meta"] = {"thinned": _is_thinned(measured)}
     return figure
 
 
-def _find_same_output(experiment: ExperimentTraces, output: OutputTraces) -> OutputTraces | None:
-    """Find the output of another result that was compared with the same samples."""
-    same = (
-        other
-        for other in experiment.outputs
-        if np.array_equal(other.measured.values, output.measured.values, equal_nan=True)
+@dataclass(frozen=True, slots=True)
+class _Compared(Generic[T]):
+    """A signal of one of the compared results: its place among them, name, and number."""
+
+    place: int
+    name: str
+    number: int
+    signal: T
+
+
+_Plot: TypeAlias = list[tuple[SignalTrace, list[_Compared[T]]]]
+"""What shares a plot: different recorded signals, each with the results that have it."""
+
+
+def _align_starts(
+    compared: Sequence[tuple[str, ExperimentTraces]],
+) -> Sequence[tuple[str, ExperimentTraces]]:
+    """Let every record begin at zero, unless all begin at the same time."""
+    starts = [_find_start(experiment) for _, experiment in compared]
+    if len(set(starts)) == 1:
+        return compared
+    return [
+        (name, _shift_times(experiment, since))
+        for (name, experiment), since in zip(compared, starts, strict=True)
+    ]
+
+
+def _find_start(experiment: ExperimentTraces) -> float:
+    # A recursion does not score its first outputs, so the inputs tell where the record begins.
+    signals = experiment.inputs or [output.measured for output in experiment.outputs]
+    return min((float(signal.times[0]) for signal in signals), default=0.0)
+
+
+def _shift_times(experiment: ExperimentTraces, since: float) -> ExperimentTraces:
+    def shift(signal: SignalTrace) -> SignalTrace:
+        return replace(signal, times=signal.times - since)
+
+    return replace(
+        experiment,
+        outputs=tuple(
+            replace(output, measured=shift(output.measured)) for output in experiment.outputs
+        ),
+        inputs=tuple(map(shift, experiment.inputs)),
+        validation_from=None
+        if experiment.validation_from is None
+        else experiment.validation_from - since,
     )
-    return next(same, None)
+
+
+def _group_plots(entries: Iterable[tuple[SignalTrace, _Compared[T]]]) -> list[_Plot[T]]:
+    """Group signals: equal samples are one signal; the same number and unit are one plot."""
+    plots: dict[tuple[int, str], _Plot[T]] = {}
+    for signal, entry in entries:
+        for other, sharing in (pair for plot in plots.values() for pair in plot):
+            if _has_same_samples(signal, other):
+                sharing.append(entry)
+                break
+        else:
+            plots.setdefault((entry.number, signal.unit), []).append((signal, [entry]))
+    return list(plots.values())
+
+
+def _has_same_samples(signal: SignalTrace, other: SignalTrace) -> bool:
+    return np.array_equal(signal.times, other.times) and np.array_equal(
+        signal.values, other.values, equal_nan=True
+    )
+
+
+def _join_names(plot: _Plot[T]) -> str:
+    return " / ".join(dict.fromkeys(signal.name for signal, _ in plot))
+
+
+def _compare_outputs(
+    plot: _Plot[OutputTraces], number: int, window: tuple[float | None, float | None]
+) -> Iterator[dict[str, Any]]:
+    """Draw the measured signals of a plot, and over each the outputs of its results."""
+    upper, lower, in_legend = f"y{2 * number + 1}", f"y{2 * number + 2}", number == 0
+    for signal, sharing in plot:
+        span = window_slice(signal.times, *window)
+        measured = _output_traces(sharing[0].signal, span, upper, in_legend)[0]
+        yield measured if len(plot) == 1 else _name_measured(measured, signal, sharing)
+        for one in sharing:
+            look = {"legendgroup": one.name, "line": theme.series_style(one.place)}
+            hover = f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{one.name}</extra>"
+            identified = _output_traces(one.signal, span, upper, in_legend)[-1]
+            yield {**identified, **look, "name": one.name, "hovertemplate": hover}
+            yield {
+                **_residual_trace(one.signal, span, lower, False),
+                **look,
+                "name": one.name,
+                "hovertemplate": hover.replace("</extra>", ", residual</extra>"),
+            }
+
+
+def _name_measured(
+    trace: dict[str, Any], signal: SignalTrace, sharing: Sequence[_Compared[OutputTraces]]
+) -> dict[str, Any]:
+    """Name a measured signal by the first of its results, and give it a shade of its colour."""
+    first, name = sharing[0], f"measured, {sharing[0].name}"
+    shade = theme.fade(theme.series_style(first.place)["color"], 0.45)
+    kind = "marker" if trace["mode"] == "markers" else "line"
+    hover = f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{name}</extra>"
+    return {
+        **trace,
+        "name": name,
+        "legendgroup": first.name,
+        kind: {**trace[kind], "color": shade},
+        "hovertemplate": hover,
+    }
+
+
+def _compare_inputs(
+    plot: _Plot[SignalTrace], axis: str, window: tuple[float | None, float | None]
+) -> Iterator[dict[str, Any]]:
+    for signal, sharing in plot:
+        span, first = window_slice(signal.times, *window), sharing[0]
+        colour = theme.GREY if len(plot) == 1 else theme.series_style(first.place)["color"]
+        line = signal_line(signal, span, axis, colour, legend=False)
+        if len(plot) > 1:
+            line |= {"name": f"{signal.name}, {first.name}", "legendgroup": first.name}
+            line["hovertemplate"] = line["hovertemplate"].replace(
+                "</extra>", f", {first.name}</extra>"
+            )
+        yield line
 
 
 def response_height(n_outputs: int, n_inputs: int) -> int:

@@ -6,14 +6,23 @@ from datetime import UTC
 import pytest
 
 from service.core.states import JobState
+from service.items.deletion import delete_item
 from service.queue.leases import JobProgress, LeaseQueue
 from service.queue.queue_state import read_queue_state
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
-from service.storage.errors import KeyReused, RowConflict, RowNotFound, UnstorableValue
-from service.storage.tables import Project
-from tests.stored import claim, claimed, job_of, submit
+from service.repositories.results import list_results
+from service.repositories.search import ListFilter
+from service.storage.errors import (
+    InvalidCursor,
+    KeyReused,
+    RowConflict,
+    RowNotFound,
+    UnstorableValue,
+)
+from service.storage.tables import Project, Run
+from tests.stored import claim, claimed, job_of, record_outcomes, runs_of, submit
 
 NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
 
@@ -106,6 +115,98 @@ def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
         page = JobRepository(session).list_page(limit=2)
     assert len(page.items) == 2
     assert page.next is None
+
+
+def end_with_fit(database, name, *fits, cell=None):
+    """A job whose runs ended with these fits (%); a better fit has a smaller RMS."""
+    ended, runs = claimed(database, n_runs=len(fits), name=name)
+    record_outcomes(
+        database,
+        ended.lease,
+        *(
+            RunOutcome(
+                run_id=run,
+                state=JobState.SUCCEEDED,
+                best_rms=None if fit is None else 100.0 - fit,
+                fit_estimation=fit,
+            )
+            for run, fit in zip(runs, fits, strict=True)
+        ),
+    )
+    with database.write_session() as session:
+        if cell is not None:
+            session.get_one(Run, runs[0]).cell = cell
+        LeaseQueue(session).finish_job(ended.lease, JobState.SUCCEEDED)
+    return ended.job.id
+
+
+def list_in_order(database, order, **options):
+    """The names of all pages of two jobs in an order."""
+    names, cursor = [], None
+    while True:
+        with database.read_session() as session:
+            page = JobRepository(session).list_page(cursor=cursor, limit=2, order=order, **options)
+        names += [job.name for job in page.items]
+        cursor = page.next
+        if cursor is None:
+            return names
+
+
+def test_jobs_are_sorted_over_all_pages_and_those_without_a_value_come_last(database):
+    end_with_fit(database, "c", 90.0)
+    end_with_fit(database, "B", 70.0, 95.0)  # its best run counts
+    end_with_fit(database, "a", None)
+    end_with_fit(database, "d", 90.0)
+    end_with_fit(database, "batch", 99.0, cell={"/datasets": ["ds_1"]})
+    submit(database, "e")
+    assert list_in_order(database, "fit") == ["B", "d", "c", "e", "batch", "a"]
+    assert list_in_order(database, "worst-fit") == ["d", "c", "B", "e", "batch", "a"]
+    assert list_in_order(database, "rms") == ["B", "d", "c", "e", "batch", "a"]
+    assert list_in_order(database, "name") == ["a", "B", "batch", "c", "d", "e"]
+    assert list_in_order(database, "oldest") == ["c", "B", "a", "d", "batch", "e"]
+    assert list_in_order(database, "fit", chosen=ListFilter(name="B")) == ["B", "batch"]
+    queued = list_in_order(database, "name", states=[JobState.QUEUED])
+    assert queued == ["e"]
+
+
+def test_the_fit_of_a_job_is_that_of_the_best_run_that_is_left(database):
+    job = end_with_fit(database, "two", 90.0, 95.0)
+    assert job_of(database, job).fit_estimation == 95.0
+    best = runs_of(database, job)[1].id
+    with database.write_session() as session:
+        delete_item(session, "run", best)
+    assert (job_of(database, job).fit_estimation, job_of(database, job).best_rms) == (90.0, 10.0)
+
+
+@pytest.mark.parametrize("cursor", ["job_0", "nothing", "job_0:7"])
+def test_a_cursor_of_a_sorted_list_is_a_job(database, cursor):
+    submit(database)
+    with pytest.raises(InvalidCursor), database.read_session() as session:
+        JobRepository(session).list_page(cursor=cursor, order="fit")
+
+
+def test_results_of_all_jobs_follow_each_other_page_by_page(database):
+    for name, fits in (("a", (90.0,)), ("b", (80.0, 85.0, 83.0)), ("c", (None,)), ("d", (70.0,))):
+        end_with_fit(database, name, *fits)
+    submit(database, "waits")
+
+    def walk(**options):
+        found, cursor = [], None
+        for _ in range(9):
+            with database.read_session() as session:
+                page = list_results(session, cursor=cursor, limit=2, **options)
+            found += [(row.job.name, row.number) for row in page.items]
+            cursor = page.next
+            if cursor is None:
+                return found
+        raise AssertionError(found)
+
+    assert walk() == [("d", 0), ("c", 0), ("b", 0), ("b", 1), ("b", 2), ("a", 0)]
+    assert walk(only_best=True) == [("d", 0), ("c", 0), ("b", 1), ("a", 0)]
+    assert walk(chosen=ListFilter(name="b")) == [("b", 0), ("b", 1), ("b", 2)]
+    for cursor in ("job_0:1", "x", "job_0:", "job_0:-1"):
+        with pytest.raises(InvalidCursor), database.read_session() as session:
+            list_results(session, cursor=cursor)
 
 
 def test_jobs_are_listed_and_counted_by_state(database):

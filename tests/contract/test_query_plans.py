@@ -22,7 +22,13 @@ from service.items.items import lock_item
 from service.items.schemas import EditIn
 from service.queue import run_writes
 from service.queue.admission import Admission, count_unfinished
-from service.queue.leases import Claim, JobProgress, LeaseOwners, LeaseQueue
+from service.queue.leases import (
+    Claim,
+    JobProgress,
+    LeaseOwners,
+    LeaseQueue,
+    count_held_parcels,
+)
 from service.queue.notifications import read_queue_status
 from service.queue.packed_results import LAYOUTS
 from service.queue.previous_attempts import (
@@ -37,6 +43,9 @@ from service.repositories.datasets import DatasetRepository
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.lineage import LineageRepository
+from service.repositories.outcomes import read_parameters
+from service.repositories.references import ReferenceRepository
+from service.repositories.results import list_results
 from service.repositories.runs import RunRepository
 from service.repositories.search import ListFilter, add_terms
 from service.repositories.summaries import (
@@ -262,6 +271,23 @@ def search_lists(at: Filled) -> None:
             assert len(datasets.list_page(chosen=part, limit=20).items) == 20
 
 
+def show_results(at: Filled) -> None:
+    """A sorted list reads an index of all jobs of the project, but no row that it does not show."""
+    with at[0].read_session() as session:
+        jobs = JobRepository(session)
+        for order in ("fit", "rms"):
+            page = jobs.list_page(order=order, limit=20)
+            assert len(jobs.list_page(order=order, limit=20, cursor=page.next).items) == 20
+        rows = list_results(session, limit=5).items
+        list_results(session, limit=5, cursor=f"{LARGE}:7", only_best=True)
+        read_parameters(session, [row.run for row in rows])
+        lineage = LineageRepository(session)
+        lineage.list_links_to_children(["ds_1"], 17)
+        lineage.list_links_to_parents(["job_1"], 17)
+        ReferenceRepository(session).list_of_jobs([LARGE, at[1].job.id])
+        count_held_parcels(session)
+
+
 def delete_what_is_old(at: Filled) -> None:
     limit = datetime(2020, 1, 1, tzinfo=UTC)
     with at[0].write_session() as session:
@@ -470,6 +496,7 @@ USE_CASES: dict[Callable[[Filled], None], tuple[str, ...]] = {
     submit: ("ix_jobs_open",),
     list_failed: ("ix_jobs_by_state",),
     search_lists: ("ix_jobs_named", "ix_datasets_named"),
+    show_results: ("ix_jobs_sorted",),
     delete_what_is_old: ("ix_jobs_ended", "ix_jobs_deleted", "ix_lineage_edges_parent"),
     count_jobs: ("ix_jobs_by_state",),
     show_job: ("ix_runs_job_id_best_rms", "ix_events_told"),

@@ -64,6 +64,7 @@ class Filled:
     failed: str
     queued: str
     sweep: str
+    sweep_run: str
     lease: Claim
 
 
@@ -100,6 +101,8 @@ def _fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     run = _end(database, store, finished, recording)
     sweep = _claimed(database, settings, _body(dataset, "three methods, four seeds", sweep=True))
     _end_sweep(database, sweep)
+    with database.write_session() as session:
+        sweep_run = _first(session, sweep)
     failed = _claimed(database, settings, _body(dataset, "a model that diverges"))
     with database.write_session() as session:
         reason = "the model diverges everywhere: no individual of 50 gave a finite output"
@@ -123,6 +126,7 @@ def _fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
         failed.job.id,
         queued,
         sweep.job.id,
+        sweep_run,
         running,
     )
 

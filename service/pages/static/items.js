@@ -38,7 +38,9 @@ async function save(form) {
   };
   const headers = { 'Content-Type': 'application/json', 'If-Match': form.dataset.etag };
   await ask(form.dataset.edit, { method: 'PATCH', headers, body: JSON.stringify(body) });
-  location.reload();
+  const { named } = form.dataset; // the address of an item that is found by its name
+  if (named) location.assign(`${named}${encodeURIComponent(name.value.trim())}`);
+  else location.reload();
 }
 
 /** Delete the item; once its dependents were shown, with all of them. */

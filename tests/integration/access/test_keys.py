@@ -95,6 +95,8 @@ def test_a_scope_includes_the_lower_ones_and_no_higher_one(guarded: Guarded) -> 
         ("DELETE", "/v1/jobs/job_0", {}, 1),
         ("GET", "/v1/audit", {}, 2),
         ("GET", "/keys", {}, 2),
+        ("GET", "/health", {}, 0),
+        ("GET", "/settings", {}, 2),
         ("POST", "/keys", {"data": {"name": "a", "scope": "read"}}, 2),
     )
     for method, path, body, needed in requests:

@@ -179,7 +179,10 @@ def test_lineage_names_what_was_deleted(own: TestClient) -> None:
     lineage = own.get(f"/v1/datasets/{data}/lineage").json()
     assert [(one["parent"], one["child"]) for one in lineage["edges"]] == [(data, job)]
     assert [(one["id"], one["name"]) for one in lineage["deleted"]] == [(job, "gone")]
-    assert job in own.get(f"/datasets/{data}").text
+    page = own.get(f"/datasets/{data}").text
+    assert ">job, deleted</text>" in page
+    assert "<title>gone</title>" in page
+    assert f"/jobs/{job}" not in page  # there is nothing to open
 
 
 def test_an_open_job_must_be_cancelled_first(server: TestClient, dataset: str) -> None:

@@ -21,7 +21,15 @@ from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Event, Job, Project, Run, SearchTerm, StoredSummary
-from tests.stored import claim, claimed, new_dataset, parcels_of, record_success, submit
+from tests.stored import (
+    claim,
+    claimed,
+    new_dataset,
+    parcels_of,
+    record_outcomes,
+    record_success,
+    submit,
+)
 
 HEAD = migrate.find_head_revision()
 VERSIONS = Path(migrations.__file__).parent / "versions"
@@ -77,6 +85,28 @@ def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back
     migrate.upgrade_database(empty_database)
     assert [rows(empty_database, kind) for kind in kinds] == before
     assert rows(empty_database, StoredSummary) == []  # the next reader computes it again
+
+
+def test_the_fit_of_ended_jobs_is_taken_from_their_best_runs(empty_database):
+    database = empty_database
+    migrate.upgrade_database(database)
+    jobs = []
+    for cells in ({"/seed": 1}, {"/datasets": ["ds_1"]}):
+        ended, runs = claimed(database, n_runs=2)
+        for run, rms in zip(runs, (0.5, 0.4), strict=True):
+            outcome = RunOutcome(
+                run_id=run, state=JobState.SUCCEEDED, best_rms=rms, fit_estimation=100 - rms
+            )
+            record_outcomes(database, ended.lease, outcome)
+        with database.write_session() as session:
+            session.get_one(Run, runs[0]).cell = cells
+            LeaseQueue(session).finish_job(ended.lease, JobState.SUCCEEDED)
+        jobs.append(ended.job.id)
+    migrate.downgrade_database(database, "0006")
+    migrate.upgrade_database(database)
+    with database.read_session() as session:
+        fits = [session.get_one(Job, job).fit_estimation for job in jobs]
+    assert fits == [99.6, None]  # a batch has none
 
 
 def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):

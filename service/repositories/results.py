@@ -1,0 +1,140 @@
+"""Results of runs of any jobs, page by page: the latest job first, its runs in their order."""
+
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from typing import Any, NamedTuple
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session
+
+from service.core.states import JobState
+from service.repositories.jobs import JobRepository
+from service.repositories.outcomes import select_best_run
+from service.repositories.search import NO_FILTER, ListFilter
+from service.storage.columns import Document
+from service.storage.errors import InvalidCursor, RowNotFound
+from service.storage.statements import RowPage
+from service.storage.tables import Job, Run
+
+JOBS_AT_ONCE = 100
+MAX_JOBS = 2000
+"""Most jobs that one page looks at; the next page goes on."""
+
+
+class ResultRow(NamedTuple):
+    """A successful run with the entries ``parameters`` of its result."""
+
+    job: Job
+    run: str
+    number: int
+    labels: Document
+    cell: Document
+    fit_estimation: float | None
+    finished_at: datetime | None
+    parameters: Sequence[Document]
+
+
+_COLUMNS = (
+    Run.job_id,
+    Run.id,
+    Run.number,
+    Run.labels,
+    Run.cell,
+    Run.fit_estimation,
+    Run.finished_at,
+    Run.result.expression["parameters"],
+)
+
+
+def list_results(
+    session: Session,
+    *,
+    cursor: str | None = None,
+    limit: int = 100,
+    chosen: ListFilter = NO_FILTER,
+    only_best: bool = False,
+) -> RowPage[ResultRow]:
+    """List the successful runs of the jobs that meet a filter.
+
+    Parameters
+    ----------
+    cursor : str, optional
+        Job and number of the last run of the previous page.
+    only_best : bool
+        Whether one run stands for each job, the best by RMS.
+    """
+    rows: list[ResultRow] = []
+    job_cursor, last = None, -1
+    if cursor is not None:
+        job, last = _read_cursor(session, cursor)
+        job_cursor = job.id
+        if not only_best:
+            rows += _list_runs(session, job, last, limit + 1)
+    for _ in range(MAX_JOBS // JOBS_AT_ONCE):
+        if len(rows) > limit:
+            break
+        page = JobRepository(session).list_page(
+            cursor=job_cursor, limit=JOBS_AT_ONCE, chosen=chosen
+        )
+        rows += _list_runs_of_jobs(session, page.items, limit + 1 - len(rows), only_best=only_best)
+        if page.next is None:
+            return _make_page(rows, limit, None)
+        job_cursor = page.next
+    return _make_page(rows, limit, f"{job_cursor}:{_AFTER_ALL}")
+
+
+_AFTER_ALL = 2**31 - 1
+"""A number that no run reaches: the next page begins with the next job."""
+
+
+def _make_page(rows: list[ResultRow], limit: int, following: str | None) -> RowPage[ResultRow]:
+    if len(rows) <= limit:
+        return RowPage(tuple(rows), following)
+    last = rows[limit - 1]
+    return RowPage(tuple(rows[:limit]), f"{last.job.id}:{last.number}")
+
+
+def _read_cursor(session: Session, cursor: str) -> tuple[Job, int]:
+    name, _, number = cursor.partition(":")
+    if not number.isascii() or not number.isdecimal() or int(number) > _AFTER_ALL:
+        raise InvalidCursor(cursor)
+    try:
+        return JobRepository(session).get(name), int(number)
+    except RowNotFound:
+        raise InvalidCursor(cursor) from None
+
+
+def _list_runs_of_jobs(
+    session: Session, jobs: Sequence[Job], room: int, *, only_best: bool
+) -> list[ResultRow]:
+    """List runs of these jobs. One query reads all that stand for their job alone."""
+    alone = [job for job in jobs if job.n_done and (only_best or job.n_runs == 1)]
+    singles = [job.id for job in alone if job.n_runs == 1]
+    best = [session.scalar(select_best_run(job.id)) for job in alone if job.n_runs > 1]
+    condition = (Run.job_id.in_(singles) & (Run.number == 0)) | Run.id.in_(filter(None, best))
+    by_id = {job.id: job for job in jobs}
+    found = _read_rows(session, _select_succeeded().where(condition), by_id)
+    of_job = {row.job.id: [row] for row in found}
+    rows: list[ResultRow] = []
+    for job in jobs:
+        if len(rows) >= room:
+            break
+        if job.n_runs > 1 and job.n_done and not only_best:
+            rows += _list_runs(session, job, -1, room - len(rows))
+        else:
+            rows += of_job.get(job.id, [])
+    return rows
+
+
+def _list_runs(session: Session, job: Job, last: int, limit: int) -> list[ResultRow]:
+    query = _select_succeeded().where(Run.job_id == job.id, Run.number > last)
+    return list(_read_rows(session, query.order_by(Run.number).limit(limit), {job.id: job}))
+
+
+def _select_succeeded() -> Select[Any]:
+    return select(*_COLUMNS).where(Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None))
+
+
+def _read_rows(session: Session, query: Select[Any], jobs: dict[str, Job]) -> Iterator[ResultRow]:
+    for job, run, number, labels, cell, fit, ended, parameters in session.execute(query):
+        yield ResultRow(jobs[job], run, number, labels, cell, fit, ended, parameters or [])
