@@ -61,6 +61,7 @@ def test_a_file_becomes_estimates_with_their_errors_without_a_mouse(
     press_tab_to(page, page.locator("#new > summary"))
     page.keyboard.press("Enter")
     page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
+    page.wait_for_function("() => !document.getElementById('job-form').inert")
     upload = page.get_by_label("or upload a recording")
     press_tab_to(page, upload)
     upload.set_input_files(recording(tmp_path / "step.csv"))  # the dialog is the system's
