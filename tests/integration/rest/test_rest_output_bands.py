@@ -81,7 +81,7 @@ def test_a_run_says_which_order_of_the_process_the_data_prefer(served: ServedRun
     assert [fit["is_open"] for fit in compared["fits"]] == [True, False]
     assert compared["delay_range"] == [compared["fits"][0]["delay"]] * 2
     page = served.server.get(f"/runs/{served.run}").text
-    assert '<table class="orders">' in page
+    assert '<table class="orders ' in page
     assert "ruled out" in page
 
 

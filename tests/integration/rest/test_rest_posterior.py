@@ -53,7 +53,7 @@ def test_the_corner_plot_comes_as_plotly_json_and_as_csv(served: ServedRun) -> N
 
 def test_the_page_of_its_job_has_a_table_and_a_place_for_the_plot(served: ServedRun) -> None:
     page = served.server.get(f"/jobs/{served.job}").text
-    assert '<table class="posterior">' in page
+    assert '<table class="posterior ' in page
     assert 'data-figure="posterior"' in page
 
 
