@@ -18,7 +18,9 @@ from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.hard_switching import warn_hard_switching
 from sysid.identification.input_hold import (
     describe_input_holds,
+    find_hold_doubts,
     list_input_holds,
+    mark_hold_dependent,
     refit_other_holds,
 )
 from sysid.identification.integration_step import explain_finer_step
@@ -31,7 +33,11 @@ from sysid.identification.process_order import (
 )
 from sysid.identification.result import Identification
 from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
-from sysid.identification.unstable_run import warn_unstable_run
+from sysid.identification.unstable_run import (
+    compare_one_step,
+    mark_prediction_dependent,
+    warn_misled_run,
+)
 from sysid.identification.validation import (
     mark_refuted,
     split_outputs,
@@ -141,6 +147,9 @@ def _build_identification(
         orders, spent = compare_orders(problem, theta, analysis.estimates, left, late)
         budget.spend(spent)
         analysis = replace(analysis, estimates=mark_order_dependent(analysis, orders))
+    doubts = find_hold_doubts(problem, holds, simulated, best.lowest_end.rms)
+    hold_marked = mark_hold_dependent(analysis.estimates, holds, doubts)
+    analysis = replace(analysis, estimates=hold_marked)
     posterior = None
     if has_posterior:
         others = [minimum.values for minimum in found.minima if minimum.is_compatible]
@@ -149,10 +158,17 @@ def _build_identification(
         budget.spend(posterior.evaluations)
     feedback = _check_feedback(problem, simulated, analysis)
     left, late = budget.count_left(), deadline.is_past_grace
-    unstable, spent = warn_unstable_run(
-        problem, theta, analysis, left, late, has_feedback=bool(feedback)
+    ahead, spent = compare_one_step(
+        problem,
+        theta,
+        analysis,
+        left,
+        late,
+        has_feedback=bool(feedback),
+        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
     )
     budget.spend(spent)
+    analysis = replace(analysis, estimates=mark_prediction_dependent(analysis.estimates, ahead))
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
@@ -185,7 +201,7 @@ def _build_identification(
             ),
             *describe_unequal_noise(problem, metrics.channels),
             *warn_unsettled(evidence),
-            *describe_input_holds(problem, holds, analysis.estimates, best.lowest_end.rms),
+            *describe_input_holds(problem, holds, doubts, analysis.estimates, best.lowest_end.rms),
             *describe_exchanges(
                 problem,
                 analysis.exchanges,
@@ -195,7 +211,7 @@ def _build_identification(
             *warn_still_validation(problem, metrics, validated),
             *warn_time_limit(any(end.is_cut_short for end in best.ends)),
             *feedback,
-            *unstable,
+            *warn_misled_run(analysis.estimates, ahead),
             *explain_finer_step(asked, problem, best.first, analysis.estimates),
             *warn_noise_model(problem, times, noise.is_complete),
             *filter(None, [noise.note]),

@@ -1,4 +1,10 @@
-"""Holds chosen by the data: what the estimate is if an input is read the other way."""
+"""Holds chosen by the data: what the estimate is if an input is read the other way.
+
+Read held, an input acts half a sample earlier than in straight lines. Mostly both fit equally, with
+two time lags. So a choice is in doubt in three cases. The other reading fits clearly better. Or an
+input in straight lines follows the residuals, as a command that a controller computes and holds.
+Or the samples beside each of its samples say nothing of it, so no line leads there.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -6,11 +12,14 @@ from math import log
 
 import numpy as np
 
+from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
 from sysid.identification.result import InputHold
 from sysid.kernels.reads import is_difference
+from sysid.residuals.feedback import find_commands
+from sysid.residuals.residual_tests import list_residual_series
 from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
@@ -18,6 +27,7 @@ from sysid.uncertainty.estimates import Estimate
 _NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
 _CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_TOLD = 3  # estimates in one sentence
+_MIN_ROUGH = 50  # samples: fewer may be rough by chance
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
 
 
@@ -70,8 +80,7 @@ def refit_other_holds(
         if hold.other is None or is_late() or (left is not None and left <= 0):
             compared.append(hold)
             continue
-        records = [_replace_hold(record, hold) for record in problem.records]
-        other = problem.rebuild(records=records, weights=problem.output_weights)
+        other = replace_holds(problem, [hold])
         end = refine_candidates(other, [start], left, is_late)[0]
         if end is not None:
             spent += end.evaluations
@@ -82,26 +91,88 @@ def refit_other_holds(
     return tuple(compared), spent
 
 
+def find_hold_doubts(
+    problem: Problem, holds: Sequence[InputHold], simulated: FloatArray, rms: float
+) -> list[str]:
+    """Find for each hold, as a sentence, why the other reading is as likely; empty if it is not.
+
+    `simulated` (n,) and `rms` are those with the chosen readings.
+    """
+    open_holds = [hold.chosen == "first" and hold.rms_other is not None for hold in holds]
+    commands = find_commands(list_residual_series(problem, simulated)) if any(open_holds) else set()
+    doubts = []
+    for hold, is_open in zip(holds, open_holds, strict=True):
+        evidence, doubt = _compute_evidence(hold, problem.n_scored, rms), ""
+        if evidence > _CLEAR_EVIDENCE:
+            doubt = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
+        elif is_open and evidence >= -_CLEAR_EVIDENCE:
+            if hold.input in commands:
+                doubt = "The input follows the residuals as a command does, which is held"
+            elif _is_rough(hold.input, problem.records):
+                doubt = "Its samples do not follow each other, so hardly in straight lines"
+        doubts.append(doubt)
+    return doubts
+
+
+def mark_hold_dependent(
+    estimates: tuple[Estimate, ...], holds: Sequence[InputHold], doubts: Sequence[str]
+) -> tuple[Estimate, ...]:
+    """Mark identified values whose interval does not hold that of a reading as likely.
+
+    Their standard errors assume the chosen reading.
+    """
+    for hold, doubt in zip(holds, doubts, strict=True):
+        if doubt:
+            estimates = tuple(_mark(estimate, hold) for estimate in estimates)
+    return estimates
+
+
+def replace_holds(problem: Problem, holds: Sequence[InputHold]) -> Problem:
+    """Replace each of these holds that the data chose by the other one."""
+    records = list(problem.records)
+    for hold in holds:
+        records = [_replace_hold(record, hold) for record in records]
+    return problem.rebuild(records=records, weights=problem.output_weights)
+
+
+def write_hold(hold: InputHold) -> str:
+    """Write the option that sets the reading that was not chosen."""
+    return f"hold: {{{hold.input}: {hold.other}}}"
+
+
+def _mark(estimate: Estimate, hold: InputHold) -> Estimate:
+    other = (hold.estimates_other or {}).get(estimate.name)
+    interval = estimate.interval95
+    if other is None or interval is None or estimate.status != "identified":
+        return estimate
+    if interval[0] <= other <= interval[1]:
+        return estimate
+    value = f"{plain_estimate(other, estimate.stderr)}{plain_unit(estimate.unit)}"
+    reason = f"it is {value} if {hold.input} is read {_READINGS[str(hold.other)]}"
+    return replace(estimate, status="hold-dependent", reason=reason)
+
+
 def describe_input_holds(
-    problem: Problem, holds: Sequence[InputHold], estimates: Sequence[Estimate], rms: float
+    problem: Problem,
+    holds: Sequence[InputHold],
+    doubts: Sequence[str],
+    estimates: Sequence[Estimate],
+    rms: float,
 ) -> list[str]:
     """Describe holds chosen by the data where the choice moves an estimate, or fits worse.
 
-    That an input is read as straight lines is told only if held it fits better.
+    That an input is read as straight lines is told only where that is in doubt.
     """
     messages = []
-    for hold in holds:
+    for hold, doubt in zip(holds, doubts, strict=True):
         moved = _describe_moved_estimates(hold, estimates)
-        evidence = _compute_evidence(hold, problem.n_scored, rms)
-        is_worse = evidence > _CLEAR_EVIDENCE
-        if is_worse or (moved and hold.chosen == "zero"):
-            fits = (
-                f". That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}" if is_worse else ""
-            )
-            other = f"{_READINGS[str(hold.other)]} (hold: {{{hold.input}: {hold.other}}})"
+        is_worse = _compute_evidence(hold, problem.n_scored, rms) > _CLEAR_EVIDENCE
+        if is_worse or (moved and (doubt or hold.chosen == "zero")):
+            why = f". {doubt}" if doubt else ""
+            other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
             messages.append(
                 f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. "
-                f"Read {other} it would give {moved or 'the same estimates'}{fits}"
+                f"Read {other} it would give {moved or 'the same estimates'}{why}"
             )
         if hold.chosen == "zero" and hold.other is not None:
             messages += _describe_uncertain_jumps(hold.input, problem.records)
@@ -126,6 +197,16 @@ def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:
     if not hold.rms_other or not rms > 0:
         return 0.0
     return 2 * samples * log(rms / hold.rms_other)
+
+
+def _is_rough(name: str, records: Sequence[Record]) -> bool:
+    """Whether the mean of an input tells more of its samples than their two neighbours do."""
+    for channel in _find_channels(name, records):
+        values = channel.values
+        between = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+        if values.size > _MIN_ROUGH and np.mean(np.square(between)) >= np.var(values):
+            return True
+    return False
 
 
 def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]:

@@ -10,17 +10,24 @@ So if residuals are not white, and an input follows them or the free run is unst
 fitted one step ahead as well. These estimates are told if the free run is unstable there too, or if
 their residuals are white. A free run counts as unstable if the effect of some start is ten times as
 large in the last quarter of an experiment as in its first half. A double integrator reaches three.
+
+A value is `prediction-dependent` if its 95 % interval does not hold that of one step ahead. Such an
+interval is often far too narrow: disturbances grow, and so do the sensitivities.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
 from sysid.identification.fixed_start import compute_start_slopes, list_fixed_starts
+from sysid.identification.input_hold import replace_holds, write_hold
 from sysid.identification.minima import scan_parameters
+from sysid.identification.result import InputHold
 from sysid.identification.warnings import find_delay_parameters
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.series import is_coloured, iterate_parts
@@ -34,7 +41,18 @@ _MIN_GROWTH = 10.0
 _MOST_SIMULATIONS = 3000
 
 
-def warn_unstable_run(
+class OneStepComparison(NamedTuple):
+    """Estimates of one step ahead where disturbances mislead a free run, and what shows that.
+
+    `options` are those that give these estimates.
+    """
+
+    cause: str
+    estimates: tuple[Estimate, ...]
+    options: tuple[str, ...]
+
+
+def compare_one_step(
     problem: Problem,
     theta: FloatArray,
     analysis: Analysis,
@@ -42,25 +60,28 @@ def warn_unstable_run(
     is_late: Callable[[], bool],
     *,
     has_feedback: bool,
-) -> tuple[list[str], int]:
-    """Warn about a free run (D,) that disturbances mislead, with estimates of one step ahead.
+    doubtful: Sequence[InputHold] = (),
+) -> tuple[OneStepComparison | None, int]:
+    """Estimate one step ahead if disturbances mislead a free run (D,); None if they do not.
 
-    Returns the simulations too.
+    `doubtful` inputs are read the other way, as they are likelier to be. Returns the simulations
+    too.
     """
     if not _may_mislead(problem, analysis) or is_late():
-        return [], 0
+        return None, 0
     most = _MOST_SIMULATIONS if max_simulations is None else max_simulations
     if most < _MOST_SIMULATIONS or not (
         has_feedback or compute_growth(problem, theta) >= _MIN_GROWTH
     ):
-        return [], 0
+        return None, 0
     loss = replace(problem.loss, noise_model="white")
-    ahead = problem.rebuild(
+    read = replace_holds(problem, doubtful) if doubtful else problem
+    ahead = read.rebuild(
         prediction="one-step", loss=loss, weights=problem.output_weights, deviations=None
     )
     (end,) = refine_candidates(ahead, [theta], most, is_late)
     if end is None:
-        return [], 0
+        return None, 0
     names = find_delay_parameters(ahead)
     delays = [d for d, name in enumerate(ahead.free_names) if name in names]
     scan = scan_parameters(ahead, end, delays, most - end.evaluations, is_late)
@@ -73,12 +94,46 @@ def warn_unstable_run(
     elif _are_white(ahead, predicted):
         cause = "one step ahead the residuals are white: the noise acts inside the plant"
     else:
-        return [], spent
-    told = _describe(predicted.estimates, {one.name: one for one in analysis.estimates})
+        return None, spent
+    options = "prediction: one-step", *map(write_hold, doubtful)
+    return OneStepComparison(cause, predicted.estimates, options), spent
+
+
+def mark_prediction_dependent(
+    estimates: tuple[Estimate, ...], comparison: OneStepComparison | None
+) -> tuple[Estimate, ...]:
+    """Mark identified values that the estimates of one step ahead contradict."""
+    ahead = {one.name: one for one in comparison.estimates} if comparison else {}
+    return tuple(
+        replace(
+            estimate,
+            status="prediction-dependent",
+            reason=f"it is {_write_value(ahead[estimate.name])} predicted one step ahead",
+        )
+        if estimate.name in ahead
+        and estimate.status in ("identified", "hold-dependent")
+        and estimate.interval95 is not None
+        and not estimate.interval95[0] <= ahead[estimate.name].value <= estimate.interval95[1]
+        else estimate
+        for estimate in estimates
+    )
+
+
+def _write_value(estimate: Estimate) -> str:
+    return f"{plain_estimate(estimate.value, estimate.stderr)}{plain_unit(estimate.unit)}"
+
+
+def warn_misled_run(
+    estimates: Sequence[Estimate], comparison: OneStepComparison | None
+) -> list[str]:
+    """Warn about a free run that disturbances mislead, with estimates of one step ahead."""
+    if comparison is None:
+        return []
+    told = _describe(comparison.estimates, {one.name: one for one in estimates})
     return [
-        f"{cause}. So a free run attributes disturbances to the parameters. Predicted one step "
-        f"ahead they are {told}. Use prediction: one-step."
-    ], spent
+        f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
+        f"one step ahead they are {told}. Use {' and '.join(comparison.options)}."
+    ]
 
 
 def _may_mislead(problem: Problem, analysis: Analysis) -> bool:

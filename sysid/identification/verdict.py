@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, Literal, TypeGuard
 
+from sysid.core.text import plain_estimate, plain_unit
+
 if TYPE_CHECKING:  # the client's types name `Trust`, and load no numerics
     from sysid.identification.result import OrderComparison, SearchEvidence
     from sysid.residuals.residual_tests import ResidualTest
@@ -21,6 +23,7 @@ _SEVERITIES: tuple[Severity, ...] = ("serious", "caution", "note")
 _UNLIKELY = 1e-3  # probability of such residuals under a true model
 _SEPARABLE_STDERRS = 2.0  # a smaller time lag is not distinguishable from 0
 _EXPLAINED = 99.999  # %: what is left are errors of the solver
+_DEPENDENT = "order-dependent", "prediction-dependent", "hold-dependent"
 _NOTABLE_LOSS = 20.0  # percentage points of fit, from estimation to validation
 
 
@@ -107,6 +110,15 @@ class Evidence:
         """List the free parameters that have one of these statuses."""
         return [estimate.name for estimate in self.free if estimate.status in statuses]
 
+    def tell_reasons(self, status: str) -> str:
+        """Tell each free parameter of this status with its value, and the reason, as sentences."""
+        return " ".join(
+            f"{one.name} = {plain_estimate(one.value, one.stderr)}{plain_unit(one.unit)}"
+            f"{f'; {one.reason}' if one.reason else ''}."
+            for one in self.free
+            if one.status == status
+        )
+
     def has_failed(self, kind: str) -> bool:
         """Whether a residual test of this kind failed clearly: true models seldom do so."""
         return any(
@@ -180,6 +192,29 @@ def _find_refuted(evidence: Evidence) -> Iterator[Reason]:
         )
 
 
+def _find_misled_run(evidence: Evidence) -> Iterator[Reason]:
+    """Find values that disturbances mislead, by those of one step ahead."""
+    if names := evidence.list_names("prediction-dependent"):
+        yield Reason(
+            "serious",
+            f"{_join(names)} {'differ' if len(names) > 1 else 'differs'} one step ahead",
+            "A free run attributes disturbances to the parameters. "
+            f"{evidence.tell_reasons('prediction-dependent')} Use prediction: one-step.",
+        )
+
+
+def _find_other_hold(evidence: Evidence) -> Iterator[Reason]:
+    """Find values that depend on how an input moves between its samples, which is in doubt."""
+    if names := evidence.list_names("hold-dependent"):
+        depend = "depend" if len(names) > 1 else "depends"
+        yield Reason(
+            "caution",
+            f"{_join(names)} {depend} on how an input is read between its samples",
+            f"{evidence.tell_reasons('hold-dependent')} Say how the input moves between its "
+            "samples: a warning names the option.",
+        )
+
+
 def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
     if _is_number(evidence.fit_percent) and evidence.fit_percent <= 0:
         yield Reason(
@@ -192,7 +227,7 @@ def _find_no_fit(evidence: Evidence) -> Iterator[Reason]:
 
 def _find_undetermined(evidence: Evidence) -> Iterator[Reason]:
     """Find parameters that the data do not determine; serious if they determine none."""
-    known = evidence.list_names("identified", "not settled", "not validated", "order-dependent")
+    known = evidence.list_names("identified", "not settled", "not validated", *_DEPENDENT)
     severity: Severity = "caution" if known else "serious"
     if names := evidence.list_names("ambiguous"):
         yield Reason(
@@ -314,10 +349,12 @@ _FINDERS: tuple[Callable[[Evidence], Iterator[Reason]], ...] = (
     _find_invalid,
     _find_unsettled,
     _find_no_fit,
+    _find_misled_run,
     _find_refuted,
     _find_bounds,
     _find_undetermined,
     _find_other_order,
+    _find_other_hold,
     _find_missing_dynamics,
     _find_insignificant_delays,
 )

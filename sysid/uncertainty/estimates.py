@@ -13,6 +13,8 @@ EstimateStatus = Literal[
     "not settled",
     "not validated",
     "order-dependent",
+    "prediction-dependent",
+    "hold-dependent",
     "ambiguous",
     "group",
     "at bound",

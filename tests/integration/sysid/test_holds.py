@@ -99,6 +99,55 @@ def test_a_reading_that_fits_worse_than_the_other_is_told() -> None:
     found = fitted(moving_test())
     assert found.input_holds[0].chosen == "first"
     assert any("(hold={'u': 'zero'})" in one and "fits better" in one for one in found.warnings)
+    assert found["L"].status == "hold-dependent"
+    assert "if u is read held" in found["L"].reason
+    assert found.verdict.text.endswith("on how an input is read between its samples")
+
+
+def run_plant(seed: int, gain: float) -> Recording:
+    """K = 1.5, T = 8 s, L = 3 s, in a loop of this gain; a held reference moves it."""
+    random, lag = np.random.default_rng(seed), 6
+    decay = np.exp(-PERIOD / 8)
+    reference = np.repeat(random.uniform(-1, 1, 20), 20)
+    x, y, u = np.zeros(401), np.zeros(400), np.zeros(400)
+    for k in range(400):
+        y[k] = x[k] + 0.02 * random.standard_normal()
+        u[k] = reference[k] - gain * y[k]
+        x[k + 1] = decay * x[k] + (1 - decay) * 1.5 * (u[k - lag] if k >= lag else 0.0)
+    times = PERIOD * np.arange(400)
+    return Recording((Channel("u", times, u, "V"), Channel("y", times, y, "bar")))
+
+
+def test_the_command_of_a_loop_may_be_held_and_the_lag_depends_on_it() -> None:
+    found = fitted(run_plant(1, 0.8))
+    (hold,) = found.input_holds
+    assert (hold.chosen, found["L"].status) == ("first", "hold-dependent")
+    assert any("as a command does" in one for one in found.warnings)
+    assert found.verdict.trust == "limited"
+    held = fitted(run_plant(1, 0.8), {"u": "zero"})
+    assert held["L"].value == pytest.approx(3.0, abs=0.1)
+    assert held["L"].status == "identified"
+    assert held.verdict.text == "trustworthy"
+
+
+def test_a_new_level_at_every_sample_is_no_line() -> None:
+    moving = moving_test()
+    u, y = (moving.channel(name) for name in "uy")
+    noisy = y.values + 0.1 * np.random.default_rng(4).standard_normal(200)
+    found = fitted(Recording((u, Channel("y", y.times, noisy, "bar"))))
+    assert found["L"].status == "hold-dependent"
+    assert any("do not follow each other" in one for one in found.warnings)
+
+
+def test_a_smooth_input_of_an_open_loop_is_read_as_lines_without_a_word() -> None:
+    times = PERIOD * np.arange(400)
+    u, slow = np.sin(0.15 * times), 1 / (1 + 0.15j * 8) * np.exp(-0.15j * LAG)
+    y = 1.5 * np.imag(slow * np.exp(0.15j * times))
+    y += 0.02 * np.random.default_rng(1).standard_normal(400)
+    found = fitted(Recording((Channel("u", times, u, "V"), Channel("y", times, y, "bar"))))
+    assert found.input_holds[0].chosen == "first"
+    assert "hold-dependent" not in [one.status for one in found.estimates]
+    assert not any("hold=" in one for one in found.warnings)
 
 
 def test_jumps_between_irregular_samples_are_uncertain() -> None:

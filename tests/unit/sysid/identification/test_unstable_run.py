@@ -8,9 +8,15 @@ import pytest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.unstable_run import compute_growth
+from sysid.identification.result import Identification
+from sysid.identification.unstable_run import (
+    OneStepComparison,
+    compute_growth,
+    mark_prediction_dependent,
+)
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
 
 STEP, N = 0.2, 300
 PLANT: dict[str, Any] = {
@@ -47,21 +53,48 @@ def make_record(u: FloatArray, y: FloatArray) -> Record:
     return Record((Channel("u", times, u, "V", "zero"),), (Channel("y", times, y, "V"),))
 
 
-def list_told(record: Record) -> list[str]:
-    found = identify(PLANT, record)
+def list_told(found: Identification) -> list[str]:
     return [text for text in found.warnings if "Use prediction: one-step" in text]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_one_step_ahead_estimates_of_an_unstable_plant_are_told(seed: int) -> None:
     record = run_loop(seed, 0.03)
-    (told,) = list_told(record)
+    found = identify(PLANT, record)
+    (told,) = list_told(found)
     assert "the free run is unstable" in told
     ahead = identify(PLANT, record, prediction="one-step")
     for one in ahead.estimates:
         assert one.interval95 is not None
         assert one.interval95[0] <= TRUTH[one.name] <= one.interval95[1]
         assert f"{one.name} = {one.value:.4g} ± {one.stderr:.2g} 1/s" in told
+    a, (reason, *_) = ahead["a"], found.verdict.reasons
+    assert found["a"].status == "prediction-dependent"
+    assert f"a = {found['a'].value:.6f}" in reason.text
+    assert f"{a.value:.4f} ± {a.stderr:.4f} 1/s predicted one step ahead" in reason.text
+    assert found.verdict.text == "not trustworthy: a differs one step ahead"
+    assert ahead.verdict.text == "trustworthy"
+
+
+def estimate(value: float, stderr: float) -> Estimate:
+    interval = (value - 2 * stderr, value + 2 * stderr)
+    return Estimate("a", "1/s", value, -1.0, 1.0, stderr, interval, "identified")
+
+
+@pytest.mark.parametrize(
+    ("free", "ahead", "status"),
+    [
+        (estimate(0.17, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
+        (estimate(0.19, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
+        (estimate(0.17, 0.02), estimate(0.20, 0.01), "identified"),
+    ],
+)
+def test_only_a_value_outside_the_interval_of_the_free_run_contradicts_it(
+    free: Estimate, ahead: Estimate, status: str
+) -> None:
+    comparison = OneStepComparison("the free run is unstable", (ahead,), ())
+    assert mark_prediction_dependent((free,), comparison)[0].status == status
+    assert mark_prediction_dependent((free,), None) == (free,)
 
 
 def test_a_stable_plant_with_white_residuals_needs_no_other_prediction() -> None:
@@ -69,7 +102,7 @@ def test_a_stable_plant_with_white_residuals_needs_no_other_prediction() -> None
     u, x = np.repeat(random.normal(size=N // 10), 10), np.zeros(N)
     for k in range(1, N):
         x[k] = x[k - 1] + STEP * (-0.5 * x[k - 1] + u[k - 1])
-    assert not list_told(make_record(u, x + 0.02 * random.standard_normal(N)))
+    assert not list_told(identify(PLANT, make_record(u, x + 0.02 * random.standard_normal(N))))
 
 
 @pytest.mark.parametrize(("a", "least", "most"), [(-0.3, 0, 1), (0.0, 1, 1.01), (0.25, 1e3, 1e8)])

@@ -50,6 +50,7 @@ def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
             "the data determine K and T only in combination",
         ),
         ({"estimates": [estimate("K", "unidentifiable")]}, "the data do not determine K"),
+        ({"estimates": [estimate("K", "prediction-dependent")]}, "K differs one step ahead"),
         (
             {"estimates": [estimate("K"), estimate("L", "at bound")], "tests": [residual_test()]},
             "L lies at its bound",
@@ -81,6 +82,14 @@ def test_what_is_serious_is_the_verdict(evidence: dict[str, Any], text: str) -> 
             "the data determine a and b only in combination",
         ),
         ({"estimates": [estimate("K"), estimate("L", value=0.015)]}, "L may be 0"),
+        (
+            {"estimates": [estimate("K", "hold-dependent"), estimate("T", "group")]},
+            "the data determine T only in combination",
+        ),
+        (
+            {"estimates": [estimate("K"), estimate("L", "hold-dependent")]},
+            "L depends on how an input is read between its samples",
+        ),
     ],
 )
 def test_a_condition_follows_trustworthy(evidence: dict[str, Any], text: str) -> None:
