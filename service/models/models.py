@@ -17,7 +17,7 @@ from service.repositories.models import ModelRepository
 from service.repositories.search import NO_FILTER, ListFilter
 from service.storage import errors
 from service.storage.tables import ModelVersion as StoredModel
-from sysid.core.errors import UnknownModel, suggest_name
+from sysid.core.errors import InvalidModel, UnknownModel, suggest_name
 from sysid.models.catalogue import load
 from sysid.models.model import Model, replace_substeps
 from sysid.models.parse import keep_terms, parse_model
@@ -129,9 +129,25 @@ def _list_names(session: Session) -> set[str]:
 
 
 def to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
-    """Convert a stored model to an answer."""
+    """Convert a stored model to an answer.
+
+    One that an earlier version accepted and this one refuses has the reason as its title.
+    """
     document = row.document if with_document else None
-    answer = to_model_out(parse_model(row.document), row.version, document)
+    try:
+        answer = to_model_out(parse_model(row.document), row.version, document)
+    except InvalidModel as error:
+        answer = ModelOut(
+            name=row.name,
+            version=row.version,
+            builtin=False,
+            title=f"refused by this version: {error}",
+            form=str(row.document.get("form", "")),
+            inputs={},
+            outputs={},
+            parameters={},
+            document=document,
+        )
     return answer.model_copy(update={"note": row.note, "tags": row.tags or []})
 
 

@@ -22,6 +22,9 @@ from service.repositories.search import ListFilter
 from service.storage.statements import RowPage
 from sysid.figures.plotly import Figure, empty_figure
 
+_Entry = tuple[ResultRow, Mapping[str, Any]]
+"""A run, and what its result says of one parameter."""
+
 RUNS_PER_PAGE, RUNS_OF_A_FILE = 100, 1000
 ORDER, DATE = "order", "date"
 """What is always offered as the abscissa; other names are those of labels and axes."""
@@ -96,7 +99,8 @@ def results_page(session: Session, choice: ResultChoice) -> str:
     """Render one parameter over the runs of any jobs."""
     page = _list_page(session, choice, RUNS_PER_PAGE)
     parameter, entries = _choose_parameter(page.items, choice.parameter)
-    query = dict(choice.form)
+    # Other pages, the figure and the file show what this page chose.
+    query = {**choice.form, **({"parameter": parameter} if parameter else {})}
     listed = [
         ListedResult(
             row, find_model_name(row.job.spec), _describe_place(row), to_estimate_view(one)
@@ -108,11 +112,11 @@ def results_page(session: Session, choice: ResultChoice) -> str:
         rows=listed,
         parameter=parameter,
         n_others=len(page.items) - len(listed),
-        form=query,
+        form=choice.form,
         fields=FIELDS,
         choices=_list_choices(page.items, parameter, choice),
         query=urlencode({**query, **({"cursor": choice.cursor} if choice.cursor else {})}),
-        first_query=urlencode(query),
+        first_query=urlencode(choice.form),
         cursor=choice.cursor,
         next=urlencode({**query, "cursor": page.next}) if page.next else "",
     )
@@ -125,7 +129,7 @@ def load_results_figure(session: Session, choice: ResultChoice) -> Figure:
     if not entries:
         return empty_figure()
     unit = Counter(one["unit"] for _, one in entries).most_common(1)[0][0]
-    same = [(row, one) for row, one in entries if one["unit"] == unit]
+    same = _put_oldest_first([(row, one) for row, one in entries if one["unit"] == unit])
     points = [
         ResultPoint(
             x=x,
@@ -134,8 +138,8 @@ def load_results_figure(session: Session, choice: ResultChoice) -> Figure:
             group=find_model_name(row.job.spec),
             text=f"{row.job.name}, run {row.number + 1}",
         )
-        for place, (row, one) in enumerate(same)
-        if (x := _find_abscissa(row, len(same) - place, choice.over)) is not None
+        for place, (row, one) in enumerate(same, 1)
+        if (x := _find_abscissa(row, place, choice.over)) is not None
     ]
     return plot_results(points, parameter, unit, _name_abscissa(choice.over), choice.over == DATE)
 
@@ -180,12 +184,16 @@ def _list_page(session: Session, choice: ResultChoice, limit: int) -> RowPage[Re
     )
 
 
-def _choose_parameter(
-    rows: Sequence[ResultRow], wanted: str
-) -> tuple[str, list[tuple[ResultRow, Mapping[str, Any]]]]:
+def _put_oldest_first(entries: Sequence[_Entry]) -> list[_Entry]:
+    """Put the latest job last. The runs of a job stay in their order."""
+    places = {row.job.id: place for place, (row, _) in enumerate(entries)}
+    return sorted(entries, key=lambda entry: -places[entry[0].job.id])
+
+
+def _choose_parameter(rows: Sequence[ResultRow], wanted: str) -> tuple[str, list[_Entry]]:
     """Choose the wanted parameter, or the most frequent one, and its entry of each run."""
     name = wanted or next(iter(_count_parameters(rows)), "")
-    entries: list[tuple[ResultRow, Mapping[str, Any]]] = [
+    entries: list[_Entry] = [
         (row, one) for row in rows for one in row.parameters if one["name"] == name and is_free(one)
     ]
     return name, entries

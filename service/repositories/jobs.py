@@ -256,7 +256,7 @@ class JobRepository:
         if job.finished_at is not None and job.finished_at <= utc_now() - DAY:
             job.evaluations_before = job.evaluations
         job.state, job.cancel_requested = JobState.QUEUED, False
-        job.error = job.finished_at = None
+        job.error = job.finished_at = job.fit_estimation = None
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
         self._add_parcel(job)

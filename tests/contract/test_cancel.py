@@ -119,8 +119,11 @@ def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
         )
         LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "1 run failed")
     with database.write_session() as session:
+        JobRepository(session).get(got.job.id).fit_estimation = 90.0
+    with database.write_session() as session:
         job = JobRepository(session).resume(got.job.id)
         assert (job.state, job.n_done, job.n_failed, job.error) == (JobState.QUEUED, 1, 0, None)
+        assert job.fit_estimation is None  # lists sort by that of ended jobs
     states = [run.state for run in runs_of(database, got.job.id)]
     assert states == [JobState.SUCCEEDED, JobState.QUEUED, JobState.QUEUED]
     assert claim(database).lease.attempt == 2

@@ -239,6 +239,13 @@ def test_one_parameter_of_the_runs_of_all_jobs_is_a_table_a_figure_and_a_file(
     assert sorted(points["x"]) == sorted([1, 2, 3, 4] * 3)  # the run without a seed is left out
     assert set(points["error_y"]["array"]) == {0.00023}
     assert figure["layout"]["yaxis"]["title"]["text"] == "L [s]"
+    [ordered] = client.get("/pages/results/figure?parameter=L&name=four seeds").json()["data"]
+    assert ordered["x"] == list(range(1, len(ordered["x"]) + 1))
+    numbers = [int(text.rpartition(" ")[2]) for text in ordered["text"]]
+    assert numbers == list(range(1, 13))  # the runs of a sweep rise to the right
+    unasked = client.get("/results?name=four seeds").text
+    [parameter] = set(re.findall(r"results(?:/figure|\.csv)\?[^\"]*parameter=(\w+)", unasked))
+    assert f"<h2>{parameter} of each run</h2>" in unasked
     file = client.get("/pages/results.csv?parameter=T&model=lagged-tube")
     rows = list(csv.DictReader(io.StringIO(file.text)))
     assert len(rows) == 13

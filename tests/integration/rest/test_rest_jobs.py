@@ -11,6 +11,7 @@ from service.queue.dispatchers import DispatcherRepository
 from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
+from service.repositories.models import ModelRepository
 from service.storage.tables import Job
 from tests.rest import parts_of, recording, refused, store_csv
 
@@ -329,7 +330,17 @@ def test_a_job_whose_model_an_earlier_version_accepted_stays_in_the_lists(
     with parts_of(server).database.write_session() as session:
         stored = session.get_one(Job, job)
         stored.spec = {**stored.spec, "model": model}
+        ModelRepository(session).add("pipe", model)
     listed = server.get("/v1/jobs").json()["items"]
     assert [entry["rms_unit"] for entry in listed if entry["id"] == job] == ["1"]
-    for path in ("/", f"/v1/jobs/{job}", f"/v1/jobs/{job}/runs"):
+    [shown] = [one for one in server.get("/v1/models").json()["items"] if one["name"] == "pipe"]
+    assert shown["title"].startswith("refused by this version: ")
+    for path in (
+        "/",
+        "/models",
+        "/models/pipe",
+        "/v1/models/pipe",
+        f"/v1/jobs/{job}",
+        f"/v1/jobs/{job}/runs",
+    ):
         assert server.get(path).status_code == 200, path
