@@ -232,6 +232,7 @@ def test_one_parameter_of_the_runs_of_all_jobs_is_a_table_a_figure_and_a_file(
     assert page.count('<input type="checkbox" name="run"') == 13
     assert "<b>0.11270</b> ± 0.00023\u202fs" in page
     assert '<option value="/seed">seed</option>' in page
+    assert f'href="/v1/jobs/{filled.sweep}/runs.csv"' in client.get(f"/jobs/{filled.sweep}").text
     best = client.get("/results?parameter=L&runs=best&name=four seeds").text
     assert re.findall(r'name="run" value="([^"]*)"', best) == [filled.sweep_run]
     figure = client.get("/pages/results/figure?parameter=L&over=/seed&theme=dark").json()
