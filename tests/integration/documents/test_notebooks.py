@@ -33,3 +33,6 @@ def test_the_cells_of_a_notebook_run(
     folder = {"metadata": {"path": str(tmp_path)}}
     options = {"timeout": CELL_SECONDS, "resources": folder}
     jupyter["nbclient"].NotebookClient(notebook, **options).execute()
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.execution_count for cell in code)
+    assert any(cell.outputs for cell in code)
