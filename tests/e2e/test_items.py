@@ -60,8 +60,9 @@ def test_a_recording_is_deleted_after_its_jobs_were_shown(own_site: Site, page: 
     dialog = page.get_by_role("dialog", name="Delete the job")
     dialog.get_by_role("button", name="Delete").click()
     expect(dialog.get_by_role("alert")).to_contain_text("Cancel it before deleting it")
+    page.goto(f"{own_site.url}/jobs/{own_site.filled.finished}")  # until its scripts have begun
     # All figures have come: what is asked of a deleted job is refused.
-    page.goto(f"{own_site.url}/jobs/{own_site.filled.finished}", wait_until="networkidle")
+    page.wait_for_load_state("networkidle")
     page.get_by_role("button", name="Delete").first.click()
     dialog.get_by_role("button", name="Close").click()
     expect(dialog).to_be_hidden()
