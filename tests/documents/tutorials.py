@@ -24,10 +24,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from service.pages.guides import list_notebooks
 from tests.documents.painter import open_painter
 from tests.repository import ROOT
 
-FOLDERS = ("tutorials", "howto", "answers")
 WIDTH = 100
 SHOWN_ADDRESS, SHOWN_FOLDER = "127.0.0.1:8000", "/home/anna/lab"
 START_SECONDS, COMMAND_SECONDS = 120.0, 240.0
@@ -67,13 +67,8 @@ class Output:
 
 
 def list_tutorials() -> list[Path]:
-    """List the pages with blocks that run, by name."""
-    pages = [page for folder in FOLDERS for page in (ROOT / "docs" / folder).glob("*.md")]
-    return sorted(
-        page
-        for page in pages
-        if re.search(r"^```(?:python|console)$", page.read_text("utf-8"), re.M)
-    )
+    """List the pages with blocks that run, by name: those that are notebooks, too."""
+    return sorted(list_notebooks().values())
 
 
 def check_page(page: Path) -> list[Output]:
