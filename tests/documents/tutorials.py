@@ -95,7 +95,7 @@ def _run_page(text: str, note: Callable[[Output], None], draw: Callable[[str, An
     """Run the blocks of a page in an empty folder; give the page with what they print."""
     parts: list[str] = []
     end, printed, value = 0, "", None
-    with TemporaryDirectory(prefix="lagid-") as folder, chdir(folder), _Shell() as shell:
+    with TemporaryDirectory(prefix="lagid-") as folder, chdir(folder), Shell() as shell:
         names: dict[str, Any] = {}
         for block in BLOCK.finditer(text):
             parts.append(text[end : block.start()])
@@ -148,7 +148,7 @@ def find_free_port() -> int:
         return int(free.getsockname()[1])
 
 
-class _Shell:
+class Shell:
     """Runs commands of a page; what they start behind ``&`` ends with the page."""
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class _Shell:
             "LAGID_URL": self._url,
         }
 
-    def __enter__(self) -> "_Shell":
+    def __enter__(self) -> "Shell":
         return self
 
     def __exit__(self, *_: object) -> None:
