@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from docutils.nodes import SkipNode, math_block
+from docutils.nodes import SkipNode, math, math_block
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
@@ -44,7 +44,7 @@ napoleon_use_rtype = False
 linkcheck_anchors = False
 
 
-def write_formula(writer: HTML5Translator, node: math_block) -> None:
+def write_formula(writer: HTML5Translator, node: math | math_block) -> None:
     """Write a formula as a running server shows it; no script of another site is needed."""
     writer.body.append(format_formula(node.astext()))
     raise SkipNode
@@ -63,4 +63,5 @@ def setup(app: Sphinx) -> None:
             source[0] = f"{title}\n\n{link}\n{rest}"
 
     app.connect("source-read", follow)
-    app.add_html_math_renderer("mathml", block_renderers=(write_formula, None))
+    renderers = (write_formula, None)
+    app.add_html_math_renderer("mathml", renderers, renderers)
