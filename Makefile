@@ -20,7 +20,7 @@ help:
 	@echo "make test        set up, run the whole test suite"
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
 	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
-	@echo "make docs        run the tutorials, write their outputs, build the documentation in build/docs"
+	@echo "make docs        run the tutorials, write their outputs and pictures, build the documentation in build/docs"
 	@echo "make openapi     write docs/openapi.json and the client's types after a change of the interface"
 	@echo "make mutants     the gate's tests against faults made by hand, about an hour"
 	@echo "make night       all long tests with new seeds, mutants, robustness, torture: hours, one table"
@@ -94,6 +94,7 @@ format: $(READY)
 docs: $(DOCS_READY) warm
 	$(BIN)/python -m tests.documents.settings
 	$(BIN)/python -m tests.documents.tutorials
+	$(BIN)/python -m tests.documents.photographs
 	@$(MAKE) --no-print-directory site
 
 # The site alone, from the pages as they are; a link that leads nowhere is an error.

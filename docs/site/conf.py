@@ -3,13 +3,15 @@
 import sys
 from pathlib import Path
 
+from docutils.nodes import SkipNode, math, math_block
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from lagid import __version__  # noqa: E402 - of this checkout
-from service.pages.guides import list_notebooks  # noqa: E402
+from service.pages.guides import format_formula, list_notebooks  # noqa: E402
 from tests.documents.reference import follow_top_level, write_reference  # noqa: E402
 
 write_reference(ROOT / "docs" / "reference")
@@ -30,7 +32,9 @@ html_title = f"lagid {__version__}"
 html_show_sphinx = False
 html_copy_source = False
 myst_enable_extensions = ["colon_fence", "deflist"]
+myst_fence_as_directive = ["math"]
 myst_heading_anchors = 4
+html_math_renderer = "mathml"
 copybutton_prompt_text = "$ "
 copybutton_line_continuation_character = "\\"
 autodoc_typehints = "description"
@@ -38,6 +42,12 @@ autodoc_member_order = "groupwise"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 linkcheck_anchors = False
+
+
+def write_formula(writer: HTML5Translator, node: math | math_block) -> None:
+    """Write a formula as a running server shows it; no script of another site is needed."""
+    writer.body.append(format_formula(node.astext()))
+    raise SkipNode
 
 
 def setup(app: Sphinx) -> None:
@@ -53,3 +63,5 @@ def setup(app: Sphinx) -> None:
             source[0] = f"{title}\n\n{link}\n{rest}"
 
     app.connect("source-read", follow)
+    renderers = (write_formula, None)
+    app.add_html_math_renderer("mathml", renderers, renderers)

@@ -240,9 +240,9 @@ class CombinationDocument(TypedDict):
     expression: str
     """the combination"""
     value: float | None
-    """estimate of the combination"""
+    """estimate of the combination; its unit follows from its parameters"""
     stderr: float | None
-    """standard error of the combination"""
+    """standard error of the combination, in the same unit"""
     is_local: NotRequired[bool]
     """whether it holds near the estimate only"""
 
@@ -728,7 +728,7 @@ class InputHoldDocument(TypedDict):
     estimates_other: dict[str, float | None] | None
     """estimates with the other reading, in their units"""
     rms_other: float | None
-    """RMS error with the other reading"""
+    """RMS error with the other reading, in the unit of `rms`"""
 
 
 class IslandInDocument(TypedDict):
@@ -748,7 +748,7 @@ class IslandDocument(TypedDict):
     champion_rms: float | None
     """RMS error of the search, in the unit of `rms`"""
     refined_rms: float | None
-    """RMS error after least squares; null without"""
+    """RMS error after least squares, in the unit of `rms`; null without"""
     evaluations: int
     """simulations of the island"""
     parameters: list[float | None]
@@ -1029,7 +1029,7 @@ class MinimumDocument(TypedDict):
     """A minimum of the loss."""
 
     parameters: dict[str, float | None]
-    """values of the free parameters"""
+    """values of the free parameters, in their units"""
     rms: float | None
     """RMS error, in the unit of `rms`"""
     likelihood_ratio: float | None
@@ -1171,9 +1171,9 @@ class OrderFitDocument(TypedDict):
     delay: float | None
     """dead time, in the comparison's `unit`"""
     delay_stderr: float | None
-    """standard error of the dead time; null without one"""
+    """standard error of the dead time, in the same unit; null without"""
     values: dict[str, float | None]
-    """all parameters of that model"""
+    """all parameters of that model, in their units"""
     rms: float | None
     """RMS error, in the unit of `rms`"""
     bic: float | None
@@ -1590,7 +1590,7 @@ class RunDocument(TypedDict):
     rms_validation: NotRequired[float | None]
     """RMS error on the validation data, in the unit of `rms`"""
     rms_noise_free: NotRequired[float | None]
-    """RMS error against the record without the added noise"""
+    """RMS error against the record without added noise, in the unit of `rms`"""
     fit_percent: NotRequired[FitDocument | None]
     """fit to both kinds of data"""
     agreement: NotRequired[AgreementsDocument | None]
@@ -1604,7 +1604,7 @@ class RunDocument(TypedDict):
     correlation: NotRequired[MatrixDocument | None]
     """correlation of the estimates; null without errors"""
     noise_sd: NotRequired[float | None]
-    """standard deviation of the residuals, weighted"""
+    """standard deviation of the weighted residuals, in the unit of `rms`"""
     noise_colour: NotRequired[str | None]
     """colour of the residuals that the errors assume"""
     noise_model: NotRequired[str | None]
@@ -1717,7 +1717,7 @@ class SelectedTermDocument(TypedDict):
     cumulated: float
     """share explained with all terms so far"""
     coefficient: float
-    """coefficient before the search"""
+    """coefficient before the search; its unit follows from the term"""
 
 
 class SequenceInDocument(TypedDict):

@@ -6,10 +6,12 @@ A page has the address of its file, so links between pages lead where they lead 
 import re
 from dataclasses import dataclass
 from functools import cache
+from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from posixpath import basename, dirname, join, normpath
 
+from latex2mathml.converter import convert
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from markupsafe import Markup
@@ -20,7 +22,7 @@ from service.pages.notebooks import to_notebook
 INDEX = "README.md"
 _SITE_ONLY = "index.md"  # its lists are of the site's builder
 FILES = (".png", ".json")
-NOTEBOOK_FOLDERS = ("tutorials", "howto", "answers")
+NOTEBOOK_FOLDERS = ("tutorials", "howto", "answers", "explanation")
 """Folders whose pages are notebooks, too, if they have code."""
 
 
@@ -85,6 +87,19 @@ def list_notebooks() -> dict[str, Path]:
     }
 
 
+def format_formula(latex: str) -> str:
+    """Format a ``math`` block of a page, which is LaTeX, as HTML with MathML.
+
+    Examples
+    --------
+    >>> format_formula("a")  # doctest: +ELLIPSIS
+    '<div class="equation" tabindex="0"><math aria-label="a" ...><mrow><mi>a</mi></mrow></math>...'
+    """
+    mathml = convert(latex.strip(), display="block")
+    label = f'<math aria-label="{escape(latex.strip())}"'
+    return f'<div class="equation" tabindex="0">{mathml.replace("<math", label, 1)}</div>\n'
+
+
 def is_folder(path: str) -> bool:
     """Return whether a path is that of a folder with pages, without the slash at its end."""
     return f"{path}/" in _list_folders()
@@ -135,6 +150,8 @@ def _render(text: str, path: str) -> str:
     for token, content in zip(tokens, [*tokens[1:], None], strict=True):
         if token.type == "heading_open" and content is not None:
             token.attrs["id"] = _name_anchor(content.content)
+        if token.type == "fence" and token.info == "math":
+            token.type, token.content = "html_block", format_formula(token.content)
         _keep_inside(token.children or [], path)
     html = str(parser.renderer.render(tokens, parser.options, {}))
     # What is wider than the page is scrolled with keys, too.

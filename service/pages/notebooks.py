@@ -82,6 +82,7 @@ def _list_command_cells(command: str) -> list[str]:
 def _list_texts(text: str) -> Iterator[dict[str, Any]]:
     """List the text between two cells, without pictures and links to other pages."""
     plain = _LINK.sub(lambda link: f"*{link[1]}*", re.sub(r"^!\[.*\n?", "", text, flags=re.M))
+    plain = re.sub(r"^```math\n(.*?)^```", r"$$\n\1$$", plain, flags=re.M | re.S)
     if plain.strip():
         yield {"cell_type": "markdown", "source": plain.strip()}
 

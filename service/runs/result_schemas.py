@@ -57,7 +57,9 @@ class IslandOut(Answer):
     """Champion of one island before and after its refinement."""
 
     champion_rms: Finite = Field(description="RMS error of the search, in the unit of `rms`")
-    refined_rms: Finite = Field(description="RMS error after least squares; null without")
+    refined_rms: Finite = Field(
+        description="RMS error after least squares, in the unit of `rms`; null without"
+    )
     evaluations: int = Field(description="simulations of the island")
     parameters: list[Finite] = Field(description="values of the free parameters, in their units")
 
@@ -67,8 +69,10 @@ class CombinationOut(Answer):
 
     members: list[str] = Field(description="names of the parameters")
     expression: str = Field(description="the combination")
-    value: Finite = Field(description="estimate of the combination")
-    stderr: Finite = Field(description="standard error of the combination")
+    value: Finite = Field(
+        description="estimate of the combination; its unit follows from its parameters"
+    )
+    stderr: Finite = Field(description="standard error of the combination, in the same unit")
     is_local: bool = Field(default=False, description="whether it holds near the estimate only")
 
 
@@ -154,7 +158,7 @@ class InputHoldOut(Answer):
     estimates_other: dict[str, Finite] | None = Field(
         description="estimates with the other reading, in their units"
     )
-    rms_other: Finite = Field(description="RMS error with the other reading")
+    rms_other: Finite = Field(description="RMS error with the other reading, in the unit of `rms`")
 
 
 class KnownBeforeOut(Answer):
@@ -167,7 +171,9 @@ class KnownBeforeOut(Answer):
 class MinimumOut(Answer):
     """A minimum of the loss."""
 
-    parameters: dict[str, Finite] = Field(description="values of the free parameters")
+    parameters: dict[str, Finite] = Field(
+        description="values of the free parameters, in their units"
+    )
     rms: Finite = Field(description="RMS error, in the unit of `rms`")
     likelihood_ratio: Finite = Field(description="n ln(Σe²/Σe²₀) to the best minimum")
     count: int = Field(description="least-squares fits that ended in it")
@@ -220,8 +226,10 @@ class OrderFitOut(Answer):
     model: str = Field(description="its name in the catalogue")
     order: int = Field(description="number of poles")
     delay: Finite = Field(description="dead time, in the comparison's `unit`")
-    delay_stderr: Finite = Field(description="standard error of the dead time; null without one")
-    values: dict[str, Finite] = Field(description="all parameters of that model")
+    delay_stderr: Finite = Field(
+        description="standard error of the dead time, in the same unit; null without"
+    )
+    values: dict[str, Finite] = Field(description="all parameters of that model, in their units")
     rms: Finite = Field(description="RMS error, in the unit of `rms`")
     bic: Finite = Field(description="Schwarz's criterion; smaller is better")
     is_open: bool = Field(description="whether its BIC is within 6 of the lowest: not ruled out")
@@ -272,4 +280,6 @@ class SelectedTermOut(Answer):
     term: str = Field(description="the term")
     err: float = Field(description="share of the output's sum of squares that it explains")
     cumulated: float = Field(description="share explained with all terms so far")
-    coefficient: float = Field(description="coefficient before the search")
+    coefficient: float = Field(
+        description="coefficient before the search; its unit follows from the term"
+    )

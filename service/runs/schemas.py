@@ -95,7 +95,8 @@ class RunOut(Answer):
         default=None, description="RMS error on the validation data, in the unit of `rms`"
     )
     rms_noise_free: float | None = Field(
-        default=None, description="RMS error against the record without the added noise"
+        default=None,
+        description="RMS error against the record without added noise, in the unit of `rms`",
     )
     fit_percent: Annotated[Any, DescribedBy(FitOut | None)] = Field(
         default=None, description="fit to both kinds of data"
@@ -116,7 +117,8 @@ class RunOut(Answer):
         default=None, description="correlation of the estimates; null without errors"
     )
     noise_sd: float | None = Field(
-        default=None, description="standard deviation of the residuals, weighted"
+        default=None,
+        description="standard deviation of the weighted residuals, in the unit of `rms`",
     )
     noise_colour: str | None = Field(
         default=None, description="colour of the residuals that the errors assume"

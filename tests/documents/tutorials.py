@@ -24,10 +24,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from service.pages.guides import list_notebooks
 from tests.documents.painter import open_painter
 from tests.repository import ROOT
 
-FOLDERS = ("tutorials", "howto", "answers")
 WIDTH = 100
 SHOWN_ADDRESS, SHOWN_FOLDER = "127.0.0.1:8000", "/home/anna/lab"
 START_SECONDS, COMMAND_SECONDS = 120.0, 240.0
@@ -67,13 +67,8 @@ class Output:
 
 
 def list_tutorials() -> list[Path]:
-    """List the pages with blocks that run, by name."""
-    pages = [page for folder in FOLDERS for page in (ROOT / "docs" / folder).glob("*.md")]
-    return sorted(
-        page
-        for page in pages
-        if re.search(r"^```(?:python|console)$", page.read_text("utf-8"), re.M)
-    )
+    """List the pages with blocks that run, by name: those that are notebooks, too."""
+    return sorted(list_notebooks().values())
 
 
 def check_page(page: Path) -> list[Output]:
@@ -100,7 +95,7 @@ def _run_page(text: str, note: Callable[[Output], None], draw: Callable[[str, An
     """Run the blocks of a page in an empty folder; give the page with what they print."""
     parts: list[str] = []
     end, printed, value = 0, "", None
-    with TemporaryDirectory(prefix="lagid-") as folder, chdir(folder), _Shell() as shell:
+    with TemporaryDirectory(prefix="lagid-") as folder, chdir(folder), Shell() as shell:
         names: dict[str, Any] = {}
         for block in BLOCK.finditer(text):
             parts.append(text[end : block.start()])
@@ -153,7 +148,7 @@ def find_free_port() -> int:
         return int(free.getsockname()[1])
 
 
-class _Shell:
+class Shell:
     """Runs commands of a page; what they start behind ``&`` ends with the page."""
 
     def __init__(self) -> None:
@@ -172,7 +167,7 @@ class _Shell:
             "LAGID_URL": self._url,
         }
 
-    def __enter__(self) -> "_Shell":
+    def __enter__(self) -> "Shell":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -28,6 +28,7 @@ PATHS = (
     "/new/noise-sweep",
     "/new/reidentify",
     "/guides/README.md",
+    "/guides/explanation/method.md",
     "/guides/uncertainty.md",
 )
 

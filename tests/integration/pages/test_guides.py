@@ -68,6 +68,15 @@ def test_a_page_with_code_is_a_notebook_too(client: TestClient) -> None:
     assert client.get("/guides/howto/choose_a_model.ipynb").status_code == 404
 
 
+def test_formulas_are_mathml_on_a_page_and_latex_in_its_notebook(client: TestClient) -> None:
+    page = client.get("/guides/explanation/method.md").text
+    assert page.count("<math ") == page.count("</math>") == 5
+    assert "<msqrt>" in page
+    assert "\\sqrt" not in re.sub(r'aria-label="[^"]*"', "", page)
+    cells = client.get("/guides/explanation/method.ipynb").json()["cells"]
+    assert cells[0]["source"].count("$$") == 10
+
+
 def test_a_folder_has_one_address_where_its_links_lead_to_its_pages(client: TestClient) -> None:
     asked = client.get("/guides/howto", follow_redirects=False)
     assert (asked.status_code, asked.headers["Location"]) == (307, "/guides/howto/")
