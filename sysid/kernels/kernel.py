@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from llvmlite import ir
 
 from sysid.kernels import reads
-from sysid.kernels.abi import KERNEL_ARGUMENTS, LANES, NARROW_LANES, build_kernel_type
+from sysid.kernels.abi import KERNEL_ARGUMENTS, KERNEL_NAME, LANES, NARROW_LANES, build_kernel_type
 from sysid.kernels.delayed_reads import TimeStep
 from sysid.kernels.expressions import emit_expression
 from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
@@ -22,9 +22,6 @@ from sysid.kernels.signals import (
 from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import Binary, FunctionCall, walk
 from sysid.models.model import DerivedInitial, EstimatedInitial, MeasuredInitial, Model
-
-KERNEL_NAME = "kernel"
-"""Name of the kernel's function in its module."""
 
 
 def emit_kernel(model: Model, variant: KernelVariant) -> str:
