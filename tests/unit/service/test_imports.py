@@ -102,7 +102,7 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
             | {"pandas", "plotly"}
             | {f"service.cli.{group}" for group in ("access", "datasets", "jobs", "server")},
         ),
-        # SciPy's functions took a quarter of the command's time.
+        # SciPy's functions took an eighth of the command's CPU.
         ("whole identification", {"scipy.special", "psutil", "sysid.kernels.kernel"}),
         # They took half a second, four fifths of what its first use in a process does.
         ("colour of a short record", {"scipy.signal"}),
