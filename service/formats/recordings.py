@@ -9,7 +9,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from service.core.temporary_files import make_temporary_prefix
 from service.formats.advice import build_period_error
 from service.formats.file_kinds import GZIP_MAGIC, detect_kind, read_head
 from service.formats.limits import DEFAULT_LIMITS, ReadOptions, UploadLimits
@@ -88,6 +87,8 @@ def read_with_notes(
     if isinstance(content, str) and content is not source:
         content = content.encode()
     if isinstance(content, bytes):
+        from service.core.temporary_files import make_temporary_prefix
+
         with NamedTemporaryFile(prefix=make_temporary_prefix()) as file:
             file.write(content)
             file.flush()

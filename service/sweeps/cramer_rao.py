@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from sysid.core.distributions import chi_square_limit
+
 BoundsDocument = Mapping[str, Any]
 
 
@@ -62,12 +64,10 @@ def scale_to_median(group: Mapping[str, Any]) -> float | None:
     is χ² with r degrees of freedom. Its median is below r, so that of the runs may lie below a
     bound of the RMS.
     """
-    from scipy.special import chdtri  # its import takes longer than a command's start may
-
     if group["rms_floor"] is None:
         return None
     r = sum(parameter["floor"] is not None for parameter in group["parameters"]) or 1
-    return float(group["rms_floor"] * (chdtri(r, 0.5) / r) ** 0.5)
+    return float(group["rms_floor"] * (chi_square_limit(r, 0.5) / r) ** 0.5)
 
 
 def scale_to_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:

@@ -342,6 +342,10 @@ def _watch_compilation(compile_signature: Callable[[Any], Any]) -> Callable[[Any
     return compile_watched
 
 
+def _do_nothing() -> None:
+    """Stand in for Numba's search for extensions of itself."""
+
+
 def jit_compile(function: _Function) -> _Function:
     """Compile with Numba: cached on disk, GIL released, IEEE 754 division.
 
@@ -351,6 +355,9 @@ def jit_compile(function: _Function) -> _Function:
     if hasattr(compiled, "_cache"):
         compiled._cache = _FunctionCache(function)
         compiled.compile = _watch_compilation(compiled.compile)
+        # Numba would read the metadata of all installed packages to find extensions of itself,
+        # before it asks the cache. It reads them again if it compiles.
+        compiled._compilation_chain_init_hook = _do_nothing
     elif compiled is not function:  # they are the same if NUMBA_DISABLE_JIT is set
         warn_not_cached(f"Numba {numba.__version__} has no function cache in the expected place")
     return cast(_Function, compiled)

@@ -305,7 +305,7 @@ def _is_contradicted(
     if variance <= 0:
         return bool(np.any(error != 0))
     ratio = float(np.mean(error**2)) / variance
-    return bool(f_tail(count, degrees, ratio) < _UNLIKELY)
+    return f_tail(count, degrees, ratio) < _UNLIKELY
 
 
 def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:

@@ -23,6 +23,9 @@ LANES = 16
 NARROW_LANES = 8
 """W of the last block, if no more individuals are left; it takes two thirds of the time."""
 
+KERNEL_NAME = "kernel"
+"""Name of the kernel's function in its module."""
+
 KERNEL_ARGUMENTS = (
     "P",
     "theta",

@@ -12,8 +12,8 @@ from pathlib import Path
 from sysid.core.code_cache import digest_files, load_code, store_code
 from sysid.core.errors import InvalidModel
 from sysid.core.memo import cache_by_identity
+from sysid.kernels.abi import KERNEL_NAME
 from sysid.kernels.compilation import compile_kernel
-from sysid.kernels.kernel import KERNEL_NAME
 from sysid.kernels.layout import KernelVariant
 from sysid.kernels.machine_code import describe_machine, load_object_code
 from sysid.models.model import DerivedInitial, Model

@@ -7,7 +7,7 @@ monomial occurs once, i ≤ j ≤ …: C(s + m, m) - 1 coefficients for s past v
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, groupby
 from math import comb
 from typing import Any, NamedTuple, cast, get_args
 
@@ -324,8 +324,15 @@ def _read_coefficients(
 
 
 def _build_product(term: Term) -> Expression:
+    """Multiply a coefficient by powers of past values, which terms have in common."""
     coefficient: Expression = Symbol(term.coefficient_name, "parameter")
-    return reduce(lambda a, b: Binary("*", a, b), term.factors, coefficient)
+    powers = (
+        value
+        if (count := sum(1 for _ in equal)) == 1
+        else Binary("**", value, Number(float(count)))
+        for value, equal in groupby(term.factors)
+    )
+    return reduce(lambda a, b: Binary("*", a, b), powers, coefficient)
 
 
 def _build_sum(terms: Sequence[Expression]) -> Expression:

@@ -364,7 +364,7 @@ def _make_test(
     degrees: float,
     level: float,
 ) -> ResidualTest:
-    p = float(chi_square_tail(degrees, statistic))
+    p = chi_square_tail(degrees, statistic)
     size = np.abs(scaled)
     return ResidualTest(
         series.experiment,

@@ -170,7 +170,7 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
 
 def _are_white(values: FloatArray) -> bool:
     spaced = keep_in_order(values)
-    return float(chi_square_tail(spaced.n_lags, compute_whiteness(spaced).statistic)) >= _MIN_CHANCE
+    return chi_square_tail(spaced.n_lags, compute_whiteness(spaced).statistic) >= _MIN_CHANCE
 
 
 def _compute_middle(

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.fft import rfft
 from numpy.typing import NDArray
 
-from sysid.core.distributions import chi_square_tail, student_quantile
+from sysid.core.distributions import chi_square_tail, student_limit
 from sysid.core.types import RANK_TOLERANCE, FloatArray, IntArray
 from sysid.residuals.autocorrelation import (
     MIN_SAMPLES,
@@ -112,7 +112,7 @@ class Sandwich(NamedTuple):
             Mean square of the residuals; sum of squares of that combination.
         """
         variance = max(float(direction @ self.middle @ direction) / (power * norm), _MIN_WIDENING)
-        quantile = float(student_quantile(self.compute_degrees(direction), 0.975))
+        quantile = student_limit(self.compute_degrees(direction), 0.025)
         ratio = variance * (quantile**2 / CHI_SQUARE_95)
         return float(ratio * self.equivalent_samples / self.degrees)
 
@@ -361,7 +361,7 @@ def _correlate_series(
     correlation = float(a @ b) / size
     poles = max(float((a[1:] @ a[:-1]) * (b[1:] @ b[:-1]) / size**2), 0.0)
     widening = (1.0 + poles) / (1.0 - poles)
-    chance = float(chi_square_tail(1, correlation**2 * a.size / widening))
+    chance = chi_square_tail(1, correlation**2 * a.size / widening)
     return _CorrelatedPair(series, times, rows, correlation, chance)
 
 

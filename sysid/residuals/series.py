@@ -79,10 +79,10 @@ def is_coloured(part: ResidualPart, values: FloatArray) -> bool:
     is_even = np.ptp(steps) <= _EVEN_TOLERANCE * steps[0]
     spaced = keep_in_order(values) if is_even else space_residuals(part.times, values)
     whiteness = compute_whiteness(spaced)
-    chance = float(chi_square_tail(spaced.n_lags, whiteness.statistic))
+    chance = chi_square_tail(spaced.n_lags, whiteness.statistic)
     if n < SHORT_RECORD and whiteness.values[0] > 0:
         first = (whiteness.values[0] / whiteness.deviation[0]) ** 2
-        chance = min(chance, float(chi_square_tail(1, first)))
+        chance = min(chance, chi_square_tail(1, first))
     return chance < _SIGNIFICANCE
 
 
@@ -105,7 +105,7 @@ def have_unequal_variances(series: Sequence[FloatArray]) -> bool:
     statistic = total * np.log(pooled) - counts @ np.log(variances)
     degrees = len(long_series) - 1
     correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * degrees)
-    return float(chi_square_tail(degrees, statistic / correction)) < _SIGNIFICANCE
+    return chi_square_tail(degrees, statistic / correction) < _SIGNIFICANCE
 
 
 def count_used_degrees(columns: Sequence[FloatArray]) -> FloatArray:

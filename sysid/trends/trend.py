@@ -12,8 +12,8 @@ from statistics import NormalDist
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, stdtr, stdtrit
 
+from sysid.core.distributions import chi_square_tail, student_limit, student_tail
 from sysid.core.types import BoolArray, FloatArray
 from sysid.trends.laws import TrendLaw, compute_rounding_floor, fit_line, fit_power
 
@@ -217,7 +217,7 @@ def compute_half_width(law: TrendLaw) -> float:
     It is that of the normal distribution if the stated errors hold. It is that of Student's t if
     the size of the errors comes from the scatter of few points.
     """
-    return _TWO_SIDED_95 if law.birge_ratio <= 1.0 else float(stdtrit(law.degrees, 0.975))
+    return _TWO_SIDED_95 if law.birge_ratio <= 1.0 else student_limit(law.degrees, 0.025)
 
 
 def _compute_band(law: TrendLaw, x: FloatArray) -> tuple[TrendPoint, ...]:
@@ -296,7 +296,7 @@ def _compute_influence(
         t = float(np.copysign(inf, residual)) if square > 2.0 * floor else 0.0
     else:
         t = residual / sqrt(variance_of_others * (1.0 - leverage))
-    p_value = min(1.0, n * 2.0 * float(stdtr(degrees, -abs(t))))
+    p_value = min(1.0, n * 2.0 * student_tail(degrees, abs(t)))
     is_explained = sqrt(square) <= -NormalDist().inv_cdf(_OUTLIER_PROBABILITY / (2.0 * n))
     return Influence(residual, t, p_value, p_value < _OUTLIER_PROBABILITY and not is_explained)
 
@@ -358,9 +358,9 @@ def compute_drift_limit(law: TrendLaw | None = None, comparisons: int = 1) -> fl
     scatter by chance, and these keep their stated errors.
     """
     limit = -NormalDist().inv_cdf(_DRIFT_PROBABILITY / (2.0 * comparisons))
-    if law is None or chdtrc(law.degrees, law.chi_squared) >= _SCATTER_PROBABILITY:
+    if law is None or chi_square_tail(law.degrees, law.chi_squared) >= _SCATTER_PROBABILITY:
         return limit
-    return limit * float(stdtrit(law.degrees, 0.975)) / _TWO_SIDED_95
+    return limit * student_limit(law.degrees, 0.025) / _TWO_SIDED_95
 
 
 def compute_drift(new: TrendEstimate, old: TrendEstimate, comparisons: int = 1) -> Drift:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.core.distributions import student_quantile
+from sysid.core.distributions import student_limit
 from sysid.core.linear_algebra import TruncatedSvd, compute_truncated_svd
 from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
@@ -218,7 +218,7 @@ def _analyse_sensitivities(
         theta,
         statuses,
         physical,
-        student_quantile(degrees, 0.975),
+        np.array([student_limit(each, 0.025) for each in degrees.tolist()]),
         directions.is_null_member,
         uncertainty.groups,
         rows[~retained],

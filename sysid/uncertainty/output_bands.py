@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sysid.core.distributions import student_quantile
+from sysid.core.distributions import student_limit
 from sysid.core.types import FloatArray
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import compute_physical_scale
@@ -87,7 +87,7 @@ def compute_output_bands(
     columns = [spread.names.index(name) for name in problem.free_names]
     simulated = problem.predict(theta[None])[0]
     quantile, noise_quantile = (
-        float(student_quantile(max(degrees, 1.0), 0.975))
+        student_limit(max(degrees, 1.0), 0.025)
         for degrees in (spread.degrees, spread.noise_degrees)
     )
     if spread.samples is None:

@@ -19,7 +19,7 @@ SERVICE = {
 COMMANDS = {
     "command line": "import service.cli.main",
     "identify": "identify()",
-    "search": "import sysid.identification.identify",
+    "whole identification": "identify_white()",
     "colour of a short record": "fit_short_record()",
 }
 
@@ -33,6 +33,15 @@ def identify():
     with contextlib.redirect_stderr(text), contextlib.suppress(SystemExit):
         service.cli.main.main()
     assert "prediction" in text.getvalue()  # refused before anything is compiled
+
+def identify_white():
+    import numpy as np
+    from lagid import Channel, Record, identify, load_model
+
+    t, noise = np.arange(60.0), np.random.default_rng(0).standard_normal(60)
+    u = Channel("u", t, np.where(t < 5.0, 0.0, 1.0))
+    y = Channel("y", t, 2.0 - 2.0 * np.exp(-np.maximum(t - 8.0, 0.0) / 5.0) + 0.01 * noise)
+    assert identify(load_model("fopdt"), Record((u,), (y,))).residual_tests.passed
 
 def fit_short_record():
     import numpy as np
@@ -93,8 +102,8 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
             | {"pandas", "plotly"}
             | {f"service.cli.{group}" for group in ("access", "datasets", "jobs", "server")},
         ),
-        # It is loaded while the search runs.
-        ("search", {"scipy.special"}),
+        # SciPy's functions took an eighth of the command's CPU.
+        ("whole identification", {"scipy.special", "psutil", "sysid.kernels.kernel"}),
         # They took half a second, four fifths of what its first use in a process does.
         ("colour of a short record", {"scipy.signal"}),
     ],
