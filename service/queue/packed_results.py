@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 Dialect = Literal["sqlite", "postgresql"]
-ColumnKind = Literal["text", "jsonb", "boolean", "double precision", "integer", "bigint", "bytea"]
+ColumnKind = Literal[
+    "text", "json", "jsonb", "boolean", "double precision", "integer", "bigint", "bytea"
+]
 Row = tuple[Any, ...]
 
 
@@ -48,7 +50,7 @@ RESULT_ROWS = RowLayout(
         "generations": "integer",
         "seconds": "double precision",
         "estimates": "jsonb",
-        "result": "jsonb",
+        "result": "json",
         **SIGNALS_COLUMNS,
     },
 )
@@ -132,7 +134,7 @@ def _encode_text(value: str) -> bytes:
     return _pack_size(len(data)) + data
 
 
-def _encode_json(value: str) -> bytes:
+def _encode_jsonb(value: str) -> bytes:
     data = value.encode()
     return _pack_size(len(data) + 1) + b"\1" + data  # the version of the format
 
@@ -143,7 +145,8 @@ def _encode_bytes(value: bytes) -> bytes:
 
 _ENCODERS: Mapping[ColumnKind, Callable[[Any], bytes]] = {
     "text": _encode_text,
-    "jsonb": _encode_json,
+    "json": _encode_text,
+    "jsonb": _encode_jsonb,
     "boolean": lambda value: b"\0\0\0\1" + (b"\1" if value else b"\0"),
     "double precision": lambda value: _pack_double(8, value),
     "integer": lambda value: _pack_integer(4, value),

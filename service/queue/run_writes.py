@@ -44,6 +44,8 @@ _RUN_DEFAULTS = {
 }
 
 
+TEMPORARY_MIB = 32
+"""Memory for the temporary tables of a connection, in MiB: what does not fit is written to disk."""
 _NOTHING: Document = {}
 
 
@@ -255,6 +257,7 @@ class RunWriter:
         n_ended = 0
         with driver.cursor() as cursor:
             if not connection.info.get(_HAS_TABLES):
+                cursor.execute(f"SET temp_buffers = '{TEMPORARY_MIB}MB'")
                 for layout in LAYOUTS:
                     cursor.execute(_build_temporary_table(layout))
                 _remember_tables(self._session, connection)
@@ -414,14 +417,15 @@ def _build_postgres_insert(layout: RowLayout) -> str:
 def _build_temporary_table(layout: RowLayout) -> str:
     """Return the statements that create a table for this session, as it is not yet there.
 
-    Its values are not compressed, because they are copied at once.
+    Its values are copied at once. So they are not compressed, and up to 8 kB they stay in the row.
     """
     table = f"packed_{layout.table}"
     columns = ", ".join(f"{name} {kind}" for name, kind in layout.columns.items())
-    large = [name for name, kind in layout.columns.items() if kind in ("jsonb", "bytea")]
+    large = [name for name, kind in layout.columns.items() if kind in ("json", "jsonb", "bytea")]
     storage = ", ".join(f"ALTER COLUMN {name} SET STORAGE EXTERNAL" for name in large)
     return (
-        f"CREATE TEMPORARY TABLE IF NOT EXISTS {table} ({columns}) ON COMMIT DELETE ROWS; "
+        f"CREATE TEMPORARY TABLE IF NOT EXISTS {table} ({columns}) "
+        "WITH (toast_tuple_target = 8160) ON COMMIT DELETE ROWS; "
         f"ALTER TABLE {table} {storage}"
     )
 

@@ -21,6 +21,7 @@ from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Event, Job, Project, Run, SearchTerm, StoredSummary
+from tests.database import empty_postgres
 from tests.stored import (
     claim,
     claimed,
@@ -85,6 +86,23 @@ def test_rows_are_kept_by_an_upgrade_from_the_first_revision_and_by_the_way_back
     migrate.upgrade_database(empty_database)
     assert [rows(empty_database, kind) for kind in kinds] == before
     assert rows(empty_database, StoredSummary) == []  # the next reader computes it again
+
+
+@pytest.mark.postgres
+def test_postgresql_compresses_no_result_by_its_slow_method_after_a_way_back():
+    # What compresses fast, or is compressed already, is told by storage and method.
+    query = text(
+        "SELECT attrelid::regclass::text, attstorage, attcompression FROM pg_attribute WHERE "
+        "(attrelid, attname) IN (('runs'::regclass, 'result'), ('run_history'::regclass, 'points'))"
+    )
+    with empty_postgres() as database:
+        migrate.upgrade_database(database)
+        migrate.downgrade_database(database, "0007")
+        migrate.upgrade_database(database)
+        with database.engine.connect() as connection:
+            found = {table: rest for table, *rest in connection.execute(query)}
+    assert set(found) == {"runs", "run_history"}
+    assert all(storage == "e" or method == "l" for storage, method in found.values()), found
 
 
 def test_the_fit_of_ended_jobs_is_taken_from_their_best_runs(empty_database):
