@@ -143,8 +143,12 @@ def _compute_innovations(
     a, w = _to_pole_and_share(place)
     n, r = series.basis.shape
     whitened, carried = np.empty((n, r + 1)), np.empty(n - 1)
-    whitened[:, :r], whitened[:, r] = series.basis, series.values
-    carried[:] = a**series.gaps
+    for i in range(n):
+        for k in range(r):
+            whitened[i, k] = series.basis[i, k]
+        whitened[i, r] = series.values[i]
+        if i > 0:
+            carried[i - 1] = a ** float(series.gaps[i - 1])
     determinants = _whiten_in_place(carried, w, whitened)
     coefficients, log_determinant = _regress_last(whitened)
     innovations, power = np.empty(n), 0.0
@@ -197,7 +201,6 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
     return deviance
 
 
-@jit_compile
 def _minimise_deviance(series: _ObservedSeries) -> FloatArray:
     """Find the two arguments by the simplex of Nelder and Mead (1965), the best of all starts."""
     best: FloatArray = _SEARCH_STARTS[0].copy()
@@ -222,7 +225,6 @@ def _minimise_deviance(series: _ObservedSeries) -> FloatArray:
     return best
 
 
-@jit_compile
 def _move_simplex(places: FloatArray, deviances: FloatArray, series: _ObservedSeries) -> int:
     """Replace the worst of three places, or shrink them to the best; count the evaluations."""
     middle = 0.5 * (places[0] + places[1])
@@ -252,14 +254,10 @@ def _move_simplex(places: FloatArray, deviances: FloatArray, series: _ObservedSe
     return 4
 
 
-@jit_compile
 def _sort_simplex(places: FloatArray, deviances: FloatArray) -> None:
     """Sort three places by their deviance, in place; one that is not a number comes last."""
-    for last in (2, 1, 2):
-        if deviances[last] < deviances[last - 1] or np.isnan(deviances[last - 1]):
-            for c in range(2):
-                places[last - 1, c], places[last, c] = places[last, c], places[last - 1, c]
-            deviances[last - 1], deviances[last] = deviances[last], deviances[last - 1]
+    order = np.argsort(deviances, kind="stable")
+    places[:], deviances[:] = places[order], deviances[order]
 
 
 def _are_white(values: FloatArray) -> bool:
@@ -285,8 +283,10 @@ def _compute_middle(
                 lagged[j, k] += spaced_columns[i, j] * past[k]
         for k in range(d):
             past[k] = a * (past[k] + spaced_columns[i, k])
-    middle: FloatArray = variance * (gram + (1.0 - w) * (lagged + lagged.T))
-    return middle
+    for j in range(d):
+        for k in range(d):
+            gram[j, k] = variance * (gram[j, k] + (1.0 - w) * (lagged[j, k] + lagged[k, j]))
+    return gram
 
 
 def _estimate_covariance(place: FloatArray, series: _ObservedSeries) -> FloatArray:

@@ -57,8 +57,9 @@ def scale_matrix(matrix: FloatArray, scale: FloatArray) -> FloatArray:
 @jit_compile
 def compute_correlation(covariance: FloatArray) -> FloatArray:
     """Compute the correlation (D, D) of a covariance; 0 with a value that has no variance."""
-    correlation = np.eye(covariance.shape[0])
+    correlation = np.zeros(covariance.shape)
     for i in range(covariance.shape[0]):
+        correlation[i, i] = 1.0
         for j in range(covariance.shape[0]):
             size = np.sqrt(covariance[i, i]) * np.sqrt(covariance[j, j])
             if i != j and size > 0.0:
