@@ -16,6 +16,7 @@ from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.search.island import Island
 
+_WORKERS = Path(__file__).parent  # they split records and add noise
 Records: TypeAlias = tuple[Record, ...]
 WarmStartValues: TypeAlias = tuple[Mapping[str, float], ...]
 """Parameter vectors of earlier results that seed part of a population."""
@@ -121,9 +122,7 @@ class RunSpec:
             self.posterior,
             self.compare_orders,
         )
-        fingerprint = compute_fingerprint(
-            Path(__file__).parent
-        )  # workers split records and add noise
+        fingerprint = compute_fingerprint(_WORKERS)
         return blake2b(f"{parts}{fingerprint}".encode(), digest_size=16).hexdigest()
 
 

@@ -37,6 +37,7 @@ _SOURCE_PATTERNS = (
     "kernels/*.py",
     "plants/*.py",
     "simulation/*.py",
+    "uncertainty/local_algebra.py",
     "uncertainty/sensitivities.py",
     "residuals/restricted_likelihood.py",
 )

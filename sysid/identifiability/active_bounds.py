@@ -62,13 +62,13 @@ def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
     place : FloatArray, shape (D,)
         In [0, 1].
     """
+    low, high = is_at_bounds(place)
     total = float(influence @ influence)
-    if total == 0.0:
+    if total == 0.0 or not np.any(low | high):
         return np.zeros(place.size, dtype=np.bool_)
     downhill = -(columns.T @ influence)
     size = np.einsum("nd,nd->d", columns, columns)
     share = downhill**2 / np.where(size > 0, size * total, np.inf)
-    low, high = is_at_bounds(place)
     out = (low & (downhill < 0)) | (high & (downhill > 0))
     return np.asarray(out & (share > _MIN_SHARE) & (share * influence.size > _MIN_SIGNIFICANCE))
 

@@ -79,6 +79,8 @@ class ParameterBlock:
 
 def find_blocks(null: FloatArray, member: BoolArray) -> tuple[ParameterBlock, ...]:
     """Find the blocks of orthonormal directions (m, D) over the parameters in `member`."""
+    if not member.any():
+        return ()
     products = np.abs(null.T @ null)
     lengths = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
     linked = products > _LINK_TOLERANCE * np.outer(lengths, lengths)

@@ -47,6 +47,8 @@ def find_translations(
         In the parameters' units; k = 0: there is none.
     """
     _, singular, rows, _ = decomposition
+    if not problem.share("parameters of one unit", lambda: _have_common_units(problem)):
+        return np.zeros((0, theta.size)), 0
     directions = []
     evaluations = 0
     for row in rows[singular < _UNCERTAIN_RATIO * singular[0]]:
@@ -68,6 +70,12 @@ def _round_direction(row: FloatArray, scale: FloatArray) -> FloatArray:
     return np.asarray(
         np.round(_RATIO_DENOMINATOR * physical / physical[largest]) / _RATIO_DENOMINATOR
     )
+
+
+def _have_common_units(problem: Problem) -> bool:
+    """Return whether any two free parameters have the same unit."""
+    units = [parameter.unit for parameter in problem.free_parameters]
+    return len(set(units)) < len(units)
 
 
 def _has_common_unit(problem: Problem, direction: FloatArray) -> bool:

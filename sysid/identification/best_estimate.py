@@ -506,7 +506,10 @@ class _EstimateSearch:
             return
         shares = 2 if problem.loss.noise_model == "ar1" else 1  # the other is the noise model's
         most = self._budget.cap(most, self._reserved, shares)
-        minima = find_local_minima(problem, end.theta, end.rms, linear, state.seed, most)
+        may_jump = self._may_jump()
+        minima = find_local_minima(
+            problem, end.theta, end.rms, linear, state.seed, most, may_jump=may_jump
+        )
         self._budget.spend(minima.evaluations)
         self._move_best(end, minima.evaluations)
         if minima.best is not None:
@@ -515,6 +518,12 @@ class _EstimateSearch:
             self._move_best(IslandEnd(theta, minima.best.rms, True))
             self._analyse(theta, exchanges=groups)
         self._widen_intervals(minima)
+
+    def _may_jump(self) -> bool:
+        """Whether the search met jumps of the loss, or did not probe for them."""
+        searches = [island.search for island in self._state.islands]
+        is_probed = any(one["hop_count"] > 0 for one in searches) and not self._state.is_warm
+        return not is_probed or any(one["fitness_discontinuities"] > 0 for one in searches)
 
     def _move_best(self, reached: IslandEnd, evaluations: int = 0) -> None:
         """Move the best end to where these simulations led from it."""

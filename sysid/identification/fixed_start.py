@@ -169,10 +169,13 @@ def compute_start_slopes(
     depends = _list_states(problem, MeasuredInitial)
     freed = free_start() if depends else problem.share(f"free start of {state}", free_start)
     known = dict(zip(problem.free_names, theta.tolist(), strict=True))
+    place = _join_starts(freed, known, {state: starts})
+    is_start = np.array([name not in known for name in freed.free_names])
 
     def simulate(*steps: float) -> FloatArray:
-        places = [_join_starts(freed, known, {state: starts + step}) for step in steps]
-        return np.asarray(weight * freed.predict(np.array(places))[:, rows])
+        places = np.repeat(place[None], len(steps), axis=0)
+        places[:, is_start] += np.array(steps)[:, None]
+        return np.asarray(weight * freed.predict(places)[:, rows])
 
     experiments = _number_experiments(problem)
     slopes = np.zeros((rows.size, len(problem.experiments)))

@@ -8,8 +8,9 @@ the points that are lowest compared to the linear model. It is repeated around a
 (basin hopping, Wales and Doye, J. Phys. Chem. A 101 (1997) 5111).
 
 Such a minimum often lies on the edge of a jump, where no slope leads along the edge. So at last an
-evolution strategy follows it. The best of a batch of points around the best one replaces it. Their
-spread grows after a gain and shrinks otherwise (Rechenberg, Evolutionsstrategie, 1973).
+evolution strategy follows it, unless the search has probed the loss and met no jump. The best of a
+batch of points around the best one replaces it. Their spread grows after a gain and shrinks
+otherwise (Rechenberg, Evolutionsstrategie, 1973).
 
 A minimum whose likelihood ratio n ln(Σe²/Σe²₀) is below the square of the interval's quantile is
 inside the profile likelihood region (Venzon and Moolgavkar, Appl. Statist. 37 (1988) 87). With the
@@ -96,8 +97,13 @@ def find_local_minima(
     linear: LinearOutputModel,
     seed: int,
     max_simulations: int | None = None,
+    *,
+    may_jump: bool,
 ) -> LocalMinima:
-    """Search for minima around an estimate (D,) with at most `max_simulations` simulations."""
+    """Search for minima around an estimate (D,) with at most `max_simulations` simulations.
+
+    `may_jump`: whether jumps are possible. A rough loss may also just bend.
+    """
     search = _LocalSearch(
         problem, linear, seed, 2**62 if max_simulations is None else max_simulations
     )
@@ -112,8 +118,9 @@ def find_local_minima(
             best = reached  # also if lower by rounding only: the last minimum is the lowest
             if not gains or best.rms == 0:
                 break
-        minima.append(search.run_evolution_strategy(best) if best.rms > 0 else best)
-        best = minima[-1]
+        if may_jump and best.rms > 0:
+            best = search.run_evolution_strategy(best)
+            minima.append(best)
     better = best if best.rms < rms * (1.0 - _GAIN_TOLERANCE) else None
     return LocalMinima(
         better,
@@ -207,19 +214,26 @@ def widen_intervals(
     least = minima.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 2.0 * n * np.log(np.where(minima.rms > least, minima.rms / least, 1.0))
-    changed = []
     index_by_name = {
         one.name: d for d, one in enumerate(parameters) if np.isfinite(variance_ratio[d])
     }
-    for estimate in estimates:
-        if estimate.name in index_by_name and estimate.stderr and estimate.interval95 is not None:
-            d = index_by_name[estimate.name]
-            lower, upper = estimate.interval95
-            quantile, ratios = (upper - lower) / (2.0 * estimate.stderr), ratio * variance_ratio[d]
-            is_compatible = ratios <= quantile**2
-            half = estimate.stderr * np.sqrt(quantile**2 - ratios[is_compatible])
-            middle = minima.values[is_compatible, d]
-            low, high = float(np.min(middle - half)), float(np.max(middle + half))
-            estimate = replace(estimate, interval95=(min(lower, low), max(upper, high)))
-        changed.append(estimate)
-    return mark_poor_intervals(parameters, changed)
+    widened = [
+        _widen_interval(one, minima.values[:, d], ratio * variance_ratio[d])
+        if (d := index_by_name.get(one.name)) is not None
+        else one
+        for one in estimates
+    ]
+    return mark_poor_intervals(parameters, widened)
+
+
+def _widen_interval(estimate: Estimate, values: FloatArray, ratios: FloatArray) -> Estimate:
+    """Widen an interval by the values (m,) of minima with their likelihood ratios (m,)."""
+    if not estimate.stderr or estimate.interval95 is None:
+        return estimate
+    lower, upper = estimate.interval95
+    quantile = (upper - lower) / (2.0 * estimate.stderr)
+    is_compatible = ratios <= quantile**2
+    half = estimate.stderr * np.sqrt(quantile**2 - ratios[is_compatible])
+    middle = values[is_compatible]
+    low, high = float((middle - half).min()), float((middle + half).max())
+    return replace(estimate, interval95=(min(lower, low), max(upper, high)))

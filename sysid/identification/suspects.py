@@ -69,7 +69,7 @@ def find_suspects(problem: Problem, analysis: Analysis, *, are_white: bool) -> l
     error, columns = analysis.residuals_and_sensitivities
     if not np.any(error) or error.size < max(_MIN_SAMPLES, 2 * columns.shape[1]):
         return []
-    left, _, _, retained = compute_truncated_svd(columns)
+    left, _, _, retained = analysis.decomposition or compute_truncated_svd(columns)
     fit = _LinearFit(problem, error, left[:, retained])
     suspects = [one for part in iterate_parts(problem) for one in fit.list_values(part)]
     if not are_white:

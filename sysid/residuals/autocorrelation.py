@@ -20,6 +20,7 @@ ROUNDING_SHARE = 1e-9
 
 _GRID_TOLERANCE = 0.05  # of a period: largest distance of a sample from its grid point
 _MAX_TRANSFORMS = 4  # of lagged inputs that are kept
+_TINY = float(np.finfo(float).tiny)
 _MIN_FILLED_SHARE = 0.5  # of the points of a grid must be filled
 
 
@@ -104,16 +105,29 @@ class Whiteness(NamedTuple):
 
 def compute_whiteness(spaced: SpacedResiduals) -> Whiteness:
     """Compute the autocorrelation over `SpacedResiduals.n_lags` lags, without missing samples."""
-    n = np.count_nonzero(spaced.present)
-    values = _sum_lagged_products(spaced.values, spaced.n_lags) / float(
-        spaced.values @ spaced.values
-    )
+    n, lags = int(np.count_nonzero(spaced.present)), spaced.n_lags
+    values = _sum_lagged_products(spaced.values, lags) / float(spaced.values @ spaced.values)
     if n == spaced.present.size:
-        pairs = n - np.arange(1.0, spaced.n_lags + 1)
+        deviation = _compute_deviation(n, lags)
     else:
-        pairs = _sum_lagged_products(spaced.present.astype(np.float64), spaced.n_lags)
-    deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
+        pairs = _sum_lagged_products(spaced.present.astype(np.float64), lags)
+        deviation = _scale_deviation(n, pairs)
     return Whiteness(values, deviation, float(np.sum(np.square(values / deviation))))
+
+
+@lru_cache(maxsize=8)
+def _compute_deviation(n: int, lags: int) -> FloatArray:
+    """Compute the deviation over some lags of a series without gaps; the runs of a sweep share it.
+
+    The result is read-only.
+    """
+    deviation = _scale_deviation(n, n - np.arange(1.0, lags + 1))
+    deviation.flags.writeable = False
+    return deviation
+
+
+def _scale_deviation(n: int, pairs: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0))))
 
 
 def _sum_lagged_products(values: FloatArray, lags: int) -> FloatArray:
@@ -152,9 +166,8 @@ def compute_lagged_sums(
     weighted = (shifted.transform(2 * (colour.size - 1)) * colour).view(np.float64)
     covariance = weighted @ weighted.T  # real part of the product with the conjugate
     norm = sizes * np.sqrt(float(residual[is_used] @ residual[is_used]))
-    tiny = np.finfo(float).tiny
-    deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
-    return LaggedSums(lags, columns @ residual, np.maximum(norm, tiny), covariance, deviation)
+    deviation = np.sqrt(np.maximum(covariance.diagonal(), _TINY))
+    return LaggedSums(lags, columns @ residual, np.maximum(norm, _TINY), covariance, deviation)
 
 
 class _LaggedInputs(NamedTuple):
@@ -260,6 +273,7 @@ def _autocorrelate(values: FloatArray, length: int) -> FloatArray:
     return irfft(np.square(transform.real) + np.square(transform.imag), length)
 
 
+@lru_cache(maxsize=8)
 def pad_length(least: int) -> int:
     """Return the next even length for a fast transform: a power of 2 times 1, 3, 5, 9 or 15."""
     return min(
@@ -272,10 +286,11 @@ def _choose_window_width(residual: FloatArray, present: BoolArray) -> float:
     n = residual.size
     pairs = max(int(np.count_nonzero(present[1:] & present[:-1])), 1)
     product = float(residual[1:] @ residual[:-1]) * (n - 1) / pairs
-    power = max(float(residual @ residual), np.finfo(float).tiny) * n / np.count_nonzero(present)
+    power = max(float(residual @ residual), _TINY) * n / np.count_nonzero(present)
     rho = min(max(product / power, -0.99), 0.99)
     curvature = 4.0 * rho**2 / (1.0 - rho) ** 4
-    return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
+    width = 2.66 * (curvature * n) ** 0.2
+    return float(min(max(width, n ** (1 / 3)), 0.25 * n))
 
 
 def _make_parzen_window(n: int, width: float) -> FloatArray:

@@ -298,13 +298,13 @@ def _test_whiteness(
     series: ResidualSeries, spaced: SpacedResiduals, level: float, lost: float
 ) -> CorrelationFunction:
     values, deviation, statistic = compute_whiteness(spaced)
-    degrees = max(spaced.n_lags - lost, 1.0)
+    degrees = max(values.size - lost, 1.0)
     test = _make_test(series, "whiteness", None, values / deviation, statistic, degrees, level)
     band = np.concatenate([[0.0], deviation])
     return CorrelationFunction(
         test,
         spaced.period if spaced.is_regular else None,
-        np.arange(0.0, spaced.n_lags + 1),
+        np.arange(0.0, values.size + 1),
         np.concatenate([[1.0], values]),
         _BAND95 * band,
         _BAND99 * band,
@@ -328,7 +328,8 @@ def _test_independence(
         reason = "the residual is the same everywhere"
         return _make_untested(series, "independence", channel.name, reason)
     colour = smooth_spectrum_root(residual, spaced.present)
-    past = compute_lagged_sums(spaced, residual, colour, channel, np.arange(spaced.n_lags + 1.0))
+    lags = float(spaced.n_lags)
+    past = compute_lagged_sums(spaced, residual, colour, channel, np.arange(lags + 1.0))
     if isinstance(past, str):
         return _make_untested(series, "independence", channel.name, past)
     scaled = past.sums / past.deviation
@@ -340,9 +341,7 @@ def _test_independence(
     test = _make_test(series, "independence", channel.name, scaled, statistic, degrees, level)
     parts = [past]
     if both_sides:
-        future = compute_lagged_sums(
-            spaced, residual, colour, channel, np.arange(-float(spaced.n_lags), 0.0)
-        )
+        future = compute_lagged_sums(spaced, residual, colour, channel, np.arange(-lags, 0.0))
         parts = [past] if isinstance(future, str) else [future, past]
     band = np.concatenate([part.deviation / part.norm for part in parts])
     return CorrelationFunction(

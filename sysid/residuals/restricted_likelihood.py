@@ -27,8 +27,10 @@ from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness, 
 MAX_POLE = 0.97
 """Limit on an autoregressive pole: beyond, it follows a single drift (Andrews and Monahan 1992)."""
 
-_SEARCH_STARTS = ((0.6, -1.5), (1.5, 0.0))
-_SEARCH_OPTIONS = {"maxfev": 80, "xatol": 0.02, "fatol": 0.02}  # evaluations; tolerances
+_SEARCH_STARTS = np.array([[0.6, -1.5], [1.5, 0.0]])
+_FIRST_SHARE, _FIRST_STEP = 0.05, 2.5e-4  # of an argument: sides of the first simplex; of one at 0
+_MAX_EVALUATIONS, _TOLERANCE = 80, 0.02  # of a search; of both arguments and the deviance
+_TINY = float(np.finfo(float).tiny)
 _DIFFERENCE_STEP = 0.1  # of the two arguments, for finite differences
 _MIN_CURVATURE = 0.05  # a flatter likelihood counts as having this curvature
 _MIN_CHANCE = 0.05  # least p-value of the innovations for whiteness
@@ -80,47 +82,34 @@ def fit_noise_colour(spaced: SpacedResiduals, columns: FloatArray) -> NoiseColou
     columns : FloatArray, shape (n, D)
         Sensitivities of the present samples.
     """
-    from scipy.optimize import minimize  # imported late, as below: slow to load, rarely needed
-
     values = spaced.values[spaced.present]
     left_vectors, _, _, is_independent = compute_truncated_svd(columns)
     basis = left_vectors[:, is_independent]
     series = _ObservedSeries(values, basis, np.diff(np.flatnonzero(spaced.present)))
     if values.size <= basis.shape[1] + 2:
         return None
-    solutions = [
-        minimize(_compute_deviance, start, (series,), method="Nelder-Mead", options=_SEARCH_OPTIONS)
-        for start in _SEARCH_STARTS
-    ]
-    best = min(solutions, key=lambda solution: float(solution.fun)).x
+    best = _minimise_deviance(series)
     innovations, power, _ = _compute_innovations(best, series)
     if not power > 0 or not _are_white(innovations):
         return None
+    spaced_columns = np.zeros((spaced.values.size, columns.shape[1]))
+    spaced_columns[spaced.present] = columns
     steps = _DIFFERENCE_STEP * np.eye(2)
-    middles = [_compute_middle(best + step, spaced, columns, series) for step in (*steps, *-steps)]
+    middles = [_compute_middle(best + step, spaced_columns, series) for step in (*steps, *-steps)]
     slopes = np.array([(middles[i] - middles[i + 2]) / (2.0 * _DIFFERENCE_STEP) for i in range(2)])
     degrees = float(values.size - basis.shape[1])
     a, w = _to_pole_and_share(best)
     share = 1.0 / (1.0 + (1.0 - w) * 2.0 * a / (1.0 - a))
-    middle = _compute_middle(best, spaced, columns, series)
+    middle = _compute_middle(best, spaced_columns, series)
     return NoiseColourModel(
         middle, slopes, _estimate_covariance(best, series), degrees, min(share, 1.0)
     )
 
 
+@jit_compile
 def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
     """Convert the two arguments to the pole and the share of white noise."""
-    from scipy.special import expit
-
-    return MAX_POLE * float(np.tanh(place[0])), float(expit(place[1]))
-
-
-def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
-    """Whiten basis and values, (n, r + 1), and compute ln det R."""
-    a, w = _to_pole_and_share(place)
-    columns = np.column_stack([series.basis, series.values])
-    carried = np.asarray(a**series.gaps, dtype=np.float64)
-    return columns, _whiten_in_place(carried, w, columns)
+    return MAX_POLE * np.tanh(place[0]), 1.0 / (1.0 + np.exp(-place[1]))
 
 
 @jit_compile
@@ -146,26 +135,129 @@ def _whiten_in_place(carried: FloatArray, w: float, columns: FloatArray) -> floa
     return 2.0 * log_determinant
 
 
+@jit_compile
 def _compute_innovations(
     place: FloatArray, series: _ObservedSeries
 ) -> tuple[FloatArray, float, float]:
     """Compute the innovations (n,), their sum of squares, and ln of both determinants."""
-    whitened, log_determinant = _whiten_series(place, series)
-    basis, values = whitened[:, :-1], whitened[:, -1]
-    gram = basis.T @ basis
-    innovations = values - basis @ np.linalg.solve(gram, basis.T @ values)
-    return (
-        innovations,
-        float(innovations @ innovations),
-        log_determinant + float(np.linalg.slogdet(gram)[1]),
-    )
+    a, w = _to_pole_and_share(place)
+    n, r = series.basis.shape
+    whitened, carried = np.empty((n, r + 1)), np.empty(n - 1)
+    for i in range(n):
+        for k in range(r):
+            whitened[i, k] = series.basis[i, k]
+        whitened[i, r] = series.values[i]
+        if i > 0:
+            carried[i - 1] = a ** float(series.gaps[i - 1])
+    determinants = _whiten_in_place(carried, w, whitened)
+    coefficients, log_determinant = _regress_last(whitened)
+    innovations, power = np.empty(n), 0.0
+    for i in range(n):
+        innovations[i] = whitened[i, r]
+        for k in range(r):
+            innovations[i] -= coefficients[k] * whitened[i, k]
+        power += innovations[i] ** 2
+    return innovations, power, determinants + log_determinant
 
 
+@jit_compile
+def _regress_last(columns: FloatArray) -> tuple[FloatArray, float]:
+    """Regress the last of columns (n, r + 1) on the others: coefficients (r,), ln det of XᵀX."""
+    r = columns.shape[1] - 1
+    factor = _sum_products(columns)  # becomes Cholesky's; its last row becomes the solution
+    log_determinant = 0.0
+    for k in range(r):
+        factor[k, k] = np.sqrt(factor[k, k])
+        log_determinant += 2.0 * np.log(factor[k, k])
+        for j in range(k + 1, r + 1):
+            factor[j, k] /= factor[k, k]
+            for m in range(k + 1, min(j + 1, r)):
+                factor[j, m] -= factor[j, k] * factor[m, k]
+    for k in range(r - 1, -1, -1):
+        for j in range(k + 1, r):
+            factor[r, k] -= factor[j, k] * factor[r, j]
+        factor[r, k] /= factor[k, k]
+    return factor[r], log_determinant
+
+
+@jit_compile
+def _sum_products(columns: FloatArray) -> FloatArray:
+    """Sum the products (c, c) of columns (n, c) with each other: the lower triangle."""
+    n, count = columns.shape
+    products = np.zeros((count, count))
+    for i in range(n):
+        for j in range(count):
+            for k in range(j + 1):
+                products[j, k] += columns[i, j] * columns[i, k]
+    return products
+
+
+@jit_compile
 def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
     """Compute -2 ln of the restricted likelihood, without a constant."""
     _, power, determinants = _compute_innovations(place, series)
     n, r = series.basis.shape
-    return float((n - r) * np.log(max(power, float(np.finfo(float).tiny))) + determinants)
+    deviance: float = (n - r) * np.log(max(power, _TINY)) + determinants
+    return deviance
+
+
+def _minimise_deviance(series: _ObservedSeries) -> FloatArray:
+    """Find the two arguments by the simplex of Nelder and Mead (1965), the best of all starts."""
+    best: FloatArray = _SEARCH_STARTS[0].copy()
+    least = np.inf
+    places, deviances = np.empty((3, 2)), np.empty(3)
+    for start in _SEARCH_STARTS:
+        for k in range(3):
+            places[k] = start
+            if k > 0:
+                places[k, k - 1] += _FIRST_SHARE * start[k - 1] if start[k - 1] else _FIRST_STEP
+            deviances[k] = _compute_deviance(places[k], series)
+        count = 3
+        _sort_simplex(places, deviances)
+        while count < _MAX_EVALUATIONS and (
+            np.max(np.abs(places[1:] - places[0])) > _TOLERANCE
+            or np.max(np.abs(deviances[1:] - deviances[0])) > _TOLERANCE
+        ):
+            count += _move_simplex(places, deviances, series)
+            _sort_simplex(places, deviances)
+        if deviances[0] < least:
+            best, least = places[0].copy(), deviances[0]
+    return best
+
+
+def _move_simplex(places: FloatArray, deviances: FloatArray, series: _ObservedSeries) -> int:
+    """Replace the worst of three places, or shrink them to the best; count the evaluations."""
+    middle = 0.5 * (places[0] + places[1])
+    away = middle - places[2]
+    reflected = middle + away
+    value = _compute_deviance(reflected, series)
+    if value < deviances[0]:
+        expanded = middle + 2.0 * away
+        further = _compute_deviance(expanded, series)
+        if further < value:
+            places[2], deviances[2] = expanded, further
+        else:
+            places[2], deviances[2] = reflected, value
+        return 2
+    if value < deviances[1]:
+        places[2], deviances[2] = reflected, value
+        return 1
+    limit = min(value, deviances[2])
+    contracted = middle + (0.5 if value < deviances[2] else -0.5) * away
+    nearer = _compute_deviance(contracted, series)
+    if nearer <= limit:
+        places[2], deviances[2] = contracted, nearer
+        return 2
+    for k in range(1, 3):
+        places[k] = 0.5 * (places[0] + places[k])
+        deviances[k] = _compute_deviance(places[k], series)
+    return 4
+
+
+def _sort_simplex(places: FloatArray, deviances: FloatArray) -> None:
+    """Sort three places by their deviance, in place; one that is not a number comes last."""
+    order = np.argsort(deviances, kind="stable")
+    places[:], deviances[:] = places[order], deviances[order]
 
 
 def _are_white(values: FloatArray) -> bool:
@@ -173,23 +265,28 @@ def _are_white(values: FloatArray) -> bool:
     return chi_square_tail(spaced.n_lags, compute_whiteness(spaced).statistic) >= _MIN_CHANCE
 
 
+@jit_compile
 def _compute_middle(
-    place: FloatArray, spaced: SpacedResiduals, columns: FloatArray, series: _ObservedSeries
+    place: FloatArray, spaced_columns: FloatArray, series: _ObservedSeries
 ) -> FloatArray:
-    """Compute SᵀRS (D, D)."""
-    from scipy.linalg import solve_banded
-
+    """Compute SᵀRS (D, D) from sensitivities (N, D), which are 0 where a sample is missing."""
     a, w = _to_pole_and_share(place)
     n, r = series.basis.shape
     variance = _compute_innovations(place, series)[1] / (n - r)
-    spaced_columns = np.zeros((spaced.values.size, columns.shape[1]))
-    spaced_columns[spaced.present] = columns
-    recursion = np.array([[1.0], [-a]]) * np.ones(spaced.values.size)
-    forward = solve_banded((1, 0), recursion, spaced_columns)
-    backward = solve_banded((1, 0), recursion, spaced_columns[::-1])[::-1]
-    first_order = spaced_columns.T @ (forward + backward - spaced_columns)
-    middle = variance * ((1.0 - w) * first_order + w * (columns.T @ columns))
-    return np.asarray(0.5 * (middle + middle.T))
+    size, d = spaced_columns.shape
+    past = np.zeros(d)  # Σ aᵏ S(i - k) over k > 0
+    gram, lagged = np.zeros((d, d)), np.zeros((d, d))
+    for i in range(size):
+        for j in range(d):
+            for k in range(d):
+                gram[j, k] += spaced_columns[i, j] * spaced_columns[i, k]
+                lagged[j, k] += spaced_columns[i, j] * past[k]
+        for k in range(d):
+            past[k] = a * (past[k] + spaced_columns[i, k])
+    for j in range(d):
+        for k in range(d):
+            gram[j, k] = variance * (gram[j, k] + (1.0 - w) * (lagged[j, k] + lagged[k, j]))
+    return gram
 
 
 def _estimate_covariance(place: FloatArray, series: _ObservedSeries) -> FloatArray:

@@ -163,15 +163,16 @@ def count_repeats(problem: Problem) -> int:
 
 
 def _list_repeats(parts: Sequence[ResidualPart]) -> list[IntArray]:
-    """List the scored samples of each repeat of each experiment, over all of its outputs."""
+    """List the scored samples of each repeat of each experiment; none if none was pooled."""
+    if all(part.repeats is None for part in parts):
+        return []
     clusters: dict[tuple[int, float], list[IntArray]] = {}
     for part in parts:
         numbers = np.zeros(part.times.size) if part.repeats is None else part.repeats
         for number in np.unique(numbers).tolist():
             rows = part.rows.start + np.flatnonzero(numbers == number)
             clusters.setdefault((part.experiment, number), []).append(rows)
-    are_pooled = any(part.repeats is not None for part in parts)
-    return [np.concatenate(rows) for rows in clusters.values()] if are_pooled else []
+    return [np.concatenate(rows) for rows in clusters.values()]
 
 
 def _estimate_by_repeats(

@@ -42,22 +42,36 @@ class ResidualPart(NamedTuple):
 
 
 def iterate_parts(problem: Problem) -> Iterator[ResidualPart]:
-    """Iterate over the series of a problem's scored samples, in their order."""
-    measured = problem.split_by_output(problem.evaluator.weight * problem.evaluator.measured)
+    """Iterate over the series of a problem's scored samples, in their order.
+
+    The runs of a sweep share them, but not a problem from which samples are left out.
+    """
+    evaluator, rows = problem.evaluator, problem.scored_rows
+    weight, parts = problem.share(
+        "residual series", lambda: (evaluator.weight, _list_parts(problem))
+    )
+    sizes = np.abs(evaluator.weight[rows] * evaluator.measured[rows])
+    for part in parts if weight is evaluator.weight else _list_parts(problem):
+        yield part._replace(largest_value=float(np.max(sizes[part.rows])))
+
+
+def _list_parts(problem: Problem) -> list[ResidualPart]:
+    """List the series without their largest values."""
+    listed, first = [], 0
     weights = problem.split_by_output(problem.evaluator.weight)
-    first = 0
-    parts = zip(problem.records, weights, measured, strict=True)
-    for experiment, (record, weight, sizes) in enumerate(parts):
+    for experiment, (record, weight) in enumerate(zip(problem.records, weights, strict=True)):
         channels = {channel.name: channel for channel in record.outputs}
         for output, output_weight in weight.items():
             scored, channel = output_weight > 0, channels[output]
             n = int(np.count_nonzero(scored))
             if n:
-                size = float(np.max(np.abs(sizes[output][scored])))
                 rows = slice(first, first + n)
                 repeats = None if channel.repeats is None else channel.repeats[scored]
-                yield ResidualPart(experiment, output, rows, channel.times[scored], size, repeats)
+                listed.append(
+                    ResidualPart(experiment, output, rows, channel.times[scored], 0.0, repeats)
+                )
             first += n
+    return listed
 
 
 def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:

@@ -57,6 +57,13 @@ from sysid.uncertainty.estimates import (
 from sysid.uncertainty.intervals import LocalStatistics, make_estimates
 from sysid.uncertainty.likelihood import LikelihoodModel
 from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs
+from sysid.uncertainty.local_algebra import (
+    compute_correlation,
+    compute_descent,
+    compute_explained_share,
+    invert_squared,
+    scale_matrix,
+)
 from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, compute_sensitivities
 
 
@@ -113,7 +120,7 @@ def analyse_estimate(
     except BudgetSpentError as spent:
         return _analyse_without_sensitivities(problem, theta, spent, whitening)
     if whitening is not None:
-        columns = whitening.whiten(sensitivities.columns.T).T
+        columns = np.ascontiguousarray(whitening.whiten(sensitivities.columns.T).T)
         sensitivities = sensitivities._replace(
             residuals=whitening.whiten(sensitivities.residuals), columns=columns
         )
@@ -176,29 +183,31 @@ def _analyse_sensitivities(
     left = None if max_simulations is None else max_simulations - count
     shifts, spent = find_translations(problem, theta, decomposition, scale, left)
     count += spent
-    moving, n_symmetries = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    still = np.concatenate([powers * theta, shifts])  # (k, D) without effect on the output
+    moving, n_symmetries = remove_symmetries(columns, still / scale)
     _, singular, rows, retained = (
         decomposition if moving is columns else compute_truncated_svd(moving)
     )
     columns, retained = moving, retained.copy()
     retained[d - n_symmetries :] = False
-    inverse = (rows[retained].T / singular[retained] ** 2) @ rows[retained]
+    inverse = invert_squared(singular, rows, retained)
     colour = estimate_sandwich(problem, influence, columns)
     covariance, noise, middle = _estimate_covariance(
         error, columns, inverse, problem.loss_scale, colour
     )
     # A scaling does not move a factor that is 0. It moves the others, without any effect.
-    moved = _find_moved_parameters(powers * theta) | _find_moved_parameters(shifts)
+    moved = np.any(still != 0.0, axis=0)
     directions = classify_directions(singular, rows, ~retained, moved, covariance, noise)
-    physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
+    on_plateaus = covariance + np.diag(plateau**2 / 12.0) if has_plateau else covariance
+    physical = scale_matrix(on_plateaus, scale)
     blocks = find_unidentified(directions)
     names = problem.free_names
     degrees = _compute_degrees_of_freedom(n, inverse, colour, whitening)
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
-        correlation=_to_correlation(physical),
-        sensitivity_correlation=_to_correlation(inverse * np.outer(scale, scale)),
+        correlation=compute_correlation(physical),
+        sensitivity_correlation=compute_correlation(scale_matrix(inverse, scale)),
         condition=float(singular[0] / singular[-1]) if retained.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
@@ -246,11 +255,6 @@ def _analyse_sensitivities(
         decomposition=decomposition,
         likelihood=LikelihoodModel(error, columns, middle, uncertainty.degrees, whitening),
     )
-
-
-def _find_moved_parameters(directions: FloatArray) -> BoolArray:
-    """Find the parameters (D,) that any of the directions (m, D) moves."""
-    return np.asarray(np.any(directions != 0.0, axis=0))
 
 
 def _find_active_bounds(
@@ -361,16 +365,18 @@ def _compute_possible_gain(
     not move. Then the bound holds it, and the estimate is optimal inside its bounds. A known
     `decomposition` of the sensitivities is used where all parameters may move.
     """
-    total = float(influence @ influence)
-    downhill = -(columns.T @ influence)
     at_lower, at_upper = is_at_bounds(place)
-    is_held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
-    if total == 0.0 or is_held.all():
+    if not influence.any():
         return 0.0
-    if decomposition is None or is_held.any():
-        decomposition = compute_truncated_svd(columns[:, ~is_held])
-    left, _, _, retained = decomposition
-    return float(np.sum((left[:, retained].T @ influence) ** 2)) / total
+    if np.any(at_lower | at_upper):
+        downhill = compute_descent(columns, influence)
+        is_held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
+        if is_held.all():
+            return 0.0
+        if is_held.any():
+            decomposition = compute_truncated_svd(columns[:, ~is_held])
+    decomposition = decomposition or compute_truncated_svd(columns)
+    return compute_explained_share(decomposition.left, decomposition.retained, influence)
 
 
 def _estimate_covariance(
@@ -455,14 +461,6 @@ def compute_physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     ratio = np.where(problem.evaluator.is_log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
     return np.asarray(np.where(problem.evaluator.is_log > 0, theta * np.log(ratio), upper - lower))
-
-
-def _to_correlation(covariance: FloatArray) -> FloatArray:
-    deviation = np.sqrt(np.diag(covariance))
-    safe = np.where(deviation > 0, deviation, 1.0)
-    correlation = covariance / np.outer(safe, safe)
-    np.fill_diagonal(correlation, 1.0)
-    return np.asarray(np.clip(correlation, -1.0, 1.0))
 
 
 def _make_estimates_without_stderr(

@@ -89,18 +89,16 @@ def mark_poor_intervals(
 
 def keep_in_bounds(estimates: Sequence[Estimate]) -> tuple[Estimate, ...]:
     """Cut the intervals of free parameters at their bounds."""
-    return tuple(
-        replace(
-            one,
-            interval95=(
-                min(max(one.interval95[0], one.lower), one.upper),
-                max(min(one.interval95[1], one.upper), one.lower),
-            ),
-        )
-        if one.is_free and one.interval95 is not None
-        else one
-        for one in estimates
-    )
+    return tuple(_keep_in_bounds(one) for one in estimates)
+
+
+def _keep_in_bounds(estimate: Estimate) -> Estimate:
+    if not estimate.is_free or estimate.interval95 is None:
+        return estimate
+    lower, upper = (min(max(end, estimate.lower), estimate.upper) for end in estimate.interval95)
+    if (lower, upper) == estimate.interval95:
+        return estimate
+    return replace(estimate, interval95=(lower, upper))
 
 
 def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from sysid.core.linear_algebra import compute_truncated_svd
 from sysid.core.types import BoolArray, FloatArray
 from sysid.simulation.scaling import is_at_bounds
+from sysid.uncertainty.local_algebra import compute_descent, scale_matrix
 
 _RANDOM_STREAM = 2**63
 
@@ -101,14 +102,15 @@ def linearise_outputs(
     variance = total / (n - d)
     is_stated = (stated > 0) & ~on_plateau
     white = variance * np.diag(inverse)
-    slope = np.where(on_plateau, 0.0, columns.T @ error)
+    slope = -compute_descent(columns, error)
     if on_plateau.any():
+        slope[on_plateau] = 0.0
         inverse, root = _remove_parameters(root, on_plateau)
     at_lower, at_upper = is_at_bounds(place)
     leads_out = (at_lower & (slope > 0)) | (at_upper & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
     return LinearOutputModel(
-        covariance=variance * inverse * np.outer(scale, scale),
+        covariance=scale_matrix(variance * inverse, scale),
         information_root=root / unit,
         outward_slope=np.where(leads_out, slope, 0.0) / unit,
         sum_of_squares=total,

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.signal import lfilter
 
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.data.noise import Noise, draw_noise
-from sysid.identification import local_minima
+from sysid.identification import best_estimate, local_minima
 from sysid.identification.conclude import conclude_run
 from sysid.identification.identify import identify
 from sysid.identification.local_minima import (
@@ -39,12 +40,14 @@ def rough(seed: int = 70_043) -> Problem:
     return Problem.build(load_model("coulomb-eq16"), [record(noisy("coulomb-eq16", seed=seed))])
 
 
-def around(problem: Problem, start: np.ndarray, left: int | None = None) -> LocalMinima:
+def around(
+    problem: Problem, start: np.ndarray, left: int | None = None, *, may_jump: bool = True
+) -> LocalMinima:
     end = refine_candidates(problem, [start])[0]
     assert end is not None
     linear = analyse_estimate(problem, end.theta).linear_model
     assert linear is not None
-    return find_local_minima(problem, end.theta, end.rms, linear, 1, left)
+    return find_local_minima(problem, end.theta, end.rms, linear, 1, left, may_jump=may_jump)
 
 
 def test_beside_the_optimum_of_a_smooth_loss_nothing_more_than_a_look_is_spent() -> None:
@@ -90,7 +93,8 @@ def test_few_samples_do_not_make_a_linear_regression_rough(n: int, d: int) -> No
         root = np.linalg.qr(columns)[1]
         linear = linearise_outputs(error, columns, one < 0, 0.5 * one, one, one, inverse, root)
         rms = float(np.sqrt(np.mean(error**2)))
-        found = find_local_minima(Regression(), theta, rms, linear, seed)  # type: ignore[arg-type]
+        problem: Any = Regression()
+        found = find_local_minima(problem, theta, rms, linear, seed, may_jump=True)
         assert found.evaluations == 24
 
 
@@ -176,6 +180,27 @@ def test_beside_a_minimum_of_a_rough_loss_others_are_found_inside_bounds_and_bud
     assert found.rms == pytest.approx(problem.evaluate_fitness(found.values), rel=1e-12)
     if found.best is not None:
         assert found.best.rms == found.rms.min() < found.rms[0]
+
+
+def test_an_edge_is_followed_only_where_the_loss_jumps() -> None:
+    jumping, bending = (around(rough(), FALSE, may_jump=jumps) for jumps in (True, False))
+    assert jumping.rms[:-1].tobytes() == bending.rms.tobytes()
+    assert jumping.evaluations > bending.evaluations
+
+
+def test_a_search_tells_whether_the_loss_jumps(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+
+    def listen(*_: object, may_jump: bool, **__: object) -> LocalMinima:
+        told.append(may_jump)
+        return LocalMinima(None, np.zeros((1, 4)), np.zeros(1), 0)
+
+    monkeypatch.setattr(best_estimate, "find_local_minima", listen)
+    for model in ("duffing-eq16", "coulomb-eq16"):
+        identify(load_model(model), record(noisy(model)), seed=1)
+    unprobed = GeneticAlgorithm(generations=2)
+    identify(load_model("duffing-eq16"), record(noisy()), unprobed, seed=1)
+    assert told == [False, True, True]
 
 
 def test_one_of_several_minima_leads_to_a_better_one() -> None:
