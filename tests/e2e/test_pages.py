@@ -119,8 +119,9 @@ def test_plots_of_a_finished_job_follow_the_keyboard_the_scheme_and_the_wish_for
 
 
 def test_a_printed_page_has_every_figure_and_each_is_saved_as_an_image(
-    site: Site, page: Page
+    site: Site, scripted_page: Page
 ) -> None:
+    page = scripted_page
     page.add_init_script("window.print = () => { window.sheets = document.body.className; }")
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
     page.keyboard.press("Control+p")
@@ -242,8 +243,9 @@ def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page
 
 
 def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(
-    own_site: Site, page: Page
+    own_site: Site, scripted_page: Page
 ) -> None:
+    page = scripted_page
     job, database = own_site.filled.queued, own_site.parts.database
     with database.write_session() as session:
         JobRepository(session).cancel(job)
