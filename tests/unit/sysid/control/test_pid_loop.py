@@ -357,7 +357,7 @@ def test_steps_are_divided_where_the_filter_is_faster_than_they_are() -> None:
     fast = replace(PID, derivative_filter=100.0)  # its lag is 0.8 ms, a step 10 ms
     loop, found = simulated(lag(), fast)
     assert loop.model.solver.substeps == 32
-    output, _ = by_hand(fast, fine=640)
+    output, _ = by_hand(fast, fine=320)
     np.testing.assert_allclose(found.channel("y").values, output, atol=4e-3)
     assert close_loop(lag(), PID, STEP).model.solver.substeps == 2
     assert close_loop(lag(), PI, STEP).model.solver.substeps == 1
