@@ -15,9 +15,9 @@ from typing import NamedTuple
 import pytest
 
 from service.cli.main import main
+from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 
-LIMIT_SECONDS = 240.0  # beside other work what a command compiles takes minutes
 PROGRAM = (sys.executable, "-m", "service.cli.main")
 NO_SERVER = {"LAGID_URL": "http://127.0.0.1:1"}
 

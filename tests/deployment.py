@@ -26,9 +26,9 @@ from moto.server import ThreadedMotoServer
 from service.client.embedded import find_free_port
 from service.dispatch.supervisor import clear_session
 from tests.database import empty_postgres
+from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 
-LIMIT_SECONDS = 240.0
 STOP_SECONDS = 30.0
 PAUSE_SECONDS = 0.5
 MAX_RESTARTS = 5

@@ -26,11 +26,10 @@ from service.storage.sessions import Database
 from service.storage.tables import Job, Run
 from sysid.data.records import Recording
 from tests.database import migrated_postgres, migrated_sqlite
+from tests.limits import LIMIT_SECONDS
 from tests.runs import step_record
 from tests.stores import make_bucket
 from workers.protocol import Executor
-
-LIMIT_SECONDS = 240.0  # beside other work the search alone is compiled for two minutes
 
 
 class Place:

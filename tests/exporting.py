@@ -14,6 +14,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
 from sysid.models.model import Model
 from sysid.simulation.simulate import simulate
+from tests.limits import LIMIT_SECONDS
 from tests.needs import report_missing
 
 FLAGS = ("-O1", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
@@ -72,7 +73,7 @@ def compiled(folder: Path, sources: Mapping[str, str]) -> ctypes.CDLL:
         [compiler(), *FLAGS, *map(str, paths), "-o", str(library), "-lm"],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=LIMIT_SECONDS,
         check=False,
     )
     assert done.returncode == 0, done.stderr

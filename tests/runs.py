@@ -12,6 +12,7 @@ from sysid.data.records import Channel, Record
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
+from tests.limits import LIMIT_SECONDS
 from workers.protocol import (
     CompleteRun,
     Executor,
@@ -39,7 +40,6 @@ def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:
     return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
 
 
-LIMIT_SECONDS = 240.0  # beside other work the search alone is compiled for two minutes
 RECORDS: Mapping[str, Records] = {"short": (step_record(),), "long": (step_record(4000),)}
 
 

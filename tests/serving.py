@@ -9,7 +9,8 @@ from contextlib import contextmanager
 import uvicorn
 from fastapi import FastAPI
 
-STOP_LIMIT_SECONDS = 180.0
+from tests.limits import LIMIT_SECONDS
+
 REQUESTS_LIMIT_SECONDS = 10
 """How long a stopping server waits for requests that run, and for streams."""
 
@@ -43,5 +44,5 @@ def serve_in_thread(app: FastAPI, bound: socket.socket | None = None) -> Iterato
         if hasattr(app.state, "parts"):
             app.state.parts.stopping.set()
         server.should_exit = True
-        thread.join(timeout=STOP_LIMIT_SECONDS)
+        thread.join(timeout=LIMIT_SECONDS)
         assert not thread.is_alive(), "the server did not stop"

@@ -20,8 +20,8 @@ from benchmarks.breaking.stand import Stand, standing_service, until
 from benchmarks.breaking.work import DEADLY, GREEDY
 from service.storage.tables import Checkpoint, Job, Run
 from tests.foreign_modules import ForeignFolder
+from tests.limits import LIMIT_SECONDS
 
-LIMIT_SECONDS = 200.0
 LEASE_SECONDS = 2.0
 DISK_MEGABYTES = 128
 ENDLESS = {"generations": 10_000_000, "stop": {"settled": None}}

@@ -16,6 +16,7 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.jobs import JobRepository
 from service.storage.sessions import Database
+from tests.limits import LIMIT_SECONDS
 from tests.stored import claim, claimed, job_of, parcels_of, runs_of, state_of, submit
 
 pytestmark = pytest.mark.postgres  # SQLite has one writer at a time
@@ -41,7 +42,7 @@ class Beside:
             self._error = error
 
     def join(self) -> None:
-        self._thread.join(30.0)
+        self._thread.join(LIMIT_SECONDS)
         assert not self._thread.is_alive()
         if self._error is not None:
             raise self._error
@@ -53,7 +54,7 @@ def wait_until_blocked(database: Database) -> None:
         "SELECT count(*) FROM pg_stat_activity "
         "WHERE datname = current_database() AND wait_event_type = 'Lock'"
     )
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + LIMIT_SECONDS
     with database.engine.connect() as connection:
         while not connection.scalar(query):
             connection.rollback()

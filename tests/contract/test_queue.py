@@ -13,6 +13,7 @@ from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import LeaseLost, RowConflict
+from tests.limits import LIMIT_SECONDS
 from tests.stored import (
     Clock,
     claim,
@@ -206,7 +207,7 @@ def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(
 
     holder = threading.Thread(target=hold)
     holder.start()
-    is_held.wait(20)
+    is_held.wait(LIMIT_SECONDS)
     got = claim(database, "d1", clock)
     holder.join()
     assert parcel_of(database, got.job.id).lease_until == Clock().now + LEASE

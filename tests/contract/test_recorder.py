@@ -38,6 +38,7 @@ from sysid.search.archive import make_archive
 from sysid.search.island import Island
 from sysid.search.state import SEARCH_RECORD, Improvement, Migrant
 from tests.dispatching import Place
+from tests.limits import LIMIT_SECONDS
 from tests.results import conclude, encode_results
 from tests.runs import encode_runs, spec
 from tests.searching import bits
@@ -206,7 +207,7 @@ class Held:
         self.gate, self.pool = threading.Event(), ThreadPoolExecutor(1)
 
     def __call__(self, work: Callable[[], Any]) -> Future[Any]:
-        return self.pool.submit(lambda: (self.gate.wait(30.0), work()))
+        return self.pool.submit(lambda: (self.gate.wait(LIMIT_SECONDS), work()))
 
     def let_go(self) -> None:
         self.gate.set()

@@ -22,6 +22,7 @@ from playwright.sync_api import (
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from tests.e2e.filled import Filled, copy_filled
+from tests.limits import LIMIT_SECONDS
 from tests.needs import report_missing
 from tests.rest import settings_of
 from tests.serving import serve_in_thread
@@ -39,8 +40,6 @@ ARGUMENTS = [
     "--process-per-site",  # one process for all tabs: it keeps compiled scripts
 ]
 
-LIMIT_SECONDS = 180.0
-"""How long an answer may take: compiling what it needs takes minutes beside other work."""
 VIEWPORT: ViewportSize = {"width": 1280, "height": 900}
 REFUSED = re.compile("status of (409|412|422)")
 """Answers to what a user may try; the page explains them."""

@@ -11,7 +11,8 @@ from playwright.sync_api import Page, expect
 
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from tests.e2e.conftest import LIMIT_SECONDS, Site, serve_folder
+from tests.e2e.conftest import Site, serve_folder
+from tests.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -8,9 +8,10 @@ import pytest
 from playwright.sync_api import BrowserContext, Page, Request, Route, expect
 
 from service.repositories.jobs import JobRepository
-from tests.e2e.conftest import LIMIT_SECONDS, Site
+from tests.e2e.conftest import Site
 from tests.e2e.filled import MODEL, end_running, progress
 from tests.e2e.test_form import EQUATIONS, opened, write_own
+from tests.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -7,8 +7,9 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.e2e.conftest import LIMIT_SECONDS, serve_folder
+from tests.e2e.conftest import serve_folder
 from tests.identified import carried_out
+from tests.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -7,7 +7,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from service.repositories.jobs import JobRepository
-from tests.e2e.conftest import LIMIT_SECONDS, Site
+from tests.e2e.conftest import Site
+from tests.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

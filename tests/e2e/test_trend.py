@@ -8,8 +8,9 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.batches import LENGTHS, copy_batch
-from tests.e2e.conftest import LIMIT_SECONDS, serve_folder
+from tests.e2e.conftest import serve_folder
 from tests.e2e.test_late_answers import LIVE
+from tests.limits import LIMIT_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

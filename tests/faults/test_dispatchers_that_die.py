@@ -12,6 +12,7 @@ from service.queue.leases import LeaseQueue
 from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
+from tests.limits import LIMIT_SECONDS
 from tests.stored import job_of, runs_of, submit
 
 pytestmark = pytest.mark.slow  # processes of their own
@@ -54,7 +55,7 @@ def _fall_silent(database, lease):
 def _dispatch(url, owner, trouble, before, claimed, refused):
     """Claim and work for ever; the first claim comes after `before` and meets the trouble."""
     database = Database(url)
-    before.wait(180)
+    before.wait(LIMIT_SECONDS)
     while True:
         with database.write_session() as session:
             queue = LeaseQueue(session)
@@ -89,13 +90,13 @@ def test_each_run_has_one_result_though_dispatchers_die_and_stall(database):
     ]
     for process in processes:
         process.start()
-    limit = time.monotonic() + 180
+    limit = time.monotonic() + LIMIT_SECONDS
     try:
         while not _finished(database, jobs) and time.monotonic() < limit:
             time.sleep(0.1)
-        owner, late = refused.get(timeout=60)
+        owner, late = refused.get(timeout=LIMIT_SECONDS)
         while owner != "stalling":  # on a busy machine others may be late as well
-            owner, late = refused.get(timeout=60)
+            owner, late = refused.get(timeout=LIMIT_SECONDS)
     finally:
         for process in processes:
             process.kill()

@@ -11,9 +11,10 @@ import pytest
 from benchmarks.breaking.disks import fill_folders
 from benchmarks.breaking.stand import until
 from service.core.states import JobState
+from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 from tests.rest import CSV, PROBLEM
-from tests.standing import LIMIT_SECONDS, Service
+from tests.standing import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -55,7 +56,10 @@ def check_service(service: Service, disk: Path) -> None:
     (dispatcher,) = stand.family.dispatchers()
     with fill_folders(disk):
         upload = httpx.post(
-            f"{stand.url}/v1/datasets", content=b"t,u,y\n0,1,1\n", headers=CSV, timeout=60.0
+            f"{stand.url}/v1/datasets",
+            content=b"t,u,y\n0,1,1\n",
+            headers=CSV,
+            timeout=LIMIT_SECONDS,
         )
         assert upload.status_code == 503
         assert upload.headers["content-type"] == PROBLEM
@@ -70,6 +74,8 @@ def check_service(service: Service, disk: Path) -> None:
 
 def is_refused(service: Service) -> bool:
     """Whether a submission meets a full disk, as a problem document."""
-    answer = httpx.post(f"{service.stand.url}/v1/jobs", json=service.build_body(), timeout=60.0)
+    answer = httpx.post(
+        f"{service.stand.url}/v1/jobs", json=service.build_body(), timeout=LIMIT_SECONDS
+    )
     assert answer.status_code in (202, 503), answer.text
     return answer.status_code == 503

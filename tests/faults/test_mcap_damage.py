@@ -26,6 +26,7 @@ from service.formats.mcap_messages import build_schema
 from service.formats.mcap_writer import MCAP_MAGIC
 from sysid.core.errors import UnreadableFile
 from sysid.data.records import Channel, Recording
+from tests.limits import LIMIT_SECONDS
 from tests.mcap_files import foreign, json_messages, recorded
 from tests.profiles import scale_examples
 
@@ -188,7 +189,7 @@ def test_a_bomb_needs_no_more_memory_than_it_declares(tmp_path: Path) -> None:
         [sys.executable, "-c", READ_IN_LITTLE_MEMORY, *(tmp_path / name for name in files)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=LIMIT_SECONDS,
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -19,15 +19,14 @@ from service.dispatch.supervisor import (
     make_paths_absolute,
     to_environment,
 )
-
-LIMIT_SECONDS = 40.0
+from tests.limits import LIMIT_SECONDS
 
 # A child with a child of its own in another process group, as Ray's helpers are.
 CHILD = """
 import os, subprocess, sys, time
-subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], process_group=0)
+subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"], process_group=0)
 open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
-time.sleep(60)
+time.sleep(600)
 """
 
 OWNER = """
@@ -35,7 +34,7 @@ import sys, time
 from service.dispatch.supervisor import Supervisor
 supervisor = Supervisor([sys.executable, "-c", sys.argv[2], sys.argv[1]], {})
 supervisor.start()
-time.sleep(60)
+time.sleep(600)
 """
 
 # Ends when its standard input does.

@@ -12,6 +12,7 @@ import pytest
 from service.core.states import JobState
 from service.storage.tables import Run
 from tests.dispatching import Place, until
+from tests.limits import LIMIT_SECONDS
 from tests.two_nodes import two_nodes
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(300)]
@@ -59,7 +60,7 @@ def told_on_joining(address: str, environment: dict[str, str]) -> str:
         env={**inherited, "HOME": "/nonexistent", **environment},
         capture_output=True,
         text=True,
-        timeout=90,
+        timeout=LIMIT_SECONDS,
         check=True,
     )
     return done.stdout
@@ -115,7 +116,7 @@ def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(tmp_path: Pa
         },
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=LIMIT_SECONDS,
         check=False,
     )
     assert done.returncode == 1

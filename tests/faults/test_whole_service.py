@@ -14,7 +14,8 @@ from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import Stream
 from service.core.states import JobState
 from service.storage.tables import Checkpoint, Job, Run
-from tests.standing import LIMIT_SECONDS, Service
+from tests.limits import LIMIT_SECONDS
+from tests.standing import Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks.breaking.stand import until
 from service.core.states import JobState
-from tests.standing import ENDLESS, LIMIT_SECONDS, Service
+from tests.limits import LIMIT_SECONDS
+from tests.standing import ENDLESS, Service
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -26,7 +27,7 @@ def test_jobs_wait_for_ray_with_their_checkpoints(service: Service) -> None:
         os.kill(dispatcher, signal.SIGTERM)
         queued, cancelled = service.submit(), service.submit(algorithm=ENDLESS)
         until(lambda: stand.log.count(REFUSAL) > refusals + 1, "two tries", LIMIT_SECONDS)
-        readiness = httpx.get(f"{stand.url}/readyz", timeout=60.0)
+        readiness = httpx.get(f"{stand.url}/readyz", timeout=LIMIT_SECONDS)
         assert readiness.status_code == 503
         assert re.search("no dispatcher is alive|Ray is starting", readiness.json()["detail"])
         for _ in range(2):  # the second time it is cancelled already

@@ -17,6 +17,7 @@ from service.repositories.keys import note_use
 from service.storage.tables import ApiKey, WebSession
 from tests.database import record_statements
 from tests.guarded import Guarded, guard
+from tests.limits import LIMIT_SECONDS
 from tests.rest import CSV, recording, refused
 from tests.stored import submit
 
@@ -254,7 +255,7 @@ def test_an_open_event_stream_ends_after_its_key(
         with pytest.raises(TimeoutError):
             stream.result(timeout=0.5)
         change_key(guarded, token, revoked_at=datetime.now(UTC))
-        answer = stream.result(timeout=60)
+        answer = stream.result(timeout=LIMIT_SECONDS)
     assert answer.status_code == 200
     assert "still here" in answer.text
     refused(guarded.ask("GET", f"/v1/jobs/{job}/events", token), 401, "unauthorized")

@@ -24,13 +24,13 @@ from service.storage.migrate import find_head_revision
 from sysid.core.errors import InvalidSettings
 from sysid.identification import identify
 from tests.commands import (
-    LIMIT_SECONDS,
     PROGRAM,
     check_refusal,
     make_environment,
     run_lagid,
     run_lagid_process,
 )
+from tests.limits import LIMIT_SECONDS
 from tests.rest import recording, settings_of
 from tests.serving import serve_in_thread
 
@@ -444,7 +444,7 @@ def test_a_server_ends_in_order_on_sigterm_and_so_does_an_open_event_stream(
         assert child.stdout is not None
         assert url in child.stdout.readline()
         _wait_until_answering(url)
-        with httpx.Client(base_url=url, timeout=60) as http:
+        with httpx.Client(base_url=url, timeout=LIMIT_SECONDS) as http:
             csv = {"content-type": "text/csv"}
             dataset = http.post("/v1/datasets", content=recording(), headers=csv).json()["id"]
             body = {"model": "fopdt", "datasets": [dataset]}
@@ -455,7 +455,7 @@ def test_a_server_ends_in_order_on_sigterm_and_so_does_an_open_event_stream(
                 child.send_signal(signal.SIGTERM)
                 for _ in lines:
                     pass  # the stream ends, and so does the loop
-        rest, _ = child.communicate(timeout=60)
+        rest, _ = child.communicate(timeout=LIMIT_SECONDS)
         assert child.returncode == 0, rest
     finally:
         child.kill()
@@ -592,7 +592,7 @@ def test_a_noise_sweep_is_submitted_with_the_settings_that_were_given(server: st
     assert done.code == 0, done.stderr
     job = json.loads(done.stdout)
     assert job["progress"]["runs"] == 6
-    request = httpx.get(f"{server}/v1/jobs/{job['id']}", timeout=60).json()["request"]
+    request = httpx.get(f"{server}/v1/jobs/{job['id']}", timeout=LIMIT_SECONDS).json()["request"]
     assert request["algorithm"]["population"] == 12
     assert request["parameters"] == {"L": {"upper": 1}}
     assert request["sweep"]["axes"][0]["values"] == [0, 0.1, 0.2]

@@ -14,6 +14,7 @@ from service.client.client import Client
 from service.core.states import JobState
 from service.repositories.jobs import JobRepository
 from tests.identified import carried_out
+from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 from tests.rest import settings_of
 from tests.serving import serve_in_thread
@@ -49,7 +50,7 @@ def url(tmp_path: Path) -> Iterator[str]:
             yield address
         finally:
             worker.ended.set()
-            worker.join(timeout=20)
+            worker.join(timeout=LIMIT_SECONDS)
 
 
 def test_the_page_shows_every_recipe_and_what_follows_it() -> None:

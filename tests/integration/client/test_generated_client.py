@@ -15,6 +15,7 @@ import pytest
 
 from service.api.write_contract import DOCUMENT_FILE
 from service.client.embedded import run_embedded_service
+from tests.limits import LIMIT_SECONDS
 from tests.needs import report_missing
 from tests.repository import ROOT
 from tests.rest import recording
@@ -26,7 +27,6 @@ PACKAGE = "lagid_generated"
 # The generator knows few media types by name; it takes those of files as bytes.
 CONFIGURATION = "content_type_overrides:\n  application/x-mcap: application/octet-stream\n"
 SMALL = {"population": 20, "generations": 40}
-LIMIT_SECONDS = 240.0
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ class Generated:
     """Calls of the generated package; an answer that is no success is an error."""
 
     def __init__(self, package: Any, url: str) -> None:
-        self._client = package.Client(base_url=url, timeout=60.0)
+        self._client = package.Client(base_url=url, timeout=LIMIT_SECONDS)
 
     def close(self) -> None:
         self._client.get_httpx_client().close()

@@ -15,6 +15,7 @@ from service.api.app import create_app
 from service.api.event_feed import EventFeed
 from service.repositories.events import JobHead
 from service.storage.sessions import Database
+from tests.limits import LIMIT_SECONDS
 from tests.rest import awaited, parts_of, recording, refused, settings_of, store_csv
 from tests.serving import serve_in_thread
 
@@ -25,7 +26,7 @@ STREAMS = 30
 def served(tmp_path: Path) -> Iterator[tuple[httpx.Client, str, Database]]:
     """A service on a port with room for 30 streams, and a queued job."""
     app = create_app(settings_of(tmp_path, max_streams=STREAMS, poll_seconds=0.05))
-    with serve_in_thread(app) as url, httpx.Client(base_url=url, timeout=60) as client:
+    with serve_in_thread(app) as url, httpx.Client(base_url=url, timeout=LIMIT_SECONDS) as client:
         steps = store_csv(_AppOf(app), recording())
         job = client.post("/v1/jobs", json={"model": "fopdt", "datasets": [steps]}).json()["id"]
         yield client, job, app.state.parts.database
@@ -61,7 +62,9 @@ def test_streams_that_are_opened_at_once_do_not_pass_the_limit_together(
 
     async def play() -> list[int]:
         limits = httpx.Limits(max_connections=2 * STREAMS)
-        async with httpx.AsyncClient(base_url=plain.base_url, timeout=60, limits=limits) as client:
+        async with httpx.AsyncClient(
+            base_url=plain.base_url, timeout=LIMIT_SECONDS, limits=limits
+        ) as client:
             opened: asyncio.Queue[int] = asyncio.Queue()
             path = f"/v1/jobs/{job}/events"
             tasks = [
@@ -83,7 +86,9 @@ def test_streams_share_their_readings_and_one_beyond_the_limit_is_refused(
 
     async def play() -> list[str]:
         limits = httpx.Limits(max_connections=2 * STREAMS)
-        async with httpx.AsyncClient(base_url=plain.base_url, timeout=60, limits=limits) as client:
+        async with httpx.AsyncClient(
+            base_url=plain.base_url, timeout=LIMIT_SECONDS, limits=limits
+        ) as client:
             async with open_streams(client, path) as tasks:
                 await asyncio.sleep(0.2)
                 async with client.stream("GET", path) as answer:

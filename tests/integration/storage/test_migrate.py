@@ -22,6 +22,7 @@ from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRe
 from service.storage.sessions import Database
 from service.storage.tables import Base, Event, Job, Project, Run, SearchTerm, StoredSummary
 from tests.database import empty_postgres
+from tests.limits import LIMIT_SECONDS
 from tests.stored import (
     claim,
     claimed,
@@ -302,7 +303,7 @@ def test_threads_that_upgrade_at_once_do_not_race(empty_database):
 
 
 def _start_service(url, start, results):
-    start.wait(180)
+    start.wait(LIMIT_SECONDS)
     database = Database(url)
     migrate.upgrade_database(database)
     migrate.check_revision(database)
@@ -321,7 +322,7 @@ def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_databa
     ]
     for process in processes:
         process.start()
-    assert [results.get(timeout=180) for _ in processes] == ["up"] * 3
+    assert [results.get(timeout=LIMIT_SECONDS) for _ in processes] == ["up"] * 3
     for process in processes:
         process.join()
     assert migrate.list_differences(empty_database) == []

@@ -14,7 +14,8 @@ from service.queue.admission import Admission
 from service.queue.leases import Claim
 from service.storage.objects import open_store
 from service.storage.sessions import Database
-from tests.dispatching import LIMIT_SECONDS, Place
+from tests.dispatching import Place
+from tests.limits import LIMIT_SECONDS
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
 from workers import packing
 from workers.inline_executor import InlineExecutor

@@ -10,6 +10,7 @@ from service.client import calls
 from service.client.async_client import AsyncClient
 from service.client.calls import Document, ServerUnreachable
 from service.client.client import Client
+from tests.limits import LIMIT_SECONDS
 from tests.rest import awaited
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nTransfer-Encoding: chunked\r\n\r\n"
@@ -39,7 +40,7 @@ class SilentServer:
             self._open.append(connection)
 
     def close(self) -> None:
-        self._thread.join(10.0)
+        self._thread.join(LIMIT_SECONDS)
         for connection in (*self._open, self._listener):
             connection.close()
 

@@ -11,6 +11,7 @@ import pytest
 from service.core import computed
 from service.core.computed import FRESH_SECONDS, MAX_WAITING, REUSE_FACTOR, ComputedValues
 from service.core.errors import ServiceBusy
+from tests.limits import LIMIT_SECONDS
 
 
 class Clock:
@@ -92,7 +93,7 @@ def test_few_requests_wait_for_a_value_and_others_are_told_to_come_again() -> No
     values, may_end = ComputedValues(2), Event()
 
     def compute() -> int:
-        may_end.wait(30.0)
+        may_end.wait(LIMIT_SECONDS)
         return 7
 
     def ask() -> int | str:

@@ -8,6 +8,7 @@ import pytest
 from service.core import concurrency
 from service.core.concurrency import ConcurrencyLimit
 from service.core.errors import ServiceBusy
+from tests.limits import LIMIT_SECONDS
 
 
 def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
@@ -33,14 +34,14 @@ def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
     def work(number: int) -> int:
         with turns.acquire():
             begun[number].set()
-            assert ended.wait(30)
+            assert ended.wait(LIMIT_SECONDS)
         return number
 
     with ThreadPoolExecutor(3) as pool:
         first = [pool.submit(work, number) for number in range(2)]
-        assert all(one.wait(30) for one in begun[:2])
+        assert all(one.wait(LIMIT_SECONDS) for one in begun[:2])
         third = pool.submit(work, 2)
-        assert all(asked.acquire(timeout=30) for _ in range(3))
+        assert all(asked.acquire(timeout=LIMIT_SECONDS) for _ in range(3))
         assert not begun[2].is_set()
         with pytest.raises(ServiceBusy, match="too many"), turns.acquire():
             pass

@@ -10,6 +10,7 @@ import pytest
 
 from service.core import temporary_files
 from sysid.core import machine
+from tests.limits import LIMIT_SECONDS
 from workers import local_ray, ray_folders
 from workers.errors import ClusterUnavailable
 
@@ -30,7 +31,7 @@ def ended() -> int:
 
 
 def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-c", LEAVE, f"{tmp_path}/"], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", LEAVE, f"{tmp_path}/"], check=True, timeout=LIMIT_SECONDS)
     assert len(list(tmp_path.iterdir())) == 1
     mine = tmp_path / f"{temporary_files.make_temporary_prefix()}file"
     mine.touch()

@@ -10,8 +10,7 @@ import pytest
 
 from service.dispatch.background import BackgroundJobs
 from service.storage.columns import Document
-
-LIMIT_SECONDS = 30.0
+from tests.limits import LIMIT_SECONDS
 
 
 def until(holds: Callable[[], bool]) -> None:
