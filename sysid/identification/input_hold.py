@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.data.holds import Hold
+from sysid.data.holds import Hold, is_rough
 from sysid.data.records import Channel, Record
 from sysid.identification.result import InputHold
 from sysid.kernels.reads import is_difference
@@ -27,7 +27,6 @@ from sysid.uncertainty.estimates import Estimate
 _NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
 _CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_TOLD = 3  # estimates in one sentence
-_MIN_ROUGH = 50  # samples: fewer may be rough by chance
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
 
 
@@ -108,7 +107,7 @@ def find_hold_doubts(
         elif is_open and evidence >= -_CLEAR_EVIDENCE:
             if hold.input in commands:
                 doubt = "The input follows the residuals as a command does, which is held"
-            elif _is_rough(hold.input, problem.records):
+            elif any(is_rough(one.values) for one in _find_channels(hold.input, problem.records)):
                 doubt = "Its samples do not follow each other, so hardly in straight lines"
         doubts.append(doubt)
     return doubts
@@ -197,16 +196,6 @@ def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:
     if not hold.rms_other or not rms > 0:
         return 0.0
     return 2 * samples * log(rms / hold.rms_other)
-
-
-def _is_rough(name: str, records: Sequence[Record]) -> bool:
-    """Whether the mean of an input tells more of its samples than their two neighbours do."""
-    for channel in _find_channels(name, records):
-        values = channel.values
-        between = values[1:-1] - 0.5 * (values[:-2] + values[2:])
-        if values.size > _MIN_ROUGH and np.mean(np.square(between)) >= np.var(values):
-            return True
-    return False
 
 
 def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]:
