@@ -25,17 +25,22 @@ _NEW_SHARE = 0.5  # of the variance: what the past does not predict of a random 
 
 
 class HoldChoice(NamedTuple):
-    """A chosen hold, and the reason as the end of a sentence: "it …"."""
+    """A chosen hold, and the reason as the end of a sentence: "it …".
+
+    `needs_fit`: the values alone are weak evidence, and the fit must agree.
+    """
 
     hold: Hold
     reason: str
+    needs_fit: bool = False
 
 
 def choose_hold(values: FloatArray) -> HoldChoice:
     """Choose the hold of an input by its values: ``zero`` if held, else ``first``.
 
     Held is a piecewise constant signal, and one that moves at random from sample to sample. No line
-    leads there, and no sine: nothing but a generator or a controller that holds each value.
+    leads there, and no sine: but for a generator or a controller that holds each value, only noise
+    that is sampled too slowly.
 
     Piecewise constant is a signal of two or few levels, or one whose jumps lie between plateaus
     without noise. Not so is a moving signal that a converter has quantised: it has plateaus too,
@@ -67,7 +72,8 @@ def choose_hold(values: FloatArray) -> HoldChoice:
     # noise of a converter is random too, but of a few quanta
     is_fine = np.std(places) > _FEW_LEVELS * np.min(np.diff(levels))
     if is_fine and is_rough(values) and _is_random(values):
-        return HoldChoice("zero", "moves at random: its samples do not follow from those before")
+        reason = "moves at random: its samples do not follow from those before"
+        return HoldChoice("zero", reason, needs_fit=True)
     return HoldChoice("first", f"moves: {share}")
 
 
