@@ -17,6 +17,7 @@ from sysid.identification.deadline import Clock, Deadline
 from sysid.identification.fixed_start import warn_fixed_starts
 from sysid.identification.hard_switching import warn_hard_switching
 from sysid.identification.input_hold import (
+    FITS_AS_WELL,
     describe_input_holds,
     find_hold_doubts,
     list_input_holds,
@@ -165,7 +166,11 @@ def _build_identification(
         left,
         late,
         has_feedback=bool(feedback),
-        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
+        doubtful=[
+            hold
+            for hold, doubt in zip(holds, doubts, strict=True)
+            if doubt not in ("", FITS_AS_WELL)
+        ],
     )
     budget.spend(spent)
     analysis = replace(analysis, estimates=mark_prediction_dependent(analysis.estimates, ahead))
