@@ -104,6 +104,8 @@ JOB_FILTER_CHOICES: Mapping[str, Sequence[tuple[str, str]]] = {
         ("", "newest first"),
         ("oldest", "oldest first"),
         ("name", "name"),
+        ("verdict", "best verdict first"),
+        ("worst-verdict", "worst verdict first"),
         ("fit", "best fit first"),
         ("worst-fit", "worst fit first"),
         ("rms", "smallest RMS first"),
@@ -113,7 +115,7 @@ JOB_FILTER_CHOICES: Mapping[str, Sequence[tuple[str, str]]] = {
 JOB_HEADINGS: Sequence[tuple[str, str, Sequence[tuple[JobOrder, str]]]] = (
     ("State", "", ()),
     ("Job", "", (("name", "ascending"),)),
-    ("Result", "", ()),
+    ("Result", "", (("verdict", "descending"), ("worst-verdict", "ascending"))),
     ("Fit", "n", (("fit", "descending"), ("worst-fit", "ascending"))),
     ("RMS", "n", (("rms", "ascending"),)),
     ("Warnings", "n", ()),
@@ -453,9 +455,8 @@ def reidentify_page(session: Session) -> str:
 
 
 def _list_models(session: Session) -> Sequence[ModelOut]:
-    """List every model once, under the name of its latest version."""
-    listed = models.list_models(session, None, MAX_CHOICES).items
-    return list({model.name: model for model in reversed(listed)}.values())[::-1]
+    """List the latest version of every model."""
+    return models.list_models(session, None, MAX_CHOICES, only_latest=True).items
 
 
 def _list_datasets(session: Session) -> Sequence[Dataset]:
