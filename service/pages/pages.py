@@ -27,7 +27,7 @@ from service.pages.diagnostics import to_diagnostics
 from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
-from service.pages.lineage import BOX_HEIGHT, BOX_WIDTH, draw_lineage
+from service.pages.lineage import draw_lineage
 from service.pages.render import render_template
 from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
@@ -239,6 +239,7 @@ def job_page(
         comparable=_comparison_query(page.items),
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
+        lineage=draw_lineage(session, job),
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
@@ -342,7 +343,6 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         height=signals.signals_height(dataset.n_channels),
         has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=draw_lineage(session, dataset),
-        box=(BOX_WIDTH, BOX_HEIGHT),
     )
 
 

@@ -172,6 +172,16 @@ def test_references_are_listed_with_units_and_what_is_compared_with_them(
     assert client.get("/references/pipe").status_code == 404
 
 
+def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
+    page = client.get(f"/jobs/{filled.finished}").text
+    drawn = page[page.index('<svg class="lineage"') :].partition("</svg>")[0]
+    assert f'<a href="/datasets/{filled.dataset}" aria-label="recording tube 40 m">' in drawn
+    assert f'<a href="/runs/{filled.finished_run}" aria-label="run run 1 of tube' in drawn
+    assert drawn.count('<g class="shown">') == 1
+    assert 'aria-label="reference tube"' in drawn
+    assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording
+
+
 def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
     parts = parts_of(client)
     channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, 2.0]), "V")
