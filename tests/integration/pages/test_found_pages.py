@@ -90,6 +90,8 @@ def test_runs_on_other_data_are_drawn_over_their_own_measured_output() -> None:
     units = plot_comparison([("a", first), ("b", traces(0.0, [3, 2, 1], "kPa"))])
     names = [one["title"]["text"] for key, one in units["layout"].items() if "yaxis" in key]
     assert names[0::2][:2] == ["y [V]", "y [kPa]"]  # other units have plots of their own
+    named = [one["name"] for one in units["data"] if one.get("showlegend")]
+    assert named == ["measured", "a", "b"]  # each once
     late = replace(first, outputs=traces(1.0, [2, 3]).outputs)  # the first sample is not scored
     assert plot_comparison([("a", first), ("b", late)])["data"][3]["x"] == [1, 2]
 
