@@ -55,6 +55,8 @@ def format_value(value: object) -> str:
     """Format the value of an axis or of a label; a model is represented by its name."""
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, Mapping):
         return (
             str(value["name"])

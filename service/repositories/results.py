@@ -116,7 +116,7 @@ def _list_runs_of_jobs(
     for job in jobs:
         if len(rows) >= room:
             break
-        if job.n_runs > 1 and job.n_done and not only_best:
+        if job.n_runs > 1 and job.n_done > job.n_failed and not only_best:
             rows += _list_runs(session, job, -1, room - len(rows))
         else:
             rows += of_job.get(job.id, [])

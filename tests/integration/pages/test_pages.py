@@ -285,4 +285,4 @@ def test_why_the_one_run_of_a_job_failed_is_told_once_above_its_model(
 ) -> None:
     text = client.get(f"/jobs/{filled.failed}").text
     assert text[: text.index("<h2>Model</h2>")].count('class="note bad"') == 1
-    assert "The run failed." in text
+    assert "The run failed:" in text
