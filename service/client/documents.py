@@ -1926,7 +1926,11 @@ class TrendDocument(TypedDict):
     quantities: list[QuantityDocument]
     """trend of each quantity"""
     missing: NotRequired[int]
-    """runs that failed or have not ended"""
+    """runs without a result"""
+    failed: NotRequired[int]
+    """how many of these failed"""
+    unended: NotRequired[int]
+    """how many of these have not ended"""
     notes: NotRequired[list[str]]
     """what limits the trends"""
 

@@ -3,10 +3,12 @@
 This module imports the standard library only, so that every command may use it.
 """
 
+import csv
+import io
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from typing import Any
 
@@ -53,6 +55,8 @@ def format_value(value: object) -> str:
     """Format the value of an axis or of a label; a model is represented by its name."""
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, Mapping):
         return (
             str(value["name"])
@@ -101,7 +105,17 @@ def name_label(name: str) -> str:
     return f"{quantity} [{unit}]" if quantity and is_known_unit(unit) else name
 
 
-def escape_formula(value: object) -> object:
+def write_csv(rows: Iterable[Iterable[object]]) -> str:
+    """Write rows as CSV lines. Texts are escaped, None is an empty field.
+
+    A float keeps all its digits: it comes back bit for bit.
+    """
+    sink = io.StringIO()
+    csv.writer(sink, lineterminator="\n").writerows(map(_escape_formula, row) for row in rows)
+    return sink.getvalue()
+
+
+def _escape_formula(value: object) -> object:
     """Escape a value so that no spreadsheet evaluates it and no reader splits it into two lines."""
     if not isinstance(value, str):
         return value
@@ -109,7 +123,7 @@ def escape_formula(value: object) -> object:
 
 
 def unescape_formula(text: str) -> str:
-    """Return a text without the apostrophe that `escape_formula` put before it."""
+    """Return a text without the apostrophe that `write_csv` put before a formula."""
     return text[1:] if text.startswith("'") and _is_formula(text[1:]) else text
 
 

@@ -1,9 +1,10 @@
 """Write the numbers of a figure as CSV."""
 
-import csv
-import io
+from collections.abc import Iterator, Mapping
+from itertools import chain
+from typing import Any
 
-from service.core.text import escape_formula
+from service.core.text import write_csv
 from sysid.figures.plotly import Figure
 
 
@@ -12,16 +13,16 @@ def to_csv(figure: Figure) -> str:
 
     Contours are left out: they are drawn from numbers of other series.
     """
-    sink = io.StringIO()
-    rows = csv.writer(sink, lineterminator="\n")
     traces = [trace for trace in figure["data"] if trace["type"] != "contour"]
     matrix = any("z" in trace for trace in traces)
-    rows.writerow(["series", "x", "y", *(["z"] if matrix else [])])
-    for trace in traces:
-        name = escape_formula(trace.get("name", ""))
-        if "z" in trace:
-            for y, line in zip(trace["y"], trace["z"], strict=True):
-                rows.writerows((name, x, y, z) for x, z in zip(trace["x"], line, strict=True))
-        else:
-            rows.writerows((name, x, y) for x, y in zip(trace["x"], trace["y"], strict=True))
-    return sink.getvalue()
+    heading = ("series", "x", "y", *(["z"] if matrix else []))
+    return write_csv(chain([heading], chain.from_iterable(map(_list_points, traces))))
+
+
+def _list_points(trace: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    name = trace.get("name", "")
+    if "z" not in trace:
+        yield from ((name, x, y) for x, y in zip(trace["x"], trace["y"], strict=True))
+        return
+    for y, line in zip(trace["y"], trace["z"], strict=True):
+        yield from ((name, x, y, z) for x, z in zip(trace["x"], line, strict=True))

@@ -233,7 +233,7 @@ def _floor_traces(
     if not x:
         return []
     signs = (-QUANTILE_95, QUANTILE_95) if panel.is_signed else (1.0,)
-    name = "Cramér–Rao bound (of the median; of parameters: 5 and 95 %)"
+    name = "Cramér–Rao bound (median; 5 and 95 %)"
     lines = []
     for sign in signs:
         lines.append(

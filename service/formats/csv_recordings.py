@@ -9,16 +9,14 @@ Repeats of a measurement are segments, placed one after another on one time axis
 also written as CSV, block by block, and its numbers come back bit for bit.
 """
 
-import csv
 from collections.abc import Iterator, Sequence
-from io import StringIO
-from itertools import chain
+from itertools import chain, islice
 from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
 
-from service.core.text import escape_formula
+from service.core.text import write_csv
 from service.formats.limits import DEFAULT_LIMITS, UploadLimits
 from service.formats.table_columns import read_lines
 from service.formats.table_layout import detect_layout
@@ -89,29 +87,28 @@ def generate_csv(recording: Recording) -> Iterator[str]:
     that a spreadsheet would take for a formula gets a leading apostrophe, which `read_csv` removes.
     """
     labels = sorted({name for segment in recording.segments for name in segment.labels})
-    buffer = StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    headings = ["t", *labels, *(_format_heading(channel) for channel in recording.channels)]
-    writer.writerow(map(escape_formula, headings))
-    for number, row in enumerate(_iterate_rows(recording, labels), 1):
-        writer.writerow(row)
-        if number % WRITTEN_BLOCK_ROWS == 0:
-            yield _drain_buffer(buffer)
-    yield _drain_buffer(buffer)
+    headings: list[object] = [
+        "t",
+        *labels,
+        *(_format_heading(channel) for channel in recording.channels),
+    ]
+    rows = chain([headings], _iterate_rows(recording, labels))
+    while block := list(islice(rows, WRITTEN_BLOCK_ROWS)):
+        yield write_csv(block)
 
 
-def _iterate_rows(recording: Recording, labels: list[str]) -> Iterator[list[str]]:
+def _iterate_rows(recording: Recording, labels: list[str]) -> Iterator[list[object]]:
     if not recording.segments:
         for time, values in _iterate_samples(recording):
-            yield [repr(time), *values]
+            yield [time, *values]
         return
     for segment, piece in zip(recording.segments, recording.split_segments(), strict=True):
-        texts = [_format_value(segment.labels.get(name, "")) for name in labels]
+        texts = [_blank_missing(segment.labels.get(name, "")) for name in labels]
         for time, values in _iterate_samples(piece):
-            yield [repr(time), *texts, *values]
+            yield [time, *texts, *values]
 
 
-def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
+def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[object]]]:
     """Yield times in order, with the values of all channels; a missing value is empty.
 
     A time has one row, or as many as one channel has values at it.
@@ -130,32 +127,24 @@ def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
         [np.full(channels[group[0]].times.size, number) for number, group in enumerate(groups)]
     )
     index_in_group = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
-    time, row, written = nan, [""] * len(channels), set[int]()
+    time, written = nan, set[int]()
+    row: list[object] = [None] * len(channels)
     for index in np.argsort(times, kind="stable").tolist():
         number = int(group_of_sample[index])
         if written and (time != times[index] or number in written):
             yield time, row
-            row, written = [""] * len(channels), set()
+            row, written = [None] * len(channels), set()
         time = float(times[index])
         written.add(number)
         for member in groups[number]:
-            row[member] = _format_value(float(channels[member].values[index_in_group[index]]))
+            row[member] = _blank_missing(float(channels[member].values[index_in_group[index]]))
     if written:
         yield time, row
 
 
-def _format_value(value: float | str) -> str:
-    if isinstance(value, str):
-        return str(escape_formula(value))
-    return repr(value) if isfinite(value) else ""
+def _blank_missing(value: float | str) -> float | str | None:
+    return value if isinstance(value, str) or isfinite(value) else None
 
 
 def _format_heading(channel: Channel) -> str:
     return channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]"
-
-
-def _drain_buffer(buffer: StringIO) -> str:
-    text = buffer.getvalue()
-    buffer.seek(0)
-    buffer.truncate()
-    return text

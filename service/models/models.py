@@ -24,13 +24,22 @@ from sysid.models.parse import keep_terms, parse_model
 
 
 def list_models(
-    session: Session, cursor: str | None, limit: int, chosen: ListFilter = NO_FILTER
+    session: Session,
+    cursor: str | None,
+    limit: int,
+    chosen: ListFilter = NO_FILTER,
+    *,
+    only_latest: bool = False,
 ) -> ModelPage:
     """List the built-in models (first page), then all versions of user models, latest first.
 
+    Or only the last version of each.
+
     Built-in models have names only: a filter of tags or times excludes them.
     """
-    stored = ModelRepository(session).list_page(cursor=cursor, limit=limit, chosen=chosen)
+    stored = ModelRepository(session).list_page(
+        cursor=cursor, limit=limit, chosen=chosen, only_latest=only_latest
+    )
     part = (chosen.name or "").lower()
     is_first = not (cursor or chosen.terms or chosen.since or chosen.until)
     built_in = [model for model in list_catalogue() if part in model.name] if is_first else []

@@ -1,4 +1,4 @@
-"""Lineage of a dataset as a drawing: from what it came, the jobs that used it, their results.
+"""Lineage of a recording or a job as a drawing: from what it came, and what was made from it.
 
 A few levels and the latest items are drawn. The boxes are links, so that a keyboard reaches them.
 """
@@ -73,17 +73,19 @@ class LineageDrawing:
     width: int
     height: int
     is_cut: bool
+    box_width: int = BOX_WIDTH
+    box_height: int = BOX_HEIGHT
 
 
-def draw_lineage(session: Session, dataset: Dataset) -> LineageDrawing:
-    """Draw from what a dataset came, and what was made from it."""
-    links, is_cut = _collect_links(LineageRepository(session), dataset.id)
-    ids = {dataset.id, *(link.child for link in links), *(link.parent for link in links)}
+def draw_lineage(session: Session, shown: Dataset | Job) -> LineageDrawing:
+    """Draw from what a recording or a job came, and what was made from it."""
+    links, is_cut = _collect_links(LineageRepository(session), shown.id)
+    ids = {shown.id, *(link.child for link in links), *(link.parent for link in links)}
     jobs = JobRepository(session).list_some([one for one in ids if one.startswith("job_")])
     results = [*_link_runs(session, jobs), *_link_trends(jobs), *_link_references(session, jobs)]
     ids |= {link.child for link in results} | {link.parent for link in results}
     nodes = {node.id: node for node in _describe_nodes(session, ids)}
-    nodes[dataset.id] = replace(nodes[dataset.id], is_shown=True)
+    nodes[shown.id] = replace(nodes[shown.id], is_shown=True)
     pairs = {(link.parent, link.child): link for link in (*results, *links)}
     arrows = [one for one in pairs.values() if one.parent in nodes and one.child in nodes]
     return _arrange(nodes, arrows, is_cut=is_cut)

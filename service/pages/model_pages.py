@@ -97,13 +97,15 @@ def models_page(session: Session, form: Mapping[str, str], cursor: str | None) -
     """Render the gallery: your own models, the latest version of each, then the built-in ones."""
     part = form.get("name", "").lower()
     page = ModelRepository(session).list_page(
-        cursor=cursor, limit=MODELS_PER_PAGE, chosen=ListFilter(name=part or None)
+        cursor=cursor,
+        limit=MODELS_PER_PAGE,
+        chosen=ListFilter(name=part or None),
+        only_latest=True,
     )
-    own = {row.name: row for row in reversed(page.items)}  # the latest version comes last
     built_in = [] if cursor else [view for view in view_catalogue() if _contains(view, part)]
     return render_template(
         "models.html",
-        own=[_view_own(row) for row in reversed(own.values())],
+        own=[_view_own(row) for row in page.items],
         built_in=built_in,
         form=form,
         cursor=cursor,

@@ -27,7 +27,7 @@ from service.pages.diagnostics import to_diagnostics
 from service.pages.differences import list_differences
 from service.pages.figure_data import list_free_parameters
 from service.pages.guides import read_guide
-from service.pages.lineage import BOX_HEIGHT, BOX_WIDTH, draw_lineage
+from service.pages.lineage import draw_lineage
 from service.pages.render import render_template
 from service.pages.result_view import to_model_view
 from service.pages.trend import TrendView, count_trend_flags, load_trend, to_trend_view
@@ -104,6 +104,8 @@ JOB_FILTER_CHOICES: Mapping[str, Sequence[tuple[str, str]]] = {
         ("", "newest first"),
         ("oldest", "oldest first"),
         ("name", "name"),
+        ("verdict", "best verdict first"),
+        ("worst-verdict", "worst verdict first"),
         ("fit", "best fit first"),
         ("worst-fit", "worst fit first"),
         ("rms", "smallest RMS first"),
@@ -113,7 +115,7 @@ JOB_FILTER_CHOICES: Mapping[str, Sequence[tuple[str, str]]] = {
 JOB_HEADINGS: Sequence[tuple[str, str, Sequence[tuple[JobOrder, str]]]] = (
     ("State", "", ()),
     ("Job", "", (("name", "ascending"),)),
-    ("Result", "", ()),
+    ("Result", "", (("verdict", "descending"), ("worst-verdict", "ascending"))),
     ("Fit", "n", (("fit", "descending"), ("worst-fit", "ascending"))),
     ("RMS", "n", (("rms", "ascending"),)),
     ("Warnings", "n", ()),
@@ -237,6 +239,7 @@ def job_page(
         comparable=_comparison_query(page.items),
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
+        lineage=draw_lineage(session, job),
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
@@ -340,7 +343,6 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         height=signals.signals_height(dataset.n_channels),
         has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=draw_lineage(session, dataset),
-        box=(BOX_WIDTH, BOX_HEIGHT),
     )
 
 
@@ -453,9 +455,8 @@ def reidentify_page(session: Session) -> str:
 
 
 def _list_models(session: Session) -> Sequence[ModelOut]:
-    """List every model once, under the name of its latest version."""
-    listed = models.list_models(session, None, MAX_CHOICES).items
-    return list({model.name: model for model in reversed(listed)}.values())[::-1]
+    """List the latest version of every model."""
+    return models.list_models(session, None, MAX_CHOICES, only_latest=True).items
 
 
 def _list_datasets(session: Session) -> Sequence[Dataset]:

@@ -1,7 +1,5 @@
 """Results across jobs: one parameter of the runs of any jobs, as a table, a figure and CSV."""
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +8,7 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
-from service.core.text import escape_formula, format_labels, name_label
+from service.core.text import format_labels, name_label, write_csv
 from service.figures.results import ResultPoint, plot_results
 from service.jobs.job_links import find_model_name
 from service.jobs.results import is_free
@@ -147,31 +145,30 @@ def load_results_figure(session: Session, choice: ResultChoice) -> Figure:
 def write_results_csv(session: Session, choice: ResultChoice) -> str:
     """Write the parameter of the page as CSV, from this page on, and of more runs."""
     page = _list_page(session, choice, RUNS_OF_A_FILE)
-    parameter, entries = _choose_parameter(page.items, choice.parameter)
-    sink = io.StringIO()
-    lines = csv.writer(sink, lineterminator="\n")
-    lines.writerow(COLUMNS)
-    for row, one in entries:
-        low, high = one["interval95"] or (None, None)
-        values = (
-            row.job.id,
-            row.run,
-            row.number,
-            row.job.name,
-            find_model_name(row.job.spec),
-            _describe_place(row),
-            parameter,
-            one["value"],
-            one["stderr"],
-            low,
-            high,
-            one["unit"],
-            one["status"],
-            row.fit_estimation,
-            row.finished_at.isoformat() if row.finished_at else None,
-        )
-        lines.writerow(map(escape_formula, values))
-    return sink.getvalue()
+    _, entries = _choose_parameter(page.items, choice.parameter)
+    return write_csv([COLUMNS, *(_list_fields(row, one) for row, one in entries)])
+
+
+def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
+    """List the fields of a line of the file, in the order of `COLUMNS`."""
+    low, high = one["interval95"] or (None, None)
+    return (
+        row.job.id,
+        row.run,
+        row.number,
+        row.job.name,
+        find_model_name(row.job.spec),
+        _describe_place(row),
+        one["name"],
+        one["value"],
+        one["stderr"],
+        low,
+        high,
+        one["unit"],
+        one["status"],
+        row.fit_estimation,
+        row.finished_at.isoformat() if row.finished_at else None,
+    )
 
 
 def _list_page(session: Session, choice: ResultChoice, limit: int) -> RowPage[ResultRow]:

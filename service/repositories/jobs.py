@@ -25,14 +25,19 @@ from service.storage.statements import (
 )
 from service.storage.tables import IdempotencyKey, Job, Parcel, Run, StoredSummary
 
-JobOrder = Literal["newest", "oldest", "name", "fit", "worst-fit", "rms"]
+JobOrder = Literal[
+    "newest", "oldest", "name", "verdict", "worst-verdict", "fit", "worst-fit", "rms"
+]
 JOB_ORDERS: tuple[JobOrder, ...] = get_args(JobOrder)
-"""Orders of a list of jobs; `fit` has the best fit first."""
+"""Orders of a list of jobs; `fit` and `verdict` have the best first."""
 # The RMS of a batch, or before the end, compares with no other. It has no fit then.
 _FINAL_RMS = case((Job.fit_estimation.is_not(None), Job.best_rms))
+_TRUST_RANK = case({"trustworthy": 0, "limited": 1, "not trustworthy": 2}, value=Job.trust)
 _ORDERS: Mapping[JobOrder, tuple[ColumnElement[Any], bool]] = {
     "oldest": (Job.id.expression, True),
     "name": (func.lower(Job.name), True),
+    "verdict": (_TRUST_RANK, True),
+    "worst-verdict": (_TRUST_RANK, False),
     "fit": (Job.fit_estimation.expression, False),
     "worst-fit": (Job.fit_estimation.expression, True),
     "rms": (_FINAL_RMS, True),
@@ -256,7 +261,7 @@ class JobRepository:
         if job.finished_at is not None and job.finished_at <= utc_now() - DAY:
             job.evaluations_before = job.evaluations
         job.state, job.cancel_requested = JobState.QUEUED, False
-        job.error = job.finished_at = job.fit_estimation = None
+        job.error = job.finished_at = job.fit_estimation = job.trust = None
         job.n_done -= job.n_failed
         job.lost_leases = job.n_failed = 0
         self._add_parcel(job)

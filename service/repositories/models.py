@@ -4,9 +4,9 @@ import hashlib
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, exists, func, select
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from service.repositories.audit import record_action
 from service.repositories.search import NO_FILTER, ListFilter, select_ids
@@ -70,10 +70,17 @@ class ModelRepository:
         return self._session.scalar(query.order_by(ModelVersion.version.desc()).limit(1))
 
     def list_page(
-        self, *, cursor: str | None = None, limit: int = 50, chosen: ListFilter = NO_FILTER
+        self,
+        *,
+        cursor: str | None = None,
+        limit: int = 50,
+        chosen: ListFilter = NO_FILTER,
+        only_latest: bool = False,
     ) -> RowPage[ModelVersion]:
-        """List every version of the models that meet a filter, latest first."""
+        """List every version of the models that meet a filter, or the last ones, latest first."""
         ids = select_ids(ModelVersion, self._project_id, chosen, cursor=cursor, limit=limit)
+        if only_latest:
+            ids = ids.where(~self._exists_later_version())
         query = select(ModelVersion).where(ModelVersion.id.in_(list(self._session.scalars(ids))))
         rows = sorted(self._session.scalars(query), key=lambda row: row.id, reverse=True)
         return make_page(rows, limit, (model.id for model in rows))
@@ -87,6 +94,15 @@ class ModelRepository:
 
     def _filter_project(self) -> tuple[Any, ...]:
         return ModelVersion.project_id == self._project_id, ModelVersion.deleted_at.is_(None)
+
+    def _exists_later_version(self) -> ColumnElement[bool]:
+        later = aliased(ModelVersion)
+        return exists().where(
+            later.project_id == self._project_id,
+            later.deleted_at.is_(None),
+            later.name == ModelVersion.name,
+            later.version > ModelVersion.version,
+        )
 
     def _find_model(self, reference: str) -> ModelVersion | None:
         name, separator, version = reference.partition("@")

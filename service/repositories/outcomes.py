@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, select
+from sqlalchemy import ColumnElement, Select, select
 from sqlalchemy.orm import Session
 
 from service.core.job_fields import DATASETS_PATH
@@ -25,24 +25,27 @@ class OutcomeRow(NamedTuple):
 def read_outcome_rows(
     session: Session, jobs: Sequence[Job], parts: Sequence[str]
 ) -> list[OutcomeRow]:
-    """Read one row for each of these jobs that has a run with a result.
-
-    The only runs come by one query. The best of many is the first of an index, a query for each
-    job. No other result is read.
-    """
-    single = [job.id for job in jobs if job.n_runs == 1 and job.n_done]
-    chosen = [
-        session.scalar(select_best_run(job.id)) for job in jobs if job.n_runs > 1 and job.n_done
-    ]
-    condition = (Run.job_id.in_(single) & (Run.number == 0)) | Run.id.in_(filter(None, chosen))
+    """Read one row for each of these jobs that has a run with a result."""
     columns = [Run.result.expression[part] for part in parts]
     query = select(Run.job_id, Run.id, Run.fit_estimation, Run.fit_validation, *columns).where(
-        condition, Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None)
+        match_outcomes(session, jobs), Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None)
     )
     return [
         OutcomeRow(job, run, fit, validated, dict(zip(parts, values, strict=True)))
         for job, run, fit, validated, *values in session.execute(query)
     ]
+
+
+def match_outcomes(session: Session, jobs: Sequence[Job]) -> ColumnElement[bool]:
+    """Match the run that stands for each of these jobs. No result is read.
+
+    One query finds the best runs of all jobs that have several, each as the first of an index.
+    """
+    single = [job.id for job in jobs if job.n_runs == 1 and job.n_done]
+    several = [job.id for job in jobs if job.n_runs > 1 and job.n_done]
+    best_run = _select_best_run(Job.id.expression).scalar_subquery()
+    best = session.scalars(select(best_run).where(Job.id.in_(several))) if several else ()
+    return (Run.job_id.in_(single) & (Run.number == 0)) | Run.id.in_(list(filter(None, best)))
 
 
 def read_parameters(session: Session, runs: Collection[str]) -> dict[str, list[Any]]:
@@ -53,21 +56,23 @@ def read_parameters(session: Session, runs: Collection[str]) -> dict[str, list[A
 
 
 def record_best_run(session: Session, job: Job) -> None:
-    """Take RMS and fit of a job from the result of its best run.
+    """Take RMS, fit and trust of a job from the result of its best run.
 
     Before the end, runs report their fitness only. The runs of a batch see different recordings, so
-    it has no fit. Without any result, the RMS stays.
+    it has neither fit nor trust. Without any result, the RMS stays.
     """
-    columns = Run.best_rms, Run.fit_estimation, Run.cell
-    best = session.execute(select_best_run(job.id).with_only_columns(*columns)).first()
+    verdict = Run.result.expression["verdict"]
+    columns = Run.best_rms, Run.fit_estimation, Run.cell, verdict["trust"].as_string()
+    best = session.execute(_select_best_run(job.id).with_only_columns(*columns)).first()
+    job.fit_estimation = job.trust = None
     if best is None:
-        job.fit_estimation = None
         return
-    is_of_batch = any(path.startswith(DATASETS_PATH) for path in best.cell)
-    job.best_rms, job.fit_estimation = best.best_rms, None if is_of_batch else best.fit_estimation
+    job.best_rms, fit, cell, trust = best
+    if not any(path.startswith(DATASETS_PATH) for path in cell):
+        job.fit_estimation, job.trust = fit, trust
 
 
-def select_best_run(job: str) -> Select[str]:
+def _select_best_run(job: str | ColumnElement[str]) -> Select[str]:
     """Select the run of a job with the smallest RMS."""
     query = select(Run.id).where(
         Run.job_id == job, Run.best_rms.is_not(None), Run.deleted_at.is_(None)

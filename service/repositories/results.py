@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.repositories.jobs import JobRepository
-from service.repositories.outcomes import select_best_run
+from service.repositories.outcomes import match_outcomes
 from service.repositories.search import NO_FILTER, ListFilter
 from service.storage.columns import Document
 from service.storage.errors import InvalidCursor, RowNotFound
@@ -108,18 +108,15 @@ def _list_runs_of_jobs(
     session: Session, jobs: Sequence[Job], room: int, *, only_best: bool
 ) -> list[ResultRow]:
     """List runs of these jobs. One query reads all that stand for their job alone."""
-    alone = [job for job in jobs if job.n_done and (only_best or job.n_runs == 1)]
-    singles = [job.id for job in alone if job.n_runs == 1]
-    best = [session.scalar(select_best_run(job.id)) for job in alone if job.n_runs > 1]
-    condition = (Run.job_id.in_(singles) & (Run.number == 0)) | Run.id.in_(filter(None, best))
-    by_id = {job.id: job for job in jobs}
-    found = _read_rows(session, _select_succeeded().where(condition), by_id)
+    alone = [job for job in jobs if only_best or job.n_runs == 1]
+    query = _select_succeeded().where(match_outcomes(session, alone))
+    found = _read_rows(session, query, {job.id: job for job in jobs})
     of_job = {row.job.id: [row] for row in found}
     rows: list[ResultRow] = []
     for job in jobs:
         if len(rows) >= room:
             break
-        if job.n_runs > 1 and job.n_done and not only_best:
+        if job.n_runs > 1 and job.n_done > job.n_failed and not only_best:
             rows += _list_runs(session, job, -1, room - len(rows))
         else:
             rows += of_job.get(job.id, [])

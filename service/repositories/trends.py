@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
@@ -49,11 +49,3 @@ def read_trend_rows(
         .limit(limit)
     )
     return [TrendRow(*row) for row in session.execute(query)]
-
-
-def count_succeeded(session: Session, job_id: str, project_id: str | None = None) -> int:
-    """Count the successful runs of a job."""
-    query = select(func.count()).where(
-        *filter_job(job_id, project_id or find_project(session)), Run.state == JobState.SUCCEEDED
-    )
-    return int(session.scalar(query) or 0)

@@ -201,10 +201,11 @@ class Job(Base):
     `attempt` counts the claims of its parcels and gives each claim its fencing token. `lost_leases`
     is that of the parcel that was lost last. `evaluations`, `generation` and `seconds_left` are the
     progress over all runs. `best_rms` is the smallest RMS of any run so far. `fit_estimation` is
-    the fit (%) of that run once the job has ended; a batch has none. `n_reused` counts the
-    runs taken over from other jobs. `floors` is the document that `service.dispatch.cramer_rao`
-    computes for a job with noise. `evaluations_before` is the part of `evaluations` that was made a
-    day or more before the job was resumed: it does not count for the limit of a day.
+    the fit (%) of that run once the job has ended, `trust` that of its verdict; a batch has none.
+    `n_reused` counts the runs taken over from other jobs. `floors` is the document that
+    `service.dispatch.cramer_rao` computes for a job with noise. `evaluations_before` is the part of
+    `evaluations` that was made a day or more before the job was resumed: it does not count for the
+    limit of a day.
 
     `version` and `fingerprint` are those of the program that last started the job; until then
     `version` is that of the program that took it. `spec_hash` is the digest of its request.
@@ -245,6 +246,7 @@ class Job(Base):
             "best_rms",
             "name",
             "state",
+            "trust",
             "id",
         ),
         _partial_index(
@@ -273,6 +275,7 @@ class Job(Base):
     n_reused: Mapped[int] = mapped_column(default=0)
     best_rms: Mapped[float | None]
     fit_estimation: Mapped[float | None]
+    trust: Mapped[str | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
     evaluations_before: Mapped[int] = mapped_column(LargeInteger, default=0, server_default="0")
     generation: Mapped[int] = mapped_column(default=0)

@@ -5,6 +5,7 @@ from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
+from service.core.text import name_label
 from service.core.text_checks import find_text_fault
 from service.items.reference_names import REFERENCE_PREFIX, RUN_PREFIX
 from service.jobs import submit
@@ -71,7 +72,7 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     }
     return JobIn.model_validate(
         {
-            "name": f"{_choose_model_name(body.model)} over {body.label}"[:200],
+            "name": f"{_choose_model_name(body.model)} over {name_label(body.label)}"[:200],
             **body.job_fields,
             "datasets": chosen[0].datasets,
             "sweep": {"axes": [axis]},

@@ -1,13 +1,11 @@
 """Use case: stream all runs of a job as one CSV table."""
 
-import csv
-import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.text import escape_formula
+from service.core.text import write_csv
 from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
@@ -92,13 +90,13 @@ def _stream_parts(
         for what in ("", "stderr of ")
     ]
     statuses = [f"status of {name}" for name in layout.parameter_names]
-    yield _to_csv_lines([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
+    yield write_csv([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
     cursor: str | None = None
     while True:
         with database.read_session() as session:
             page = RunRepository(session).list_page(job_id, cursor=cursor, limit=RUNS_PER_PART)
             rows = [_build_row(run, layout) for run in page.items]
-        yield _to_csv_lines(rows)
+        yield write_csv(rows)
         cursor = page.next
         if cursor is None:
             return
@@ -128,9 +126,3 @@ def _get_estimates(run: Run) -> list[dict[str, Any]]:
 
 def _to_csv_value(value: object) -> object:
     return json.dumps(value) if isinstance(value, dict | list) else value
-
-
-def _to_csv_lines(rows: Iterable[Sequence[Any]]) -> str:
-    sink = io.StringIO()
-    csv.writer(sink, lineterminator="\n").writerows(map(escape_formula, row) for row in rows)
-    return sink.getvalue()

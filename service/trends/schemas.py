@@ -130,5 +130,7 @@ class TrendOut(Answer):
     reference_names: list[str] = Field(default=[], description="names under which it was accepted")
     labels: list[BatchLabelOut] = Field(description="runs of each label, in the order of x")
     quantities: list[QuantityOut] = Field(description="trend of each quantity")
-    missing: int = Field(default=0, description="runs that failed or have not ended")
+    missing: int = Field(default=0, description="runs without a result")
+    failed: int = Field(default=0, description="how many of these failed")
+    unended: int = Field(default=0, description="how many of these have not ended")
     notes: list[str] = Field(default=[], description="what limits the trends")

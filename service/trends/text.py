@@ -6,6 +6,7 @@ All functions take the document of ``GET /v1/jobs/{id}/trend``.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from service.core.text import format_count
 from sysid.core.text import (
     DASH,
     append_unit,
@@ -219,6 +220,18 @@ def list_notes(trend: Mapping[str, Any]) -> list[str]:
             by_text.setdefault(text, []).append(f"{label_runs['x']:g}")
     notes += [f"{trend['x']} {', '.join(values)}: {text}" for text, values in by_text.items()]
     if trend["missing"]:
-        notes.append(f"{trend['missing']} runs failed or have not ended. They are not in the table")
+        notes.append(_describe_missing(trend["missing"], trend["failed"], trend["unended"]))
     limits = format_limits(trend["quantities"])
     return [*notes, *trend["notes"], *([limits] if limits else [])]
+
+
+def _describe_missing(missing: int, failed: int, unended: int) -> str:
+    """Describe the runs that are in no table, by the reason."""
+    others = missing - failed - unended
+    reasons = (
+        (failed, "failed"),
+        (unended, "have not ended" if unended > 1 else "has not ended"),
+        (others, "were cancelled or deleted" if others > 1 else "was cancelled or deleted"),
+    )
+    told = [f"{format_count(count)} {reason}" for count, reason in reasons if count]
+    return f"Runs that are not in the table: {', '.join(told)}"

@@ -8,11 +8,12 @@ from sqlalchemy.orm import Session
 from service.core.computed import ComputedValues
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import build_run_body
+from service.core.states import JobState
 from service.jobs.results import read_noise_model
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import list_reference_names
 from service.repositories.runs import RunRepository
-from service.repositories.trends import TrendRow, count_succeeded, read_trend_rows
+from service.repositories.trends import TrendRow, read_trend_rows
 from service.storage.sessions import release_connection
 from service.storage.tables import Job
 from service.trends.drift import BatchReference, compare_with_reference
@@ -111,6 +112,8 @@ def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
             reference.explain_gaps(request["x"], rows_by_label),
             describe_differences(session, reference.run, list(bodies.values()), channels),
         ]
+    runs = RunRepository(session).count_states(job.id)
+    ended = sum(runs[state] for state in JobState if state.is_terminal)
     return TrendOut(
         job=job.id,
         x=request["x"],
@@ -123,7 +126,9 @@ def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
             for x, rows in rows_by_label.items()
         ],
         quantities=answers,
-        missing=job.n_runs - count_succeeded(session, job.id),
+        missing=job.n_runs - runs[JobState.SUCCEEDED],
+        failed=runs[JobState.FAILED],
+        unended=0 if job.state.is_terminal else job.n_runs - ended,
         notes=[note for note in notes if note],
     )
 

@@ -172,15 +172,17 @@ def _compare_outputs(
     plot: _Plot[OutputTraces], number: int, window: tuple[float | None, float | None]
 ) -> Iterator[dict[str, Any]]:
     """Draw the measured signals of a plot, and over each the outputs of its results."""
-    upper, lower, in_legend = f"y{2 * number + 1}", f"y{2 * number + 2}", number == 0
+    upper, lower = f"y{2 * number + 1}", f"y{2 * number + 2}"
     for signal, sharing in plot:
         span = window_slice(signal.times, *window)
-        measured = _output_traces(sharing[0].signal, span, upper, in_legend)[0]
+        is_new = number == 0 or (len(plot) > 1 and sharing[0].number == 0)
+        measured = _output_traces(sharing[0].signal, span, upper, is_new)[0]
         yield measured if len(plot) == 1 else _name_measured(measured, signal, sharing)
         for one in sharing:
             look = {"legendgroup": one.name, "line": theme.series_style(one.place)}
             hover = f"%{{y:.6~g}}{plain_unit(signal.unit)}<extra>{one.name}</extra>"
-            identified = _output_traces(one.signal, span, upper, in_legend)[-1]
+            # The legend names each result once, wherever its first output is drawn.
+            identified = _output_traces(one.signal, span, upper, one.number == 0)[-1]
             yield {**identified, **look, "name": one.name, "hovertemplate": hover}
             yield {
                 **_residual_trace(one.signal, span, lower, False),

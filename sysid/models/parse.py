@@ -61,6 +61,8 @@ _FIELDS = {
     "differential": (*_COMMON_FIELDS, "states", "equations", "outputs"),
     "polynomial": (*_COMMON_FIELDS, *POLYNOMIAL_FIELDS),
 }
+_PAST_SAMPLE = re.compile(r"\w\(k\s*[-)]")
+"""An earlier value in a recursion, such as ``x(k-1)``."""
 _MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -88,7 +90,7 @@ def parse_model(document: object) -> Model:
     model = (
         _read_polynomial_model(reader, fields)
         if form == "polynomial"
-        else _read_equation_model(reader, fields)
+        else _read_equation_model(reader, fields, form)
     )
     _check_size(reader, model)
     check_delay_units(reader, model)
@@ -133,11 +135,16 @@ def _check_bounds_rules(reader: DocumentReader, model: Model) -> None:
 
 
 def _read_form(reader: DocumentReader, document: Mapping[str, Any]) -> ModelForm:
+    """Read the form. A wrong one is guessed from the fields, so that their faults are told too."""
     form = reader.require_field(document, "form", "", f"it is one of {', '.join(_FORMS)}")
     if form is not None:
-        form = reader.read_choice(form, _FORMS, "/form")
-    reader.raise_faults()  # the allowed fields depend on the form
-    return cast(ModelForm, form)
+        reader.read_choice(form, _FORMS, "/form")
+    if isinstance(form, str) and form in _FORMS:
+        return cast(ModelForm, form)
+    if "equations" not in document and any(field in document for field in POLYNOMIAL_FIELDS):
+        return "polynomial"
+    has_samples = _PAST_SAMPLE.search(str(document.get("equations")))
+    return "difference" if has_samples else "differential"
 
 
 def _read_head(reader: DocumentReader, fields: Mapping[str, Any]) -> None:
@@ -149,8 +156,9 @@ def _read_head(reader: DocumentReader, fields: Mapping[str, Any]) -> None:
         reader.read_text(fields.get(field), join_pointer(field))
 
 
-def _read_equation_model(reader: DocumentReader, fields: Mapping[str, Any]) -> Model:
-    form: EquationForm = fields["form"]
+def _read_equation_model(
+    reader: DocumentReader, fields: Mapping[str, Any], form: EquationForm
+) -> Model:
     states = read_signals(reader, fields.get("states"), "/states")
     if not fields.get("states"):
         reader.add_fault(

@@ -150,6 +150,23 @@ def test_a_deleted_version_keeps_its_number(database):
         assert models.add("pump", {"order": 1}).model.version == 2
 
 
+def test_the_last_version_of_each_model_is_listed_once_over_all_pages(database):
+    with database.write_session() as session:
+        models = ModelRepository(session)
+        for order in range(3):
+            for name in ("pump", "valve", "tank"):
+                models.add(name, {"order": order})
+        models.delete("tank")  # an earlier version is the last one now
+        found, cursor = [], None
+        while True:
+            page = models.list_page(cursor=cursor, limit=1, only_latest=True)
+            found += [(one.name, one.version) for one in page.items]
+            cursor = page.next
+            if cursor is None:
+                break
+    assert sorted(found) == [("pump", 3), ("tank", 2), ("valve", 3)]
+
+
 def test_models_stored_at_once_get_different_versions(database):
     orders = iter(range(4))
 

@@ -21,7 +21,7 @@ from service.storage.errors import (
     RowNotFound,
     UnstorableValue,
 )
-from service.storage.tables import Project, Run
+from service.storage.tables import Job, Project, Run
 from tests.stored import claim, claimed, job_of, record_outcomes, runs_of, submit
 
 NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
@@ -117,8 +117,9 @@ def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
     assert page.next is None
 
 
-def end_with_fit(database, name, *fits, cell=None):
+def end_with_fit(database, name, *fits, cell=None, trust=None):
     """A job whose runs ended with these fits (%); a better fit has a smaller RMS."""
+    result = None if trust is None else {"parameters": [], "verdict": {"trust": trust}}
     ended, runs = claimed(database, n_runs=len(fits), name=name)
     record_outcomes(
         database,
@@ -129,6 +130,7 @@ def end_with_fit(database, name, *fits, cell=None):
                 state=JobState.SUCCEEDED,
                 best_rms=None if fit is None else 100.0 - fit,
                 fit_estimation=fit,
+                result=result,
             )
             for run, fit in zip(runs, fits, strict=True)
         ),
@@ -167,6 +169,22 @@ def test_jobs_are_sorted_over_all_pages_and_those_without_a_value_come_last(data
     assert list_in_order(database, "fit", chosen=ListFilter(name="B")) == ["B", "batch"]
     queued = list_in_order(database, "name", states=[JobState.QUEUED])
     assert queued == ["e"]
+
+
+def test_jobs_are_sorted_by_the_trust_in_their_results(database):
+    end_with_fit(database, "a", 90.0, trust="limited")
+    end_with_fit(database, "b", 70.0, trust="not trustworthy")
+    resumed = end_with_fit(database, "c", 80.0, trust="trustworthy")
+    end_with_fit(database, "d", 99.0, trust="trustworthy")
+    end_with_fit(database, "batch", 99.0, trust="trustworthy", cell={"/datasets": ["ds_1"]})
+    submit(database, "e")
+    assert list_in_order(database, "verdict") == ["d", "c", "a", "b", "e", "batch"]
+    assert list_in_order(database, "worst-verdict") == ["b", "a", "d", "c", "e", "batch"]
+    with database.write_session() as session:
+        session.get_one(Job, resumed).state = JobState.FAILED
+    with database.write_session() as session:
+        JobRepository(session).resume(resumed)
+    assert list_in_order(database, "verdict")[0:2] == ["d", "a"]
 
 
 def test_the_fit_of_a_job_is_that_of_the_best_run_that_is_left(database):

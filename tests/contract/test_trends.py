@@ -125,6 +125,11 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
     record_outcomes(place.database, lease, outcome)
     found = trend(place, job)
     assert (found.missing, [label.x for label in found.labels]) == (2, [1.0])
+    assert (found.failed, found.unended) == (1, 1)
+    with place.database.write_session() as session:
+        LeaseQueue(session).finish_job(lease, JobState.CANCELLED)
+    found = trend(place, job)
+    assert (found.missing, found.failed, found.unended) == (2, 1, 0)
 
 
 def end(place: Place, job: str) -> None:

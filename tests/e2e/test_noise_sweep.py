@@ -49,7 +49,7 @@ def test_a_sweep_shows_its_errors_and_a_cell_leads_to_its_runs(page: Page, job: 
     assert set(drawn) == {
         "simple",
         "improved",
-        "Cramér–Rao bound (of the median; of parameters: 5 and 95 %)",
+        "Cramér–Rao bound (median; 5 and 95 %)",
     }
     height = page.locator(PLOT).evaluate("plot => [plot.clientHeight, plot.layout.height]")
     assert height[0] == height[1]  # the page had left room: nothing below has moved

@@ -90,6 +90,8 @@ def test_runs_on_other_data_are_drawn_over_their_own_measured_output() -> None:
     units = plot_comparison([("a", first), ("b", traces(0.0, [3, 2, 1], "kPa"))])
     names = [one["title"]["text"] for key, one in units["layout"].items() if "yaxis" in key]
     assert names[0::2][:2] == ["y [V]", "y [kPa]"]  # other units have plots of their own
+    named = [one["name"] for one in units["data"] if one.get("showlegend")]
+    assert named == ["measured", "a", "b"]  # each once
     late = replace(first, outputs=traces(1.0, [2, 3]).outputs)  # the first sample is not scored
     assert plot_comparison([("a", first), ("b", late)])["data"][3]["x"] == [1, 2]
 
@@ -170,6 +172,16 @@ def test_references_are_listed_with_units_and_what_is_compared_with_them(
     assert f'href="/jobs/{filled.queued}"' in page
     assert "compared with it" in page
     assert client.get("/references/pipe").status_code == 404
+
+
+def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
+    page = client.get(f"/jobs/{filled.finished}").text
+    drawn = page[page.index('<svg class="lineage"') :].partition("</svg>")[0]
+    assert f'<a href="/datasets/{filled.dataset}" aria-label="recording tube 40 m">' in drawn
+    assert f'<a href="/runs/{filled.finished_run}" aria-label="run run 1 of tube' in drawn
+    assert drawn.count('<g class="shown">') == 1
+    assert 'aria-label="reference tube"' in drawn
+    assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording
 
 
 def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, filled: Filled) -> None:

@@ -187,7 +187,9 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
             "reference_names": [],
             "labels": [place],
             "quantities": [one],
-            "missing": 0,
+            "missing": 6,
+            "failed": 1,
+            "unended": 2,
             "notes": ["use loss: {noise_model: ar1}"],
         },
         FieldOrigins(),
@@ -195,6 +197,7 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
     told = capsys.readouterr().out
     assert "T [s]" in told
     assert "note: use --set loss.noise_model=ar1" in told
+    assert "1 failed, 2 have not ended, 3 were cancelled or deleted" in told
 
 
 def test_a_job_that_is_watched_from_a_pipe_tells_its_state(served: Served) -> None:

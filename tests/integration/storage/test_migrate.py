@@ -106,7 +106,7 @@ def test_postgresql_compresses_no_result_by_its_slow_method_after_a_way_back():
     assert all(storage == "e" or method == "l" for storage, method in found.values()), found
 
 
-def test_the_fit_of_ended_jobs_is_taken_from_their_best_runs(empty_database):
+def test_fit_and_trust_of_ended_jobs_are_taken_from_their_best_runs(empty_database):
     database = empty_database
     migrate.upgrade_database(database)
     jobs = []
@@ -114,7 +114,14 @@ def test_the_fit_of_ended_jobs_is_taken_from_their_best_runs(empty_database):
         ended, runs = claimed(database, n_runs=2)
         for run, rms in zip(runs, (0.5, 0.4), strict=True):
             outcome = RunOutcome(
-                run_id=run, state=JobState.SUCCEEDED, best_rms=rms, fit_estimation=100 - rms
+                run_id=run,
+                state=JobState.SUCCEEDED,
+                best_rms=rms,
+                fit_estimation=100 - rms,
+                result={
+                    "parameters": [],
+                    "verdict": {"trust": "limited" if rms == 0.4 else "trustworthy"},
+                },
             )
             record_outcomes(database, ended.lease, outcome)
         with database.write_session() as session:
@@ -124,8 +131,9 @@ def test_the_fit_of_ended_jobs_is_taken_from_their_best_runs(empty_database):
     migrate.downgrade_database(database, "0006")
     migrate.upgrade_database(database)
     with database.read_session() as session:
-        fits = [session.get_one(Job, job).fit_estimation for job in jobs]
-    assert fits == [99.6, None]  # a batch has none
+        found = [session.get_one(Job, job) for job in jobs]
+    # A batch has none.
+    assert [(job.fit_estimation, job.trust) for job in found] == [(99.6, "limited"), (None, None)]
 
 
 def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):

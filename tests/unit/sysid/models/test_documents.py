@@ -104,6 +104,13 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
     assert repr(CONTINUOUS) == before
 
 
+@pytest.mark.parametrize("base", [CONTINUOUS, DISCRETE])
+def test_a_wrong_form_does_not_hide_the_other_faults(base: dict[str, Any]) -> None:
+    told = faults(base, form="ode", equations=base["equations"] | {"x": "x^2"})
+    assert set(told) == {"/form", "/equations/x"}
+    assert "^" in told["/equations/x"]
+
+
 @pytest.mark.parametrize(
     ("changes", "pointer", "part"),
     [
