@@ -5,6 +5,7 @@ from __future__ import annotations  # the help of `identify` shows `Data`, not a
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from sysid.core.distributions import load_in_background
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind, Weights
 from sysid.core.text import rewrite_settings
 from sysid.data.holds import HoldSetting
@@ -210,6 +211,7 @@ def identify_records(
     check_warm(warm, [parameter.name for parameter in problem.all_parameters])
     if tell is not None:
         tell(warn_constant_outputs(problem))
+    load_in_background()  # the conclusion needs them
     found = conclude_run(
         problem,
         algorithm,

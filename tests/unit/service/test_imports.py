@@ -19,6 +19,7 @@ SERVICE = {
 COMMANDS = {
     "command line": "import service.cli.main",
     "identify": "identify()",
+    "search": "import sysid.identification.identify",
     "whole identification": "identify_white()",
     "colour of a short record": "fit_short_record()",
 }
@@ -102,8 +103,9 @@ def run_statements(statements: dict[str, str], data: Path) -> dict[str, list[str
             | {"pandas", "plotly"}
             | {f"service.cli.{group}" for group in ("access", "datasets", "jobs", "server")},
         ),
-        # SciPy's functions took an eighth of the command's CPU.
-        ("whole identification", {"scipy.special", "psutil", "sysid.kernels.kernel"}),
+        # SciPy's functions are loaded while the search runs.
+        ("search", {"scipy.special"}),
+        ("whole identification", {"psutil", "sysid.kernels.kernel"}),
         # They took half a second, four fifths of what its first use in a process does.
         ("colour of a short record", {"scipy.signal"}),
     ],
