@@ -18,10 +18,10 @@ from benchmarks.table import Row, parser, report
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.results.result import Identification
 from sysid.uncertainty.estimates import Estimate
 
 DRAWS, QUICK = 20, 4

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from sysid.export.export import export_model
     from sysid.export.load import load_identified
     from sysid.identification.identify import identify
-    from sysid.identification.result import Identification
     from sysid.models.catalogue.load import catalogue, load_model
     from sysid.models.parameters import Parameter
+    from sysid.results.result import Identification
     from sysid.simulation.problem import Problem
     from sysid.simulation.simulate import simulate
     from sysid.uncertainty.estimates import Estimate
@@ -116,7 +116,7 @@ _PUBLIC_NAMES = {
     "export.export": ("export_model",),
     "export.load": ("load_identified",),
     "identification.identify": ("identify",),
-    "identification.result": ("Identification",),
+    "results.result": ("Identification",),
     "models.catalogue.load": ("catalogue", "load_model"),
     "models.parameters": ("Parameter",),
     "simulation.problem": ("Problem",),

@@ -5,8 +5,8 @@ from service.queue.leases import Lease, LeaseQueue
 from service.queue.packed_results import PackedResults
 from service.queue.run_writes import RunWriter
 from service.storage.sessions import Database
-from sysid.identification.result import Identification, SearchEvidence
 from sysid.islands.state import RunState
+from sysid.results.result import Identification, SearchEvidence
 from sysid.search.state import Improvement, Migrant
 from sysid.uncertainty.estimates import Criteria, Estimate
 from tests.runs import spec

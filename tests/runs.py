@@ -9,9 +9,9 @@ import numpy as np
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import copy_catalogue_document
+from sysid.results.result import Identification
 from tests.limits import LIMIT_SECONDS
 from workers.protocol import (
     CompleteRun,

@@ -12,8 +12,8 @@ from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.identification.fingerprint import compute_fingerprint
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
+from sysid.results.result import Identification
 from sysid.search.island import Island
 
 _WORKERS = Path(__file__).parent  # they split records and add noise

@@ -19,7 +19,7 @@ from service.pages.figures import (
     load_trend_figure,
 )
 from sysid.figures.plotly import Figure, apply_theme
-from sysid.identification.figures import FigureName
+from sysid.results.figures import FigureName
 
 router = APIRouter()
 

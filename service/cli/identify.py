@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from service.jobs.schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.arguments import ReadRecords
-    from sysid.identification.result import Identification
     from sysid.models.model import Model
+    from sysid.results.result import Identification
     from sysid.uncertainty.estimates import Posterior
 
 
@@ -361,7 +361,7 @@ def print_result(
     Warnings that are `printed` already are in the JSON only.
     """
     from service.runs.result import to_result_document
-    from sysid.identification.summary import describe_order, describe_residuals, find_output_unit
+    from sysid.results.summary import describe_order, describe_residuals, find_output_unit
 
     document = to_result_document(result, seconds)
     if output is not None:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.identification.result import SearchEvidence
-from sysid.identification.verdict import Evidence, Verdict, judge_result
 from sysid.residuals.residual_tests import ResidualTest
+from sysid.results.result import SearchEvidence
+from sysid.results.verdict import Evidence, Verdict, judge_result
 from sysid.uncertainty.estimates import Estimate
 
 VERDICT_PARTS = ("verdict", "valid", "parameters", "fit_percent", "search", "residual_tests")

@@ -28,8 +28,8 @@ from sysid.core.settings import (
     TopologyName,
 )
 from sysid.data.records import HoldSetting
-from sysid.identification.verdict import Trust
 from sysid.models.parameters import ParameterScale
+from sysid.results.verdict import Trust
 
 SEARCH, LOSS = GeneticAlgorithm(), Loss()
 """Core settings, which provide the defaults."""

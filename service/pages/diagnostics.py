@@ -14,7 +14,7 @@ from sysid.core.text import (
 )
 from sysid.figures.plotly import Figure
 from sysid.figures.residuals import plot_residuals
-from sysid.identification.figures import to_correlation_trace
+from sysid.results.figures import to_correlation_trace
 
 if TYPE_CHECKING:  # a report without a database has diagnostics too
     from service.runs.residuals import ResidualAnalysis

@@ -32,14 +32,14 @@ from sysid.figures.data import (
     RunFigureData,
     SignalTrace,
 )
-from sysid.identification.figures import (
+from sysid.models.parameters import Parameter, ParameterScale
+from sysid.results.figures import (
     RecordTraces,
     add_bands,
     arrange_experiments,
     label_fitness,
     to_signal_trace,
 )
-from sysid.models.parameters import Parameter, ParameterScale
 
 
 def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:

@@ -29,7 +29,7 @@ from sysid.figures import plotly, signals
 from sysid.figures.plotly import Abscissa, Figure
 from sysid.figures.posterior import plot_posterior
 from sysid.figures.theme import Theme
-from sysid.identification.figures import FigureName
+from sysid.results.figures import FigureName
 from sysid.trends.trend import OutlierRule
 
 

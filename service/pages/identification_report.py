@@ -16,9 +16,9 @@ from service.pages.render import (
 )
 from service.pages.result_view import to_result_view
 from service.runs.result import to_result_document
-from sysid.identification.figures import draw_figures, list_experiments
-from sysid.identification.result import Identification
-from sysid.identification.summary import find_output_unit
+from sysid.results.figures import draw_figures, list_experiments
+from sysid.results.result import Identification
+from sysid.results.summary import find_output_unit
 
 MAX_EXPERIMENTS = 4
 

@@ -85,12 +85,12 @@ def _compute_bands(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> "tuple[tuple[OutputBands, ...], ...]":
     # These import the compiler, which most requests never need.
-    from sysid.identification.bands import (
+    from sysid.residuals.series import make_whitening
+    from sysid.results.bands import (
         compute_fit_bands,
         estimate_noise,
         list_whole_records,
     )
-    from sysid.residuals.series import make_whitening
     from sysid.uncertainty.analysis import analyse_estimate
     from sysid.uncertainty.output_bands import ParameterSpread
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from service.core.documents import to_finite
 from service.jobs.results import to_verdict_document
-from sysid.identification.result import Identification, InputHold, OrderComparison
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import TEST_LEVEL, ResidualTest, ResidualTests
+from sysid.results.result import Identification, InputHold, OrderComparison
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 

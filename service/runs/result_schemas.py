@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.core.wire import Answer, Finite
-from sysid.identification.verdict import Severity, Trust
+from sysid.results.verdict import Severity, Trust
 
 
 class EstimateOut(Answer):

@@ -232,9 +232,9 @@ class Loss:
 
     With the noise model ``ar1`` the search minimises squares. Then generalised least squares
     under first-order noise gives the estimates
-    (`sysid.identification.generalised_least_squares`). ``auto`` selects, for free runs by
+    (`sysid.noise_models.generalised_least_squares`). ``auto`` selects, for free runs by
     squares with coloured residuals, the one that predicts left-out data better
-    (`sysid.identification.noise_model_choice`), else ``white``.
+    (`sysid.noise_models.noise_model_choice`), else ``white``.
 
     Examples
     --------

@@ -13,11 +13,11 @@ from sysid.export.c import write_c_source
 from sysid.export.description import write_json_source
 from sysid.export.python import write_python_source
 from sysid.export.python_control import write_control_source
-from sysid.identification.result import Identification
 from sysid.language.evaluation import evaluate_expression
 from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
 from sysid.models.ties import resolve_ties
+from sysid.results.result import Identification
 
 ExportFormat = Literal["json", "python", "c", "control"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)

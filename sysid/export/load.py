@@ -9,8 +9,8 @@ import numpy as np
 from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue
 from sysid.core.errors import InvalidModel, UnreadableResult
 from sysid.export.description import JSON_FORMAT
-from sysid.identification.saved_result import FORMAT, read_json
 from sysid.models.parse import parse_model
+from sysid.results.saved_result import FORMAT, read_json
 
 
 def load_identified(path: str | PathLike[str]) -> IdentifiedModel:

@@ -1,1 +1,1 @@
-"""The whole: run a search, conclude, choose the noise model, warn; `identify()`, `Run`."""
+"""The whole: search, best estimate, evidence; `identify()`, `Run`."""

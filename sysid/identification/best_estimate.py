@@ -13,18 +13,7 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.identifiability.exchange import (
-    ExchangeGroups,
-    find_exchanges,
-    order_exchangeable,
-)
-from sysid.identification.budget import Budget
-from sysid.identification.deadline import Deadline
-from sysid.identification.generalised_least_squares import (
-    GeneralisedEstimate,
-    fit_generalised_least_squares,
-)
-from sysid.identification.integration_step import (
+from sysid.diagnosis.integration_step import (
     HalfStep,
     choose_starts,
     compare_half_step,
@@ -32,13 +21,25 @@ from sysid.identification.integration_step import (
     find_limit,
     mark_changing,
 )
-from sysid.identification.local_minima import (
+from sysid.diagnosis.unrecorded_input import RecordedComparison, compare_where_recorded
+from sysid.diagnosis.validation import simulate_validation
+from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.identifiability.exchange import (
+    ExchangeGroups,
+    find_exchanges,
+    order_exchangeable,
+)
+from sysid.identification.budget import Budget
+from sysid.identification.deadline import Deadline
+from sysid.islands.state import RunState
+from sysid.islands.stopping import count_restarts
+from sysid.minima.local_minima import (
     LocalMinima,
     count_affordable_simulations,
     find_local_minima,
     widen_intervals,
 )
-from sysid.identification.minima import (
+from sysid.minima.minima import (
     Fit,
     FoundMinima,
     collect_minima,
@@ -48,18 +49,17 @@ from sysid.identification.minima import (
     scan_by_projection,
     scan_parameters,
 )
-from sysid.identification.noise_model_choice import (
+from sysid.minima.search_evidence import is_explained
+from sysid.noise_models.generalised_least_squares import (
+    GeneralisedEstimate,
+    fit_generalised_least_squares,
+)
+from sysid.noise_models.noise_model_choice import (
     PredictionErrors,
     compare_on_blocks,
     explain_noise_model_choice,
     may_be_ar1,
 )
-from sysid.identification.search_evidence import is_explained
-from sysid.identification.unrecorded_input import RecordedComparison, compare_where_recorded
-from sysid.identification.validation import simulate_validation
-from sysid.identification.warnings import find_delay_parameters
-from sysid.islands.state import RunState
-from sysid.islands.stopping import count_restarts
 from sysid.residuals.residual_tests import run_residual_tests
 from sysid.residuals.series import make_whitening
 from sysid.residuals.whitening import Whitening

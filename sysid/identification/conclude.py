@@ -10,13 +10,9 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.records import find_common_sample_time
-from sysid.identifiability.exchange import describe_exchanges
-from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
-from sysid.identification.budget import Budget
-from sysid.identification.deadline import Clock, Deadline
-from sysid.identification.fixed_start import warn_fixed_starts
-from sysid.identification.hard_switching import warn_hard_switching
-from sysid.identification.input_hold import (
+from sysid.diagnosis.fixed_start import warn_fixed_starts
+from sysid.diagnosis.hard_switching import warn_hard_switching
+from sysid.diagnosis.input_hold import (
     FITS_AS_WELL,
     describe_input_holds,
     find_hold_doubts,
@@ -24,38 +20,42 @@ from sysid.identification.input_hold import (
     mark_hold_dependent,
     refit_other_holds,
 )
-from sysid.identification.integration_step import explain_finer_step
-from sysid.identification.minima import mark_ambiguous
-from sysid.identification.noise_model_choice import resolve_noise_model
-from sysid.identification.process_order import (
+from sysid.diagnosis.integration_step import explain_finer_step
+from sysid.diagnosis.process_order import (
     compare_orders,
     mark_order_dependent,
     warn_other_order,
 )
-from sysid.identification.result import Identification
-from sysid.identification.search_evidence import assess_search, mark_unsettled, warn_unsettled
-from sysid.identification.unstable_run import (
+from sysid.diagnosis.unstable_run import (
     compare_one_step,
     mark_prediction_dependent,
     warn_misled_run,
 )
-from sysid.identification.validation import (
+from sysid.diagnosis.validation import (
     mark_refuted,
     split_outputs,
     validate_estimates,
     warn_refuted,
     warn_still_validation,
 )
-from sysid.identification.warnings import (
+from sysid.diagnosis.warnings import (
     collect_warnings,
     find_delay_parameters,
     warn_noise_model,
     warn_time_limit,
 )
+from sysid.identifiability.exchange import describe_exchanges
+from sysid.identification.best_estimate import IslandEnd, find_best_estimate, is_refining
+from sysid.identification.budget import Budget
+from sysid.identification.deadline import Clock, Deadline
 from sysid.islands.state import RunState
+from sysid.minima.minima import mark_ambiguous
+from sysid.minima.search_evidence import assess_search, mark_unsettled, warn_unsettled
+from sysid.noise_models.noise_model_choice import resolve_noise_model
 from sysid.residuals.feedback import describe_feedback
 from sysid.residuals.onset_delay import estimate_onset_delays
 from sysid.residuals.residual_tests import list_residual_series, run_residual_tests
+from sysid.results.result import Identification
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.problem import Problem, compute_metrics
 from sysid.uncertainty.analysis import Analysis

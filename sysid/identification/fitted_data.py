@@ -8,10 +8,10 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
 from sysid.identification.fit_problems import FitRecords, ProblemPair
-from sysid.identification.result import FittedData, Identification
 from sysid.models.model import Model
 from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import compute_correlations, list_residual_series
+from sysid.results.result import FittedData, Identification
 from sysid.simulation.problem import Problem
 
 

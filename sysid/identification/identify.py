@@ -11,6 +11,7 @@ from sysid.core.text import rewrite_settings
 from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
 from sysid.data.records import Record
+from sysid.diagnosis.warnings import warn_constant_outputs
 from sysid.identification.arguments import (
     Change,
     Data,
@@ -23,14 +24,13 @@ from sysid.identification.arguments import (
 from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.fitted_data import collect_fitted_data
-from sysid.identification.result import Identification
 from sysid.identification.run import advance_run, begin_run, is_finished
-from sysid.identification.warnings import warn_constant_outputs
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import ModelSource, resolve_model
 from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
 from sysid.models.units import check_signal_units
+from sysid.results.result import Identification
 from sysid.simulation.problem import Problem
 
 _PROGRESS_SECONDS = 0.25

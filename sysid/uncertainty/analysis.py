@@ -11,7 +11,7 @@ K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals u
 If the residuals are clearly not one white noise, the covariance is a sandwich
 (`sysid.residuals.sandwich`): of coloured residuals of a free run, of unequal variances, of outputs
 that share their noise, or of whole repeats. Under a noise model, e and S are whitened first
-(`sysid.identification.generalised_least_squares`).
+(`sysid.noise_models.generalised_least_squares`).
 
 A time lag that is rounded to whole samples has plateaus of width w on which the output does not
 change. The position on a plateau is undetermined. So w²/12 is added to the variance, and the

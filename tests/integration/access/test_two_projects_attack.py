@@ -17,8 +17,8 @@ from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
 from service.repositories.audit import list_actions
 from service.storage.tables import DEFAULT_PROJECT, ApiKey, AuditEntry, Base, Project
-from sysid.identification.figures import FigureName
 from sysid.models.catalogue.load import copy_catalogue_document
+from sysid.results.figures import FigureName
 from tests.guarded import Guarded
 from tests.identified import identified
 from tests.rest import CSV, recording, store_csv_in

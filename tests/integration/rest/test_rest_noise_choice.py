@@ -11,7 +11,7 @@ from service.api.app import create_app
 from service.api.dependencies import Parts
 from tests.identified import identified
 from tests.rest import parts_of, refused, settings_of, store_csv
-from tests.unit.sysid.identification.test_noise_model_choice import (
+from tests.unit.sysid.noise_models.test_noise_model_choice import (
     LAG,
     STEP,
     TANK,

@@ -6,8 +6,8 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
+from sysid.results.result import Identification
 from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=60, generations=40, islands=2)

@@ -5,9 +5,9 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.data.records import Record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
+from sysid.results.result import Identification
 from tests.catalogue_cases import CASES, Case, made
 
 

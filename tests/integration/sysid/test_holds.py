@@ -11,8 +11,8 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Recording
 from sysid.identification.fit_problems import prepare_records
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification, InputHold
 from sysid.models.catalogue.load import load_model
+from sysid.results.result import Identification, InputHold
 
 PERIOD, LAG = 0.5, 3.2
 

@@ -8,9 +8,9 @@ from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.data.noise import Noise
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
+from sysid.results.result import Identification
 from sysid.search.refine import refine_candidates
 from tests.searching import COULOMB, DUFFING, clean, example, noisy, record
 

@@ -10,11 +10,11 @@ from sysid.core.settings import GeneticAlgorithm, IslandChange, Stop
 from sysid.data.records import Channel, Record
 from sysid.export.export import export_model
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.identification.run import begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.results.result import Identification
 from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate

@@ -35,12 +35,12 @@ from sysid.core.errors import (
     UnreadableResult,
     UnwritableFile,
 )
-from sysid.identification.figures import FIGURES, draw_figures, list_experiments
-from sysid.identification.result import InputHold
-from sysid.identification.saved_result import FORMAT
-from sysid.identification.summary import summarise_result
 from sysid.models.model import Model, replace_substeps
 from sysid.residuals.residual_tests import judge_tests
+from sysid.results.figures import FIGURES, draw_figures, list_experiments
+from sysid.results.result import InputHold
+from sysid.results.saved_result import FORMAT
+from sysid.results.summary import summarise_result
 from sysid.uncertainty.estimates import Posterior
 from tests.polynomials import TRUTH as POLYNOMIAL
 from tests.polynomials import document, frols, record_of

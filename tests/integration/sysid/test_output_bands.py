@@ -14,11 +14,11 @@ from sysid.core.errors import InvalidSettings, RecordTooShort
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.bands import pool_noise
-from sysid.identification.figures import draw_figures
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.parse import parse_model
+from sysid.results.bands import pool_noise
+from sysid.results.figures import draw_figures
+from sysid.results.result import Identification
 from sysid.search.refine import refine_candidates
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.simulation.problem import Problem

@@ -13,10 +13,10 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.diagnosis.process_order import mark_order_dependent, warn_other_order
 from sysid.identification.identify import identify
-from sysid.identification.process_order import mark_order_dependent, warn_other_order
-from sysid.identification.result import Identification, OrderComparison, OrderFit
-from sysid.identification.summary import describe_order
+from sysid.results.result import Identification, OrderComparison, OrderFit
+from sysid.results.summary import describe_order
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Criteria, Estimate, NoiseColour, Uncertainty
 

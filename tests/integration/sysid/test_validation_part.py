@@ -12,9 +12,9 @@ from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Record
 from sysid.data.splitting import split_record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
+from sysid.results.result import Identification
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from tests.searching import DUFFING, force

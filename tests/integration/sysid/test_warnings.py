@@ -10,10 +10,10 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.results.result import Identification
 from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=30, generations=120)

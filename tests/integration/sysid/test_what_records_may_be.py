@@ -13,9 +13,9 @@ from sysid.core.types import FloatArray
 from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Record, Recording
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.results.result import Identification
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import from_unit
 from sysid.simulation.simulate import simulate

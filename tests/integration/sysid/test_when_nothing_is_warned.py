@@ -8,10 +8,10 @@ import pytest
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
+from sysid.diagnosis.warnings import _warn_correlations
 from sysid.identification.identify import identify
-from sysid.identification.result import Identification
-from sysid.identification.warnings import _warn_correlations
 from sysid.models.catalogue.load import load_model
+from sysid.results.result import Identification
 from sysid.simulation.problem import Problem
 from tests.searching import DUFFING as TRUTH
 from tests.searching import noisy, record

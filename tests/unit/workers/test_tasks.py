@@ -12,7 +12,7 @@ import pytest
 import workers.tasks
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
-from sysid.identification import best_estimate, conclude, generalised_least_squares
+from sysid.identification import best_estimate, conclude
 from sysid.identification.identify import identify
 from sysid.identification.run import begin_run
 from sysid.kernels import build, compilation
@@ -20,6 +20,7 @@ from sysid.kernels.layout import KernelVariant
 from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
+from sysid.noise_models import generalised_least_squares
 from sysid.simulation.problem import Problem
 from tests.compiling import compile_here
 from tests.polynomials import frols, lagged

@@ -15,7 +15,7 @@ from service.formats.mcap import read_fitted_outputs
 from service.queue.packed_results import LAYOUTS, RESULT_ROWS, PackedResults, RowLayout, pack_rows
 from service.queue.run_writes import RunOutcome
 from service.storage.tables import Base
-from sysid.identification.result import Identification
+from sysid.results.result import Identification
 from tests.runs import RECORDS, spec
 from workers.protocol import AdvanceRun, CompleteRun, RunConclusion
 from workers.tasks import process_pack

@@ -25,7 +25,7 @@ from sysid.figures.theme import (
     thin_indices,
     window_slice,
 )
-from sysid.identification.figures import label_fitness
+from sysid.results.figures import label_fitness
 
 
 def island(points: int, start: float = 100.0) -> list[IslandImprovement]:

@@ -1,0 +1,1 @@
+"""What speaks against an estimate: start, past, hold, step, order, suspects, validation."""

@@ -1,0 +1,243 @@
+"""Holds chosen by the data: what the estimate is if an input is read the other way.
+
+Read held, an input acts half a sample earlier than in straight lines. Mostly both fit equally, with
+two time lags. So a choice is in doubt in four cases. The other reading fits clearly better. Or an
+input in straight lines follows the residuals, as a command that a controller computes and holds.
+Or the samples beside each of its samples say nothing of it, so no line leads there. Or an input is
+held because it moves at random, and that does not fit clearly better.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from math import log
+
+import numpy as np
+
+from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.types import FloatArray
+from sysid.data.holds import Hold, is_rough
+from sysid.data.records import Channel, Record
+from sysid.kernels.reads import is_difference
+from sysid.residuals.feedback import find_commands
+from sysid.residuals.residual_tests import list_residual_series
+from sysid.results.result import InputHold
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
+
+FITS_AS_WELL = "That fits as well"  # a doubt, but no reason to prefer the other reading
+_NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
+_CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
+_MAX_TOLD = 3  # estimates in one sentence
+_READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
+
+
+def list_input_holds(problem: Problem) -> tuple[InputHold, ...]:
+    """List how each input is read; one whose experiments differ is listed once for each reading."""
+    is_recursion = is_difference(problem.model)
+    return problem.share(
+        "input holds",
+        lambda: tuple(
+            hold
+            for signal in problem.model.inputs
+            for hold in _list_holds(signal.name, problem.records, is_recursion)
+        ),
+    )
+
+
+def _list_holds(name: str, records: Sequence[Record], is_recursion: bool) -> list[InputHold]:
+    channels = _find_channels(name, records)
+    moving = [channel for channel in channels if np.ptp(channel.values) > 0] or channels[:1]
+    holds = {(channel.effective_hold, channel.hold == "auto"): channel for channel in moving[::-1]}
+    listed = []
+    for (chosen, is_chosen), channel in sorted(holds.items(), key=lambda item: item[0]):
+        has_effect = is_chosen and not is_recursion and np.ptp(channel.values) > 0
+        other: Hold = "first" if chosen == "zero" else "zero"
+        reason = channel.hold_choice.reason if is_chosen else None
+        listed.append(InputHold(name, chosen, reason, other if has_effect else None))
+    return listed
+
+
+def refit_other_holds(
+    problem: Problem,
+    holds: Sequence[InputHold],
+    theta: FloatArray,
+    start: FloatArray,
+    max_simulations: int | None,
+    is_late: Callable[[], bool],
+) -> tuple[tuple[InputHold, ...], int]:
+    """Estimate by least squares with each chosen hold replaced; return the simulations too.
+
+    Parameters
+    ----------
+    theta, start : FloatArray, shape (D,)
+        The estimates, and those by least squares. A noise model keeps its difference of the two.
+    max_simulations : int or None
+        Budget; what exceeds it is left out.
+    """
+    compared, spent = [], 0
+    for hold in holds:
+        left = None if max_simulations is None else max_simulations - spent
+        if hold.other is None or is_late() or (left is not None and left <= 0):
+            compared.append(hold)
+            continue
+        other = replace_holds(problem, [hold])
+        end = refine_candidates(other, [start], left, is_late)[0]
+        if end is not None:
+            spent += end.evaluations
+            values = (theta + end.theta - start).tolist()
+            estimates = dict(zip(problem.free_names, values, strict=True))
+            hold = replace(hold, estimates_other=estimates, rms_other=end.rms)
+        compared.append(hold)
+    return tuple(compared), spent
+
+
+def find_hold_doubts(
+    problem: Problem, holds: Sequence[InputHold], simulated: FloatArray, rms: float
+) -> list[str]:
+    """Find for each hold, as a sentence, why the other reading is as likely; empty if it is not.
+
+    `simulated` (n,) and `rms` are those with the chosen readings.
+    """
+    may_be_command = any(hold.chosen == "first" and hold.rms_other for hold in holds)
+    commands = find_commands(list_residual_series(problem, simulated)) if may_be_command else set()
+    doubts = []
+    for hold in holds:
+        evidence, doubt = _compute_evidence(hold, problem.n_scored, rms), ""
+        if evidence > _CLEAR_EVIDENCE:
+            doubt = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
+        elif hold.rms_other is not None and evidence >= -_CLEAR_EVIDENCE:
+            channels = _find_channels(hold.input, problem.records)
+            doubt = _doubt_equal_fit(hold, channels, commands)
+        doubts.append(doubt)
+    return doubts
+
+
+def _doubt_equal_fit(hold: InputHold, channels: Sequence[Channel], commands: set[str]) -> str:
+    """Say why the other reading is as likely if both fit; empty if it is not."""
+    if hold.chosen == "zero":
+        return FITS_AS_WELL if any(one.hold_choice.needs_fit for one in channels) else ""
+    if hold.input in commands:
+        return "The input follows the residuals as a command does, which is held"
+    if any(is_rough(one.values) for one in channels):
+        return "Its samples do not follow each other, so hardly in straight lines"
+    return ""
+
+
+def mark_hold_dependent(
+    estimates: tuple[Estimate, ...], holds: Sequence[InputHold], doubts: Sequence[str]
+) -> tuple[Estimate, ...]:
+    """Mark identified values whose interval does not hold that of a reading as likely.
+
+    Their standard errors assume the chosen reading.
+    """
+    for hold, doubt in zip(holds, doubts, strict=True):
+        if doubt:
+            estimates = tuple(_mark(estimate, hold) for estimate in estimates)
+    return estimates
+
+
+def replace_holds(problem: Problem, holds: Sequence[InputHold]) -> Problem:
+    """Replace each of these holds that the data chose by the other one."""
+    records = list(problem.records)
+    for hold in holds:
+        records = [_replace_hold(record, hold) for record in records]
+    return problem.rebuild(records=records, weights=problem.output_weights)
+
+
+def write_hold(hold: InputHold) -> str:
+    """Write the option that sets the reading that was not chosen."""
+    return f"hold: {{{hold.input}: {hold.other}}}"
+
+
+def _mark(estimate: Estimate, hold: InputHold) -> Estimate:
+    other = (hold.estimates_other or {}).get(estimate.name)
+    interval = estimate.interval95
+    if other is None or interval is None or estimate.status != "identified":
+        return estimate
+    if interval[0] <= other <= interval[1]:
+        return estimate
+    value = f"{plain_estimate(other, estimate.stderr)}{plain_unit(estimate.unit)}"
+    reason = f"it is {value} if {hold.input} is read {_READINGS[str(hold.other)]}"
+    return replace(estimate, status="hold-dependent", reason=reason)
+
+
+def describe_input_holds(
+    problem: Problem,
+    holds: Sequence[InputHold],
+    doubts: Sequence[str],
+    estimates: Sequence[Estimate],
+    rms: float,
+) -> list[str]:
+    """Describe holds chosen by the data where the choice moves an estimate, or fits worse.
+
+    That an input is read as straight lines is told only where that is in doubt.
+    """
+    messages = []
+    for hold, doubt in zip(holds, doubts, strict=True):
+        moved = _describe_moved_estimates(hold, estimates)
+        is_worse = _compute_evidence(hold, problem.n_scored, rms) > _CLEAR_EVIDENCE
+        if is_worse or (moved and (doubt or hold.chosen == "zero")):
+            why = f". {doubt}" if doubt else ""
+            other = f"{_READINGS[str(hold.other)]} ({write_hold(hold)})"
+            messages.append(
+                f"input {hold.input!r} {hold.reason}, so it is read {_READINGS[hold.chosen]}. "
+                f"Read {other} it would give {moved or 'the same estimates'}{why}"
+            )
+        if hold.chosen == "zero" and hold.other is not None:
+            messages += _describe_uncertain_jumps(hold.input, problem.records)
+    return messages
+
+
+def _describe_moved_estimates(hold: InputHold, estimates: Sequence[Estimate]) -> str:
+    moves = []
+    for estimate in estimates:
+        other = (hold.estimates_other or {}).get(estimate.name)
+        if other is not None and estimate.stderr:
+            move = abs(other - estimate.value) / estimate.stderr
+            if move > _NOTABLE_STDERRS:
+                unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+                told = f"{estimate.name} = {other:.4g}{unit} instead of {estimate.value:.4g}"
+                moves.append((-move, told))
+    return ", ".join(told for _, told in sorted(moves)[:_MAX_TOLD])
+
+
+def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:
+    """Compute twice the logarithm of the likelihood ratio in favour of the other reading."""
+    if not hold.rms_other or not rms > 0:
+        return 0.0
+    return 2 * samples * log(rms / hold.rms_other)
+
+
+def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]:
+    """Say by how much the times of jumps are uncertain where the sampling is irregular."""
+    gaps = []
+    for channel in _find_channels(name, records):
+        if channel.hold == "auto" and not channel.sampling.is_regular:
+            jumps = np.flatnonzero(np.diff(channel.values))
+            gaps += np.diff(channel.times)[jumps].tolist()
+    if not gaps:
+        return []
+    return [
+        f"input {name!r} is sampled irregularly, and each of its jumps lies between two samples. "
+        f"So a time lag is uncertain by up to one period, {np.median(gaps):.3g} s"
+    ]
+
+
+def _find_channels(name: str, records: Sequence[Record]) -> list[Channel]:
+    return [channel for record in records for channel in record.inputs if channel.name == name]
+
+
+def _replace_hold(record: Record, hold: InputHold) -> Record:
+    assert hold.other is not None
+    return replace(
+        record,
+        inputs=tuple(
+            replace(channel, hold=hold.other)
+            if channel.name == hold.input
+            and channel.hold == "auto"
+            and channel.effective_hold == hold.chosen
+            else channel
+            for channel in record.inputs
+        ),
+    )

@@ -1,0 +1,390 @@
+"""Fit a process with one order more and one less, and compare the orders.
+
+A dead time absorbs a missing time constant: L comes out too long, with a small standard error, and
+residuals that pass their tests. Only the fit of another order shows it. So a model that is a
+process with dead time, however it is written (`sysid.control.process_form`), is compared with its
+neighbours in the catalogue (`sysid.models.catalogue.processes`).
+
+All orders are fitted to the same samples under the same assumptions, also the model's own: the
+entry of the catalogue, with free initial states and one integration step. Least squares starts from
+the estimate. A dead time that grows by the time constant that is left out keeps the sum of all.
+
+The criterion is Schwarz's (BIC, 1978). If the residuals of the highest order are not white, or the
+estimate has a noise model, each order has first-order noise of its own, with the correlation time
+of its largest likelihood. An order is preferred if its BIC is 6 lower than that of every other:
+odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are not
+ruled out, and the dead time lies in the range of theirs.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.control.process_form import recognise_process
+from sysid.core.errors import SysidError
+from sysid.core.settings import FitSettings, Loss
+from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.models.catalogue.load import load_model
+from sysid.models.catalogue.processes import Process, ProcessEntry, list_neighbouring_orders
+from sysid.models.model import name_initial_state, replace_substeps
+from sysid.noise_models.generalised_least_squares import WhitenedLeastSquares
+from sysid.residuals.series import is_coloured, iterate_parts, make_whitening
+from sysid.residuals.whitening import Whitening
+from sysid.results.result import OrderComparison, OrderFit
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import from_unit, to_unit
+from sysid.uncertainty.analysis import Analysis, analyse_estimate, compute_criteria
+from sysid.uncertainty.estimates import Estimate
+
+_SUBSTEPS = 4  # of every order: a fast part needs them, and one step for all compares them fairly
+_NEGLIGIBLE_SHARE = 1e-3  # of the output: smaller residuals are of the integration, not of noise
+_NEW_PARTS = (0.1, 0.4, 1.0)  # of the slowest time constant: starts of the part that is added
+_MOVE = 1e-3  # of a parameter, relative: what it changes in the process
+_MAX_SIMULATIONS = 4000  # of an order: half for the fit, the rest for noise model and errors
+_ROUNDS = 2  # of least squares and correlation time, in turn
+_SHORTEST_TIME, _LONGEST_TIME = 0.1, 0.5  # correlation time, of a sampling period and the record
+_NOTABLE_MOVE = 1.0  # of a standard error of the dead time
+
+
+class _Assumptions(NamedTuple):
+    """What every order takes over from the model.
+
+    Attributes
+    ----------
+    process : Process
+        At the estimate.
+    delay : Estimate
+        Of the dead time.
+    fixed : frozenset of {"gain", "offset"}
+        What no free parameter of the model changes.
+    """
+
+    process: Process
+    delay: Estimate
+    fixed: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FittedOrder:
+    entry: ProcessEntry
+    problem: Problem
+    theta: FloatArray
+    evaluations: int
+
+
+def compare_orders(
+    problem: Problem,
+    theta: FloatArray,
+    estimates: Sequence[Estimate],
+    max_simulations: int | None = None,
+    is_late: Callable[[], bool] = lambda: False,
+) -> tuple[OrderComparison | None, int]:
+    """Compare a model with those of one order more and one less; return the simulations too.
+
+    None if the model is no process with one unknown dead time, or is not fitted by least squares
+    of a free run. Also if a gain, an offset or a start is at its bound, if it fits nearly without
+    residuals, or if the budget does not suffice.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : FloatArray, shape (D,)
+        The estimate.
+    estimates : sequence of Estimate
+        Of the model's parameters.
+    """
+    assumptions = _read_assumptions(problem, theta, estimates)
+    if assumptions is None or is_late():
+        return None, 0
+    entries = list_neighbouring_orders(assumptions.process)
+    if max_simulations is not None and max_simulations < _MAX_SIMULATIONS * len(entries):
+        return None, 0
+    fits, spent = list[_FittedOrder](), 0
+    for entry in entries:
+        fitted = _fit_order(problem, entry, assumptions, is_late)
+        if fitted is None:
+            return None, spent
+        spent += fitted.evaluations
+        fits.append(fitted)
+    if len(fits) < 2:
+        return None, spent
+    has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
+    compared = []
+    for fitted in fits:
+        order, simulations = _assess_order(fitted, has_colour=has_colour)
+        compared.append(order)
+        spent += simulations
+    own = next(
+        fitted.entry.model
+        for fitted in fits
+        if fitted.entry.parts == len(assumptions.process.time_constants)
+    )
+    return OrderComparison(
+        own,
+        assumptions.delay.name,
+        assumptions.delay.unit,
+        "ar1" if has_colour else "white",
+        tuple(compared),
+    ), spent
+
+
+def mark_order_dependent(
+    analysis: Analysis, comparison: OrderComparison | None
+) -> tuple[Estimate, ...]:
+    """Mark an identified dead time whose interval does not hold that of the preferred order.
+
+    Its standard error assumes the model's order, and the data contradict that. If errors are by
+    repeat, nothing is marked: the criterion takes samples as independent, and says too much.
+    """
+    estimates, uncertainty = analysis.estimates, analysis.uncertainty
+    is_clustered = uncertainty is not None and uncertainty.noise_colour == "clustered"
+    if comparison is None or is_clustered:
+        return estimates
+    if comparison.preferred_model in (None, comparison.model):
+        return estimates
+    [best] = comparison.open_fits
+    reason = f"it is {_write_delay(comparison, best)}, which the data prefer"
+    return tuple(
+        replace(estimate, status="order-dependent", reason=reason)
+        if estimate.name == comparison.delay
+        and estimate.status == "identified"
+        and estimate.interval95 is not None
+        and not estimate.interval95[0] <= best.delay <= estimate.interval95[1]
+        else estimate
+        for estimate in estimates
+    )
+
+
+def warn_other_order(comparison: OrderComparison | None, model: str) -> list[str]:
+    """Warn if the data prefer another order, or if the dead time depends on an open one.
+
+    `model` is the name of the model that was identified.
+    """
+    if comparison is None or comparison.preferred_model == comparison.model:
+        return []
+    own, name = comparison.own_fit, comparison.delay
+    if comparison.preferred_model is None:
+        others = [fit for fit in comparison.open_fits if _has_other_delay(fit, own)]
+        if not others:
+            return []
+        listed = ", ".join(_write_delay(comparison, fit) for fit in others)
+        return [
+            f"{name} depends on the order of the model, which the data do not tell: "
+            f"{_write_delay(comparison, own)}, {listed}. Its standard error "
+            "assumes that the order is right"
+        ]
+    [best] = comparison.open_fits
+    cure = "Give your model as many time constants, or use" if model != own.model else "Use"
+    return [
+        f"the data prefer {best.model} (order {best.order}) to {own.model} (order {own.order}): "
+        f"its BIC is {own.bic - best.bic:.3g} lower. {name} is "
+        f"{_write_delay(comparison, best)}, {_write_delay(comparison, own)}. "
+        f"{cure} the model {best.model}"
+    ]
+
+
+def _has_other_delay(fit: OrderFit, own: OrderFit) -> bool:
+    return abs(fit.delay - own.delay) > _NOTABLE_MOVE * (own.delay_stderr or 0.0)
+
+
+def _write_delay(comparison: OrderComparison, fit: OrderFit) -> str:
+    delay = f"{plain_estimate(fit.delay, fit.delay_stderr)}{plain_unit(comparison.unit)}"
+    return f"{delay} with {fit.model}"
+
+
+def _read_assumptions(
+    problem: Problem, theta: FloatArray, estimates: Sequence[Estimate]
+) -> _Assumptions | None:
+    if problem.prediction != "simulation" or problem.loss.kind != "squares":
+        return None
+    delays = find_delay_parameters(problem)
+    process = _recognise(problem, theta)
+    if process is None or len(delays) != 1 or not list_neighbouring_orders(process):
+        return None
+    [delay] = [estimate for estimate in estimates if estimate.name in delays]
+    # A delay may be an expression, such as V/q. Without an error nothing is known of it.
+    if delay.value != process.delay or delay.stderr is None:
+        return None
+    changed, bounded = set[str](), {one.name for one in estimates if one.status == "at bound"}
+    for d, name in enumerate(problem.free_names):
+        moved = theta.copy()
+        moved[d] = moved[d] * (1.0 + _MOVE) if moved[d] else _MOVE
+        other = _recognise(problem, moved)
+        if other is None:
+            continue
+        if name in bounded and not _changes_dynamics(process, other):
+            return None  # a wrong offset, gain or start looks like missing dynamics
+        changed |= {
+            part for part in ("gain", "offset") if getattr(other, part) != getattr(process, part)
+        }
+    return _Assumptions(process, delay, frozenset({"gain", "offset"} - changed))
+
+
+def _changes_dynamics(process: Process, other: Process) -> bool:
+    return (process.delay, process.time_constants) != (other.delay, other.time_constants)
+
+
+def _recognise(problem: Problem, theta: FloatArray) -> Process | None:
+    values = problem.evaluator.template.copy()
+    values[problem.evaluator.free_rows] = theta
+    named = tuple(
+        IdentifiedValue(parameter.name, value)
+        for parameter, value in zip(problem.all_parameters, values.tolist(), strict=True)
+    )
+    return recognise_process(IdentifiedModel(problem.model, named))
+
+
+def _fit_order(
+    problem: Problem,
+    entry: ProcessEntry,
+    assumptions: _Assumptions,
+    is_late: Callable[[], bool],
+) -> _FittedOrder | None:
+    """Fit an entry of the catalogue by least squares; None if that is not possible."""
+    try:
+        other = _build_problem(problem, entry, assumptions)
+    except SysidError:
+        return None
+    starts = [
+        _to_theta(other, entry, process)
+        for process in _list_starts(assumptions.process, entry, problem)
+    ]
+    found = refine_candidates(other, starts, _MAX_SIMULATIONS // 2, is_late)
+    ends = [end for end in found if end is not None]
+    if not ends or any(end.is_cut_short for end in ends):
+        return None
+    best = min(ends, key=lambda end: end.rms)
+    if best.rms <= _NEGLIGIBLE_SHARE * problem.output_scale:
+        return None
+    return _FittedOrder(entry, other, best.theta, sum(end.evaluations for end in ends))
+
+
+def _build_problem(problem: Problem, entry: ProcessEntry, assumptions: _Assumptions) -> Problem:
+    """Build the problem of an entry on the same samples."""
+    model = load_model(entry.model)
+    model = replace_substeps(model, max(_SUBSTEPS, problem.model.solver.substeps))
+    records = [
+        Record(
+            [replace(channel, name=model.inputs[0].name) for channel in record.inputs],
+            [replace(channel, name=model.outputs[0].name) for channel in record.outputs],
+        )
+        for record in problem.records
+    ]
+    delay, process = assumptions.delay, assumptions.process
+    changes: dict[str, dict[str, float]] = {"L": {"lower": delay.lower, "upper": delay.upper}}
+    for what, name in (("gain", "K"), ("offset", "y0")):
+        value = getattr(process, what)
+        if what in assumptions.fixed and any(p.name == name for p in model.parameters):
+            changes[name] = {"fixed": value, "lower": value - 1.0, "upper": value + 1.0}
+    settings = FitSettings(
+        changes,
+        loss=Loss(noise_model="white"),
+        weights={model.outputs[0].name: next(iter(problem.output_weights.values()))},
+        skip=problem.settings.skip,
+        scored_from=problem.settings.scored_from,
+        deviations=problem.settings.deviations,
+    )
+    return Problem.from_settings(model, records, settings)
+
+
+def _list_starts(process: Process, entry: ProcessEntry, problem: Problem) -> list[Process]:
+    """List processes with as many parts as an entry, near one with a part more or less."""
+    times, delay = process.time_constants, process.delay
+    if entry.parts == len(times):
+        return [process]
+    if entry.parts < len(times):
+        slower = (sum(times), *times[1:-1]) if len(times) > 1 else ()
+        return [
+            process._replace(time_constants=times[:-1], delay=delay + times[-1]),
+            process._replace(time_constants=slower),
+        ]
+    duration = max(record.stop - record.start for record in problem.records)
+    slowest = times[0] if times else delay or 0.1 * duration
+    return [
+        process._replace(
+            time_constants=tuple(sorted((*times, share * slowest), reverse=True)),
+            delay=max(delay - share * slowest, 0.0),
+        )
+        for share in _NEW_PARTS
+    ]
+
+
+def _to_theta(problem: Problem, entry: ProcessEntry, process: Process) -> FloatArray:
+    """Convert a process to the free parameters of an entry; all states start at the output."""
+    values = dict(entry.to_parameters(process))
+    for number, record in enumerate(problem.records):
+        measured = record.outputs[0].values
+        first = float(measured[np.isfinite(measured)][0]) - process.offset
+        for state in problem.model.states:
+            values[name_initial_state(state.name, number)] = first
+    theta = np.array([values[name] for name in problem.free_names])
+    return np.asarray(np.clip(theta, problem.evaluator.lower, problem.evaluator.upper))
+
+
+def _has_coloured_residuals(fitted: _FittedOrder) -> bool:
+    residuals = fitted.problem.compute_residuals(fitted.theta[None])[0]
+    return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(fitted.problem))
+
+
+def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, int]:
+    """Compute the BIC of a fitted order, and its dead time with its standard error."""
+    problem, theta, spent, whitening = fitted.problem, fitted.theta, fitted.evaluations, None
+    if has_colour:
+        theta, whitening, simulations = _fit_coloured_noise(fitted)
+        spent += simulations
+    residuals = problem.compute_residuals(theta[None])[0]
+    analysis = analyse_estimate(problem, theta, whitening=whitening)
+    criteria = compute_criteria(
+        problem, residuals if whitening is None else whitening.whiten(residuals), whitening
+    )
+    delay = next(estimate for estimate in analysis.estimates if estimate.name == "L")
+    order = OrderFit(
+        fitted.entry.model,
+        fitted.entry.order,
+        delay.value,
+        delay.stderr,
+        {estimate.name: estimate.value for estimate in analysis.estimates},
+        float(np.sqrt(np.mean(np.square(residuals)))),
+        criteria.bic,
+    )
+    return order, spent + analysis.evaluations + 1
+
+
+def _fit_coloured_noise(fitted: _FittedOrder) -> tuple[FloatArray, Whitening, int]:
+    """Estimate under first-order noise whose correlation time has the largest likelihood."""
+    problem, theta, search = fitted.problem, fitted.theta, WhitenedLeastSquares(fitted.problem)
+    whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
+    for _ in range(_ROUNDS):
+        place = search.find_lowest_minimum([to_unit(problem.evaluator, theta[None])[0]], whitening)
+        theta = from_unit(problem.evaluator, place[None])[0]
+        whitening = _fit_correlation_time(problem, problem.compute_residuals(theta[None])[0])
+    return theta, whitening, search.evaluations + _ROUNDS
+
+
+def _fit_correlation_time(problem: Problem, residuals: FloatArray) -> Whitening:
+    """Find the whitening of largest likelihood for residuals (n,)."""
+    from scipy.optimize import minimize_scalar  # imported late: slow to load, rarely needed
+
+    [output] = problem.model.outputs
+    # Pooled repeats have several samples at a time.
+    distinct = [np.unique(part.times) for part in iterate_parts(problem)]
+    spans = [times for times in distinct if times.size > 1]
+    if not spans:
+        return make_whitening(problem, {})
+    shortest = min(float(np.median(np.diff(times))) for times in spans)
+    longest = max(float(np.ptp(times)) for times in spans)
+
+    def compute_bic(logarithm: float) -> float:
+        whitening = make_whitening(problem, {output.name: float(np.exp(logarithm))})
+        return compute_criteria(problem, whitening.whiten(residuals), whitening).bic
+
+    bounds = (np.log(_SHORTEST_TIME * shortest), np.log(_LONGEST_TIME * longest))
+    best = minimize_scalar(compute_bic, bounds=bounds, method="bounded", options={"xatol": 0.01})
+    return make_whitening(problem, {output.name: float(np.exp(best.x))})

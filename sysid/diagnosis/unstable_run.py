@@ -1,0 +1,179 @@
+"""Predict one step ahead where a free run in a closed loop is misled by disturbances.
+
+In an unstable plant each disturbance grows, and a free run attributes all of it to the parameters:
+its estimates are far off, or those of a stable plant. Such a plant is recorded in a closed loop
+only. Predictions one step ahead start again at each measured output, so they forget disturbances
+(Ljung, System Identification, 2nd ed., ch. 3.2 and 13). That needs outputs that are states, and
+measurements whose noise is small beside the disturbances.
+
+So if residuals are not white, and an input follows them or the free run is unstable, the model is
+fitted one step ahead as well. These estimates are told if the free run is unstable there too, or if
+their residuals are white. A free run counts as unstable if the effect of some start is ten times as
+large in the last quarter of an experiment as in its first half. A double integrator reaches three.
+
+A value is `prediction-dependent` if its 95 % interval does not hold that of one step ahead. Such an
+interval is often far too narrow: disturbances grow, and so do the sensitivities.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.core.text import plain_estimate, plain_unit
+from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
+from sysid.diagnosis.fixed_start import compute_start_slopes, list_fixed_starts
+from sysid.diagnosis.input_hold import replace_holds, write_hold
+from sysid.diagnosis.warnings import find_delay_parameters
+from sysid.minima.minima import scan_parameters
+from sysid.residuals.past_outputs import reads_outputs
+from sysid.residuals.series import is_coloured, iterate_parts
+from sysid.results.result import InputHold
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
+from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.sensitivities import compute_sensitivities
+
+_MIN_GROWTH = 10.0
+_MOST_SIMULATIONS = 3000
+
+
+class OneStepComparison(NamedTuple):
+    """Estimates of one step ahead where disturbances mislead a free run, and what shows that.
+
+    `options` are those that give these estimates.
+    """
+
+    cause: str
+    estimates: tuple[Estimate, ...]
+    options: tuple[str, ...]
+
+
+def compare_one_step(
+    problem: Problem,
+    theta: FloatArray,
+    analysis: Analysis,
+    max_simulations: int | None,
+    is_late: Callable[[], bool],
+    *,
+    has_feedback: bool,
+    doubtful: Sequence[InputHold] = (),
+) -> tuple[OneStepComparison | None, int]:
+    """Estimate one step ahead if disturbances mislead a free run (D,); None if they do not.
+
+    `doubtful` inputs are read the other way, as they are likelier to be. Returns the simulations
+    too.
+    """
+    if not _may_mislead(problem, analysis) or is_late():
+        return None, 0
+    most = _MOST_SIMULATIONS if max_simulations is None else max_simulations
+    if most < _MOST_SIMULATIONS or not (
+        has_feedback or compute_growth(problem, theta) >= _MIN_GROWTH
+    ):
+        return None, 0
+    loss = replace(problem.loss, noise_model="white")
+    read = replace_holds(problem, doubtful) if doubtful else problem
+    ahead = read.rebuild(
+        prediction="one-step", loss=loss, weights=problem.output_weights, deviations=None
+    )
+    (end,) = refine_candidates(ahead, [theta], most, is_late)
+    if end is None:
+        return None, 0
+    names = find_delay_parameters(ahead)
+    delays = [d for d, name in enumerate(ahead.free_names) if name in names]
+    scan = scan_parameters(ahead, end, delays, most - end.evaluations, is_late)
+    best = scan.best
+    growth = compute_growth(problem, best.theta)
+    predicted = analyse_estimate(ahead, best.theta)
+    spent = end.evaluations + scan.evaluations + predicted.evaluations
+    if growth >= _MIN_GROWTH:
+        cause = f"the free run is unstable: an error of its start grows {growth:.2g} times"
+    elif _are_white(ahead, predicted):
+        cause = "one step ahead the residuals are white: the noise acts inside the plant"
+    else:
+        return None, spent
+    options = "prediction: one-step", *map(write_hold, doubtful)
+    return OneStepComparison(cause, predicted.estimates, options), spent
+
+
+def mark_prediction_dependent(
+    estimates: tuple[Estimate, ...], comparison: OneStepComparison | None
+) -> tuple[Estimate, ...]:
+    """Mark identified values that the estimates of one step ahead contradict."""
+    ahead = {one.name: one for one in comparison.estimates} if comparison else {}
+    return tuple(
+        replace(
+            estimate,
+            status="prediction-dependent",
+            reason=f"it is {_write_value(ahead[estimate.name])} predicted one step ahead",
+        )
+        if estimate.name in ahead
+        and estimate.status in ("identified", "hold-dependent")
+        and estimate.interval95 is not None
+        and not estimate.interval95[0] <= ahead[estimate.name].value <= estimate.interval95[1]
+        else estimate
+        for estimate in estimates
+    )
+
+
+def _write_value(estimate: Estimate) -> str:
+    return f"{plain_estimate(estimate.value, estimate.stderr)}{plain_unit(estimate.unit)}"
+
+
+def warn_misled_run(
+    estimates: Sequence[Estimate], comparison: OneStepComparison | None
+) -> list[str]:
+    """Warn about a free run that disturbances mislead, with estimates of one step ahead."""
+    if comparison is None:
+        return []
+    told = _describe(comparison.estimates, {one.name: one for one in estimates})
+    return [
+        f"{comparison.cause}. So a free run attributes disturbances to the parameters. Predicted "
+        f"one step ahead they are {told}. Use {' and '.join(comparison.options)}."
+    ]
+
+
+def _may_mislead(problem: Problem, analysis: Analysis) -> bool:
+    """Whether residuals of a free run by squares are not white, and there are other predictions."""
+    is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    uncertainty = analysis.uncertainty
+    is_white = uncertainty is None or uncertainty.noise_colour == "white"
+    return is_free and not is_white and reads_outputs(problem.model)
+
+
+def compute_growth(problem: Problem, theta: FloatArray) -> float:
+    """Compute by what factor the effect of a start grows at most over an experiment, at (D,)."""
+    sensitivities = compute_sensitivities(problem, theta)
+    noise = float(np.sqrt(np.mean(np.square(sensitivities.residuals))))
+    declared = {parameter.name for parameter in problem.model.parameters}
+    starts = [name not in declared for name in problem.free_names]
+    assumed = list_fixed_starts(problem)
+    slopes = [compute_start_slopes(problem, theta, one, noise) for one in assumed]
+    effects, growth = np.hstack([sensitivities.columns[:, starts], *slopes]), 1.0
+    for part in iterate_parts(problem):
+        power = np.square(effects[part.rows])
+        middle, late = power.shape[0] // 2, 3 * power.shape[0] // 4
+        before, after = np.sum(power[:middle], axis=0), np.sum(power[late:], axis=0)
+        moved = before > 0
+        ratios = np.sqrt(2.0 * after[moved] / before[moved])
+        growth = max([growth, *ratios.tolist()])
+    return growth
+
+
+def _are_white(problem: Problem, analysis: Analysis) -> bool:
+    if analysis.residuals_and_sensitivities is None:
+        return False
+    error = analysis.residuals_and_sensitivities[0]
+    return not any(is_coloured(part, error[part.rows]) for part in iterate_parts(problem))
+
+
+def _describe(ahead: Sequence[Estimate], free: Mapping[str, Estimate]) -> str:
+    return ", ".join(
+        f"{one.name} = {one.value:.4g} ± {one.stderr:.2g}{format_unit(one.unit)} "
+        f"instead of {free[one.name].value:.4g}"
+        for one in ahead
+        if one.is_free and one.stderr is not None and "(" not in one.name
+    )

@@ -1,0 +1,1 @@
+"""Minima of the loss: scans, minima near the estimate, and whether the search settled."""

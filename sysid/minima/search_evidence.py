@@ -1,0 +1,89 @@
+"""Whether a search settled: whether something shows that no better minimum was missed.
+
+Either at least two searches from random points ended in the best minimum, or nothing but noise is
+left in the residuals, or they are negligible. A false minimum leaves a part of the response in
+them. Searches that start near the best individual show nothing: they return to a false minimum as
+well.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+from sysid.islands.state import RunState
+from sysid.islands.stopping import count_restarts
+from sysid.minima.minima import FoundMinima
+from sysid.residuals.residual_tests import ResidualTests
+from sysid.results.result import SearchEvidence
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
+
+_ENOUGH_STARTS = 2  # that agree
+_UNLIKELY = 1e-3  # probability of such residuals if they are noise
+_NEGLIGIBLE_SHARE = 1e-3  # of the output: a false minimum leaves more
+
+
+def assess_search(
+    problem: Problem,
+    state: RunState,
+    rms: float,
+    tests: ResidualTests | None,
+    found: FoundMinima,
+) -> SearchEvidence:
+    """Assess the evidence that the estimate, with its RMS and residual tests, is the best."""
+    restarts = count_restarts(*state.champions_and_counters)
+    because: Literal["starts", "residuals"] | None = None
+    if found.agreeing >= _ENOUGH_STARTS:
+        because = "starts"
+    elif is_explained(problem, rms, tests):
+        because = "residuals"
+    return SearchEvidence(
+        because is not None,
+        because,
+        restarts.independent + found.projected,
+        found.agreeing,
+        problem.free_names,
+        found.minima,
+    )
+
+
+def is_explained(problem: Problem, rms: float, tests: ResidualTests | None) -> bool:
+    """Whether the residuals are negligible, or no test of them finds anything but noise.
+
+    False if they are not negligible and no test was possible.
+    """
+    if rms <= _NEGLIGIBLE_SHARE * problem.output_scale:
+        return True
+    known = [] if tests is None else [test.p for test in tests.tests if test.p is not None]
+    return bool(known) and min(known) > _UNLIKELY
+
+
+def mark_unsettled(
+    estimates: tuple[Estimate, ...], evidence: SearchEvidence
+) -> tuple[Estimate, ...]:
+    """Mark the identified estimates of a search that did not settle."""
+    if evidence.settled:
+        return estimates
+    reason = "nothing shows that the search found the best minimum"
+    return tuple(
+        replace(estimate, status="not settled", reason=reason)
+        if estimate.status == "identified"
+        else estimate
+        for estimate in estimates
+    )
+
+
+def warn_unsettled(evidence: SearchEvidence) -> list[str]:
+    """Warn about a search that did not settle."""
+    if evidence.settled:
+        return []
+    agreed = (
+        "it made no independent starts"
+        if evidence.independent_starts == 0
+        else f"{evidence.agreeing_starts} of {evidence.independent_starts} independent starts "
+        "ended in the best minimum"
+    )
+    return [
+        f"the search did not settle: {agreed}, and the residuals are not noise. A better minimum "
+        "may have been missed, or the model is wrong. Repeat it with other seeds, more "
+        "generations or narrower bounds, and compare the RMS."
+    ]

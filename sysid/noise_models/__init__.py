@@ -1,0 +1,1 @@
+"""Noise models: generalised least squares (AR(1)), and the choice that ``auto`` makes."""

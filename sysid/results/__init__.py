@@ -1,0 +1,1 @@
+"""Result of an identification: estimates, verdict, bands, figures; shown, saved and loaded."""

@@ -1,0 +1,193 @@
+"""Show a result in a few lines, as HTML for a notebook, or as a table of pandas."""
+
+from collections.abc import Iterator, Sequence
+from html import escape
+from math import isfinite
+from typing import Any
+
+from sysid.core.lazy_names import load_library
+from sysid.core.text import (
+    DASH,
+    find_rms_unit,
+    format_interval,
+    join_estimate,
+    plain_estimate,
+    plain_unit,
+)
+from sysid.residuals.residual_tests import ResidualTests
+from sysid.results.result import Identification, OrderComparison, SearchEvidence
+from sysid.uncertainty.estimates import Estimate
+
+_MAX_WARNINGS = 3
+_BECAUSE = {
+    "starts": "the search settled",
+    "residuals": "the search settled, as nothing but noise is left",
+    None: "the search has not settled",
+}
+
+
+def summarise_result(found: Identification) -> str:
+    """Summarise a result in a few lines: estimates, fit, verdicts, the first warnings."""
+    lines = [", ".join(_list_facts(found)), f"verdict: {found.verdict.text}"]
+    rows = [
+        (
+            estimate.name,
+            plain_estimate(estimate.value, estimate.stderr, status=estimate.status),
+            "" if estimate.unit == "1" else estimate.unit,
+            estimate.status,
+        )
+        for estimate in found.estimates
+    ]
+    lines += [f"  {'  '.join(cells).rstrip()}" for cells in _align_columns(rows)]
+    lines += _list_verdicts(found)
+    shown = found.warnings[:_MAX_WARNINGS]
+    lines += [f"note: {warning}" for warning in shown]
+    left = len(found.warnings) - len(shown)
+    if left > 0:
+        lines.append(f"and {left} more in `warnings`")
+    return "\n".join(lines)
+
+
+def to_html(found: Identification) -> str:
+    """Write a result as HTML: estimates, fit, verdicts, all warnings."""
+    head = "".join(
+        f"<th style='text-align:left'>{name}</th>"
+        for name in ("Parameter", "Estimate", "Unit", "95 % interval", "Status")
+    )
+    rows = "".join(f"<tr>{_write_cells(estimate)}</tr>" for estimate in found.estimates)
+    facts = "<br>".join(
+        escape(text)
+        for text in [
+            ", ".join(_list_facts(found)),
+            f"verdict: {found.verdict.text}",
+            *_list_verdicts(found),
+        ]
+    )
+    warnings = "".join(f"<li>{escape(warning)}</li>" for warning in found.warnings)
+    notes = f"<details open><summary>Warnings</summary><ul>{warnings}</ul></details>"
+    return (
+        f"<div><p>{facts}</p><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        f"{notes if warnings else ''}</div>"
+    )
+
+
+def to_frame(found: Identification) -> Any:
+    """Return the estimates as a table of pandas, indexed by the names of the parameters.
+
+    Raises
+    ------
+    MissingLibrary
+        If pandas is not installed.
+    """
+    pandas = load_library("pandas", "to_pandas()")
+    unknown = float("nan")
+    rows = [
+        {
+            "value": estimate.value,
+            "stderr": unknown if estimate.stderr is None else estimate.stderr,
+            "low95": unknown if estimate.interval95 is None else estimate.interval95[0],
+            "high95": unknown if estimate.interval95 is None else estimate.interval95[1],
+            "unit": estimate.unit,
+            "status": estimate.status,
+            "lower": estimate.lower,
+            "upper": estimate.upper,
+            "reason": estimate.reason,
+        }
+        for estimate in found.estimates
+    ]
+    names = [estimate.name for estimate in found.estimates]
+    return pandas.DataFrame(rows, index=pandas.Index(names, name="parameter"))
+
+
+def find_output_unit(found: Identification) -> str:
+    """Find the unit of the RMS of a result: that of its output, or σ for several together."""
+    return find_rms_unit(
+        {metrics.output: metrics.unit for metrics in found.agreement},
+        lambda _: "1" if found.data is None else found.data.records[0].outputs[0].unit,
+    )
+
+
+def describe_residuals(tests: ResidualTests) -> str:
+    """Say whether the residuals pass their tests; failed tests have their p-value.
+
+    Warnings cover only p < 0.001, so most failed tests are reported only here.
+    """
+    failed = [
+        f"{test.output} {'is not white' if test.input is None else f'depends on {test.input}'}"
+        + ("" if test.p is None else f" (p = {test.p:.2g})" if test.p >= 1e-3 else " (p < 0.001)")
+        for test in tests.tests
+        if test.outcome == "failed"
+    ]
+    verdict = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
+    return f"residuals on {tests.data} data: {verdict}"
+
+
+def describe_search(evidence: SearchEvidence) -> str:
+    """Say whether the search settled, and how many independent starts agree."""
+    verdict = _BECAUSE[evidence.because if evidence.settled else None]
+    return (
+        f"{verdict}: {evidence.agreeing_starts} of {evidence.independent_starts} independent "
+        "starts ended here"
+    )
+
+
+def describe_order(comparison: OrderComparison) -> str:
+    """Say which order the data prefer, and the dead time with those that matter.
+
+    These are the model's own and all that are not ruled out.
+    """
+    unit, open_fits = plain_unit(comparison.unit), comparison.open_fits
+    listed = [fit for fit in comparison.fits if fit.model == comparison.model or fit in open_fits]
+    delays = ", ".join(
+        f"{plain_estimate(fit.delay, fit.delay_stderr)}{unit} with {fit.model}" for fit in listed
+    )
+    preferred = comparison.preferred_model
+    fits = open_fits if preferred is None else comparison.fits
+    others = " and ".join(fit.model for fit in fits if fit.model != preferred)
+    verdict = "do not tell {} apart" if preferred is None else f"prefer {preferred} to {{}}"
+    return f"order: the data {verdict.format(others)}; {comparison.delay} is {delays}"
+
+
+def _list_facts(found: Identification) -> Iterator[str]:
+    if found.data is not None:
+        yield f"Identification of {found.data.model.name!r}"
+    else:
+        yield "Identification"
+    unit = plain_unit(find_output_unit(found))
+    yield f"fit {_format_fit(found.fit_percent)}"
+    yield f"RMS {found.rms:.4g}{unit}"
+    if found.rms_validation is not None and found.fit_percent_validation is not None:
+        yield f"validation fit {_format_fit(found.fit_percent_validation)}"
+        yield f"validation RMS {found.rms_validation:.4g}{unit}"
+
+
+def _format_fit(fit: float) -> str:
+    return f"{fit:.2f} %" if isfinite(fit) else "undefined"
+
+
+def _list_verdicts(found: Identification) -> list[str]:
+    verdicts = [] if found.valid else ["the model is invalid: its RMS is above the safe limit"]
+    if found.residual_tests is not None and found.residual_tests.passed is not None:
+        verdicts.append(describe_residuals(found.residual_tests))
+    if found.order_comparison is not None:
+        verdicts.append(describe_order(found.order_comparison))
+    return [*verdicts, describe_search(found.search)]
+
+
+def _align_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[list[str]]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+
+
+def _write_cells(estimate: Estimate) -> str:
+    interval = format_interval(estimate.interval95, estimate.stderr, status=estimate.status) or DASH
+    why = f" <small>{escape(estimate.reason)}</small>" if estimate.reason else ""
+    cells = (
+        f"<b>{escape(estimate.name)}</b>",
+        escape(join_estimate(estimate.value, estimate.stderr, status=estimate.status)),
+        "" if estimate.unit == "1" else escape(estimate.unit),
+        escape(interval),
+        f"{escape(estimate.status)}{why}",
+    )
+    return "".join(f"<td style='text-align:left'>{cell}</td>" for cell in cells)

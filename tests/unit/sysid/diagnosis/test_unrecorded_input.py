@@ -1,0 +1,121 @@
+"""Whether estimates hang on input from before the record that nobody recorded."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.derivations import derive_recording
+from sysid.data.records import Channel, Recording
+from sysid.diagnosis.unrecorded_input import find_assumed_samples, warn_unrecorded_input
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+from sysid.models.model import FixedInitial, Model
+from sysid.search.refine import refine_candidates
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
+
+H, CUT = 0.1, 120
+TRUE = {"K": 2.0, "T": 0.6, "L": 0.73, "y0": 0.5}
+FOPDT = load_model("fopdt")
+BOUNDS: dict[str, dict[str, Any]] = {"L": {"upper": 1.5}, "T": {"upper": 5}}
+
+
+def recorded(seed: int, *, was_at_rest: bool, samples: int = 300) -> Recording:
+    """A random binary test of a first-order lag with dead time; the cut is at sample 120."""
+    rng = np.random.default_rng(seed)
+    count = CUT + samples
+    times = H * np.arange(count)
+    command = np.repeat(rng.choice([-1.0, 1.0], count // 5 + 1), 5)[:count]
+    if was_at_rest:
+        command[CUT - 12 : CUT] = command[CUT]
+    else:  # it jumps four samples before the cut
+        command[CUT - 12 : CUT - 4], command[CUT - 4 : CUT + 1] = -command[CUT], command[CUT]
+        command[CUT - 4 : CUT - 2] = -command[CUT]
+    channel = Channel("u", times, command, "1", "zero")
+    [y] = simulate(FOPDT, [channel], {**TRUE, "x(0)": 0.0}, times=times).channels
+    noisy = replace(y, values=y.values + 0.05 * rng.normal(size=count))
+    return Recording((channel, noisy))
+
+
+def posed(recording: Recording, *, history: bool, model: Model = FOPDT, skip: int = 0) -> Problem:
+    part = derive_recording(recording, [{"trim": {"rows": [CUT, CUT + 300], "history": history}}])
+    record = part.to_record({"u": "u"}, {"y": "y"})
+    return Problem.build(model, [record], parameters=BOUNDS, skip=skip)
+
+
+def analysed(problem: Problem) -> Analysis:
+    start = np.array([TRUE.get(one.name, 0.0) for one in problem.free_parameters])
+    [found] = refine_candidates(problem, [start])
+    assert found is not None
+    return analyse_estimate(problem, found.theta)
+
+
+def notes(problem: Problem) -> list[str]:
+    return warn_unrecorded_input(problem, analysed(problem), is_contradicted=False)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_record_that_begins_in_the_middle_of_a_test_is_told_of(seed: int) -> None:
+    recording = recorded(seed, was_at_rest=False)
+    problem = posed(recording, history=False)
+    [note] = notes(problem)
+    assert note.startswith("8 samples read an input from before the record")
+    assert "of its standard errors away" in note
+    assert note.endswith("or skip: 8")
+    assert notes(posed(recording, history=True)) == []
+    assert notes(posed(recording, history=False, skip=8)) == []
+
+
+def test_what_is_told_is_what_estimation_without_these_samples_gives() -> None:
+    recording = recorded(1, was_at_rest=False)
+    [note] = notes(posed(recording, history=False))
+    without = {e.name: e.value for e in analysed(posed(recording, history=False, skip=8)).estimates}
+    whole = {e.name: e.value for e in analysed(posed(recording, history=False)).estimates}
+    told = [name for name in ("K", "T", "L") if f"{name} is " in note]
+    assert told
+    for name in told:
+        assert f"{name} is {without[name]:.4g} instead of {whole[name]:.4g}, " in note
+    assert abs(without["T"] - TRUE["T"]) < abs(whole["T"] - TRUE["T"])
+
+
+def test_of_a_record_that_begins_at_rest_nothing_is_told() -> None:
+    """The guess is right, so the first samples fit the others: 20 draws, none warned of."""
+    for seed in range(20):
+        assert notes(posed(recorded(seed, was_at_rest=True), history=False)) == []
+
+
+def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None:
+    recording = recorded(0, was_at_rest=True)
+    problem = posed(recording, history=False)
+    [part] = find_assumed_samples(problem, analysed(problem))
+    assert np.flatnonzero(part).tolist() == list(range(8))  # 0.7 s lies before L = 0.73 s
+    short = derive_recording(
+        recording, [{"trim": {"rows": [CUT - 4, CUT + 300], "history": False}}]
+    )
+    record = derive_recording(short, [{"trim": {"rows": [4, 304]}}]).to_record(
+        {"u": "u"}, {"y": "y"}
+    )
+    known = Problem.build(FOPDT, [record], parameters=BOUNDS)
+    [part] = find_assumed_samples(known, analysed(known))
+    assert np.count_nonzero(part) == 4
+
+
+def test_of_a_model_with_given_starts_nothing_is_told() -> None:
+    """Left out or not, the samples that follow start where the guess has led to."""
+    recording = recorded(2, was_at_rest=False)
+    start = float(recording.channel("y").values[CUT]) - TRUE["y0"]
+    model = replace(FOPDT, initial=(FixedInitial(start),))
+    assert notes(posed(recording, history=False, model=model)) == []
+
+
+def test_a_result_warns() -> None:
+    part = derive_recording(
+        recorded(0, was_at_rest=False), [{"trim": {"rows": [CUT, 420], "history": False}}]
+    )
+    record = part.to_record({"u": "u"}, {"y": "y"})
+    found = identify(FOPDT, record, GeneticAlgorithm(generations=80), parameters=BOUNDS)
+    assert any("Its first value is assumed there" in one for one in found.warnings)

@@ -1,0 +1,111 @@
+"""A free run that disturbances mislead, and the predictions that they do not."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.diagnosis.unstable_run import (
+    OneStepComparison,
+    compute_growth,
+    mark_prediction_dependent,
+)
+from sysid.identification.identify import identify
+from sysid.models.parse import parse_model
+from sysid.results.result import Identification
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.estimates import Estimate
+
+STEP, N = 0.2, 300
+PLANT: dict[str, Any] = {
+    "name": "unstable",
+    "form": "difference",
+    "inputs": {"u": "V"},
+    "states": {"x": "V"},
+    "parameters": {
+        "a": {"lower": -1, "upper": 1, "unit": "1/s"},
+        "b": {"lower": 0, "upper": 5, "unit": "1/s"},
+    },
+    "equations": {"x": "x(k-1) + h*(a*x(k-1) + b*u(k-1))"},
+    "outputs": {"y": "x"},
+    "initial": {"x": "measured"},
+}
+TRUTH = {"a": 0.25, "b": 1.0}
+
+
+def run_loop(seed: int, shock: float) -> Record:
+    """The plant in a proportional loop, with random disturbances inside it."""
+    random = np.random.default_rng(seed)
+    reference = np.repeat(random.choice([-1.0, 1.0], N // 20), 20)
+    x, u = np.zeros(N), np.zeros(N)
+    for k in range(N):
+        u[k] = -0.8 * (x[k] + 0.002 * random.standard_normal() - reference[k])
+        if k + 1 < N:
+            flow = TRUTH["a"] * x[k] + TRUTH["b"] * u[k]
+            x[k + 1] = x[k] + STEP * flow + shock * random.standard_normal()
+    return make_record(u, x)
+
+
+def make_record(u: FloatArray, y: FloatArray) -> Record:
+    times = STEP * np.arange(N)
+    return Record((Channel("u", times, u, "V", "zero"),), (Channel("y", times, y, "V"),))
+
+
+def list_told(found: Identification) -> list[str]:
+    return [text for text in found.warnings if "Use prediction: one-step" in text]
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_one_step_ahead_estimates_of_an_unstable_plant_are_told(seed: int) -> None:
+    record = run_loop(seed, 0.03)
+    found = identify(PLANT, record)
+    (told,) = list_told(found)
+    assert "the free run is unstable" in told
+    ahead = identify(PLANT, record, prediction="one-step")
+    for one in ahead.estimates:
+        assert one.interval95 is not None
+        assert one.interval95[0] <= TRUTH[one.name] <= one.interval95[1]
+        assert f"{one.name} = {one.value:.4g} ± {one.stderr:.2g} 1/s" in told
+    a, (reason, *_) = ahead["a"], found.verdict.reasons
+    assert found["a"].status == "prediction-dependent"
+    assert f"a = {found['a'].value:.6f}" in reason.text
+    assert f"{a.value:.4f} ± {a.stderr:.4f} 1/s predicted one step ahead" in reason.text
+    assert found.verdict.text == "not trustworthy: a differs one step ahead"
+    assert ahead.verdict.text == "trustworthy"
+
+
+def estimate(value: float, stderr: float) -> Estimate:
+    interval = (value - 2 * stderr, value + 2 * stderr)
+    return Estimate("a", "1/s", value, -1.0, 1.0, stderr, interval, "identified")
+
+
+@pytest.mark.parametrize(
+    ("free", "ahead", "status"),
+    [
+        (estimate(0.17, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
+        (estimate(0.19, 1e-4), estimate(0.20, 0.01), "prediction-dependent"),
+        (estimate(0.17, 0.02), estimate(0.20, 0.01), "identified"),
+    ],
+)
+def test_only_a_value_outside_the_interval_of_the_free_run_contradicts_it(
+    free: Estimate, ahead: Estimate, status: str
+) -> None:
+    comparison = OneStepComparison("the free run is unstable", (ahead,), ())
+    assert mark_prediction_dependent((free,), comparison)[0].status == status
+    assert mark_prediction_dependent((free,), None) == (free,)
+
+
+def test_a_stable_plant_with_white_residuals_needs_no_other_prediction() -> None:
+    random = np.random.default_rng(3)
+    u, x = np.repeat(random.normal(size=N // 10), 10), np.zeros(N)
+    for k in range(1, N):
+        x[k] = x[k - 1] + STEP * (-0.5 * x[k - 1] + u[k - 1])
+    assert not list_told(identify(PLANT, make_record(u, x + 0.02 * random.standard_normal(N))))
+
+
+@pytest.mark.parametrize(("a", "least", "most"), [(-0.3, 0, 1), (0.0, 1, 1.01), (0.25, 1e3, 1e8)])
+def test_the_effect_of_a_start_grows_as_the_poles_say(a: float, least: float, most: float) -> None:
+    problem = Problem.build(parse_model(PLANT), [run_loop(1, 0.0)])
+    assert least <= compute_growth(problem, np.array([a, 1.0])) <= most

@@ -1,0 +1,159 @@
+"""The verdict of a result: what speaks against it, the most severe first."""
+
+from typing import Any
+
+import pytest
+
+from sysid.residuals.residual_tests import ResidualTest
+from sysid.results.result import OrderComparison, OrderFit, SearchEvidence
+from sysid.results.verdict import Evidence, judge_result
+from sysid.uncertainty.estimates import Estimate, EstimateStatus
+
+
+def estimate(name: str, status: EstimateStatus = "identified", *, value: float = 0.5) -> Estimate:
+    return Estimate(name, "s", value, 0.0, 5.0, 0.01, (0.48, 0.52), status)
+
+
+def residual_test(kind: Any = "whiteness", *, p: float = 1e-9) -> ResidualTest:
+    outcome = "failed" if p < 0.05 else "passed"
+    return ResidualTest(0, "y", kind, "u" if kind == "independence" else None, outcome, 900, p=p)
+
+
+def judged(**evidence: Any) -> tuple[str, str]:
+    usual: dict[str, Any] = {
+        "estimates": [estimate("K"), estimate("T"), estimate("L")],
+        "fit_percent": 95.0,
+        "search": SearchEvidence(True, "starts", 8, 8),
+        "tests": [residual_test(p=0.3)],
+        "delays": ("L",),
+    }
+    verdict = judge_result(Evidence(**{**usual, **evidence}))
+    return verdict.trust, verdict.text
+
+
+def test_a_result_that_nothing_speaks_against_is_trustworthy() -> None:
+    assert judged() == ("trustworthy", "trustworthy")
+
+
+@pytest.mark.parametrize(
+    ("evidence", "text"),
+    [
+        ({"valid": False}, "the model is invalid"),
+        ({"search": SearchEvidence(False, None, 6, 1)}, "not settled"),
+        ({"fit_percent": -3.0}, "the model does not explain the output"),
+        (
+            {"estimates": [estimate("L", "not validated")]},
+            "the validation data contradict the model",
+        ),
+        (
+            {"estimates": [estimate("K", "group"), estimate("T", "group")]},
+            "the data determine K and T only in combination",
+        ),
+        ({"estimates": [estimate("K", "unidentifiable")]}, "the data do not determine K"),
+        ({"estimates": [estimate("K", "prediction-dependent")]}, "K differs one step ahead"),
+        (
+            {"estimates": [estimate("K"), estimate("L", "at bound")], "tests": [residual_test()]},
+            "L lies at its bound",
+        ),
+    ],
+)
+def test_what_is_serious_is_the_verdict(evidence: dict[str, Any], text: str) -> None:
+    named = text if text == "not settled" else f"not trustworthy: {text}"
+    assert judged(**evidence) == ("not trustworthy", named)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "text"),
+    [
+        ({"tests": [residual_test()]}, "L depends on the model's order"),
+        (
+            {"tests": [residual_test()], "delays": ()},
+            "each estimate depends on the model's order",
+        ),
+        ({"tests": [residual_test("independence")]}, "the residuals depend on u"),
+        ({"fit_percent_validation": 60.0}, "it fits the validation data worse"),
+        ({"estimates": [estimate("K"), estimate("L", "at bound")]}, "L lies at its bound"),
+        (
+            {"estimates": [estimate("K"), estimate("L", "ambiguous")]},
+            "another value of L fits as well",
+        ),
+        (
+            {"estimates": [estimate("K"), estimate("a", "group"), estimate("b", "group")]},
+            "the data determine a and b only in combination",
+        ),
+        ({"estimates": [estimate("K"), estimate("L", value=0.015)]}, "L may be 0"),
+        (
+            {"estimates": [estimate("K", "hold-dependent"), estimate("T", "group")]},
+            "the data determine T only in combination",
+        ),
+        (
+            {"estimates": [estimate("K"), estimate("L", "hold-dependent")]},
+            "L depends on how an input is read between its samples",
+        ),
+    ],
+)
+def test_a_condition_follows_trustworthy(evidence: dict[str, Any], text: str) -> None:
+    assert judged(**evidence) == ("limited", f"trustworthy, but {text}")
+
+
+def test_a_note_alone_leaves_a_result_trustworthy() -> None:
+    tests = [residual_test(p=0.02)]
+    verdict = judge_result(Evidence(estimates=[estimate("K")], fit_percent=95.0, tests=tests))
+    assert verdict.text == "trustworthy"
+    assert [reason.severity for reason in verdict.reasons] == ["note"]
+
+
+def test_what_only_the_solver_leaves_is_no_missing_dynamics() -> None:
+    assert judged(tests=[residual_test()], fit_percent=99.9999)[0] == "trustworthy"
+
+
+def test_the_most_severe_reason_comes_first_and_all_are_told() -> None:
+    verdict = judge_result(
+        Evidence(
+            estimates=[estimate("K"), estimate("L", "not settled")],
+            search=SearchEvidence(False, None, 0, 0),
+            tests=[residual_test()],
+            delays=("L",),
+        )
+    )
+    assert verdict.text == "not settled"
+    assert [reason.severity for reason in verdict.reasons] == ["serious", "caution"]
+    assert "no independent starts" in verdict.reasons[0].text
+
+
+def test_fixed_parameters_do_not_count_as_determined() -> None:
+    fixed = estimate("T", "fixed")
+    assert judged(estimates=[fixed, estimate("K", "unidentifiable")])[0] == "not trustworthy"
+
+
+def orders(*bics: float) -> OrderComparison:
+    """A comparison of a model of first order with those of second and third order."""
+    names, delays = ("fopdt", "sopdt", "topdt"), (1.57, 1.33, 1.31)
+    fits = (
+        OrderFit(name, place, delay, 0.01, {"L": delay}, 0.02, bic)
+        for place, (name, delay, bic) in enumerate(zip(names, delays, bics, strict=False), 1)
+    )
+    return OrderComparison("fopdt", "L", "s", "white", tuple(fits))
+
+
+def test_an_order_that_the_data_prefer_limits_the_trust_and_names_its_lag() -> None:
+    verdict = judge_result(Evidence(estimates=[estimate("L")], orders=orders(-1264.0, -1474.0)))
+    assert verdict.text == "trustworthy, but L depends on the model's order"
+    assert "prefer sopdt, with L = 1.33 s instead of 1.57 s" in verdict.reasons[0].text
+
+
+def test_orders_that_the_data_do_not_tell_apart_give_a_range_of_the_lag() -> None:
+    verdict = judge_result(Evidence(estimates=[estimate("L")], orders=orders(-1473.0, -1474.0)))
+    assert verdict.text == "trustworthy, but L depends on the model's order"
+    assert "do not tell fopdt and sopdt apart. With them L is from 1.33 to 1.57 s" in (
+        verdict.reasons[0].text
+    )
+
+
+def test_the_order_that_the_data_prefer_is_not_blamed_for_coloured_residuals() -> None:
+    own = orders(-1474.0, -1264.0)
+    assert judged(orders=own) == ("trustworthy", "trustworthy")
+    assert judged(orders=own, tests=[residual_test()]) == (
+        "limited",
+        "trustworthy, but the residuals are not noise",
+    )
