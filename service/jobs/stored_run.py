@@ -23,7 +23,6 @@ from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
-from sysid.data.holds import HoldSetting
 from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.models.model import Model, build_initial_parameters
@@ -109,18 +108,10 @@ class StoredRun:
         from sysid.identification.fit_problems import prepare_records
 
         validation = self.body["validation"] or {}
-        records = self.read_datasets(session, store, self.body["datasets"])
-        holds = self._find_former_holds(records)
-        records, others = (
-            tuple(record.replace_holds(holds) for record in read)
-            for read in (
-                records,
-                self.read_datasets(session, store, validation.get("datasets") or ()),
-            )
-        )
+        others = validation.get("datasets")
         return prepare_records(
-            records,
-            others or None,
+            self.read_datasets(session, store, self.body["datasets"]),
+            None if others is None else self.read_datasets(session, store, others),
             validation.get("fraction"),
             Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"])),
         )
@@ -159,19 +150,6 @@ class StoredRun:
         estimates = [to_estimate(document) for document in self.estimates]
         settings = fit_settings_of(self.body)
         return records, resimulate_run(model, records, settings, estimates, substeps)
-
-    def _find_former_holds(self, records: Sequence[Record]) -> dict[str, HoldSetting]:
-        """Find inputs that the run read otherwise than this program would by their values."""
-        listed = self.result.get("input_hold") or ()
-        names = [hold["input"] for hold in listed]
-        former = {h["input"]: h["chosen"] for h in listed if names.count(h["input"]) == 1}
-        return {
-            channel.name: former[channel.name]
-            for record in records
-            for channel in record.inputs
-            if channel.hold == "auto"
-            and former.get(channel.name, channel.effective_hold) != channel.effective_hold
-        }
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Select the changes of these parameters. The request may name unselected terms."""

@@ -18,29 +18,17 @@ _SAMPLES_PER_LEVEL = 10
 _BRIEF = 2  # samples: a shorter return to the level before is noise of a converter
 _BRIEF_SHARE = 0.1  # of the jumps
 _LASTING_SHARE = 0.5  # of the jumps between two plateaus in a piecewise constant signal
-_MIN_ROUGH = 50  # samples: fewer may be rough by chance
-_PAST = 25  # samples that may predict the next one; eight sines need sixteen
-_MIN_RANDOM, _MAX_RANDOM = 4 * _PAST, 5_000  # samples that are tested
-_NEW_SHARE = 0.5  # of the variance: what the past does not predict of a random signal
 
 
 class HoldChoice(NamedTuple):
-    """A chosen hold, and the reason as the end of a sentence: "it …".
-
-    `needs_fit`: the values alone are weak evidence, and the fit must agree.
-    """
+    """A chosen hold, and the reason as the end of a sentence: "it …"."""
 
     hold: Hold
     reason: str
-    needs_fit: bool = False
 
 
 def choose_hold(values: FloatArray) -> HoldChoice:
-    """Choose the hold of an input by its values: ``zero`` if held, else ``first``.
-
-    Held is a piecewise constant signal, and one that moves at random from sample to sample. No line
-    leads there, and no sine: but for a generator or a controller that holds each value, only noise
-    that is sampled too slowly.
+    """Choose the hold of an input by its values: ``zero`` if piecewise constant, else ``first``.
 
     Piecewise constant is a signal of two or few levels, or one whose jumps lie between plateaus
     without noise. Not so is a moving signal that a converter has quantised: it has plateaus too,
@@ -69,30 +57,7 @@ def choose_hold(values: FloatArray) -> HoldChoice:
     is_lasting = (lengths[:-1] > 1) & (lengths[1:] > 1)
     if np.mean(is_lasting) >= _LASTING_SHARE:
         return HoldChoice("zero", f"is piecewise constant: {share}")
-    # noise of a converter is random too, but of a few quanta
-    is_fine = np.std(places) > _FEW_LEVELS * np.min(np.diff(levels))
-    if is_fine and is_rough(values) and _is_random(values):
-        reason = "moves at random: its samples do not follow from those before"
-        return HoldChoice("zero", reason, needs_fit=True)
     return HoldChoice("first", f"moves: {share}")
-
-
-def is_rough(values: FloatArray) -> bool:
-    """Whether the mean of a signal tells more of its samples than their two neighbours do."""
-    between = values[1:-1] - 0.5 * (values[:-2] + values[2:])
-    return values.size > _MIN_ROUGH and bool(np.mean(np.square(between)) >= np.var(values))
-
-
-def _is_random(values: FloatArray) -> bool:
-    """Whether the past of a signal predicts less than half of its variance; of sines it has all."""
-    if values.size < _MIN_RANDOM:
-        return False
-    values = values[:_MAX_RANDOM] - np.mean(values[:_MAX_RANDOM])
-    past = np.lib.stride_tricks.sliding_window_view(values[:-1], _PAST)
-    following = values[_PAST:]
-    weights = np.linalg.lstsq(past, following, rcond=_ROUNDING_SHARE)[0]
-    rest = following - past @ weights
-    return bool(rest @ rest / (following.size - _PAST) >= _NEW_SHARE * np.var(values))
 
 
 def _is_quantised(jumps: FloatArray, levels: FloatArray, lengths: FloatArray) -> bool:

@@ -52,9 +52,7 @@ def resample_recording(recording: Recording, arguments: StepArguments) -> Record
     read = _average_periods if method == "mean" else _interpolate_values
     channels = []
     for recorded in recording.channels:
-        # a random signal may be an output with noise: here no fit tells that it is held
-        is_guess = recorded.hold == "auto" and recorded.hold_choice.needs_fit
-        channel = replace(recorded, hold="first" if is_guess else recorded.effective_hold)
+        channel = replace(recorded, hold=recorded.effective_hold)
         first, *later = [channel.slice_time(*span) for span in spans]
         begun = _resample_channel(first, grids[0], period, read)
         values = [begun.values]

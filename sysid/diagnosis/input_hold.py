@@ -1,10 +1,9 @@
 """Holds chosen by the data: what the estimate is if an input is read the other way.
 
 Read held, an input acts half a sample earlier than in straight lines. Mostly both fit equally, with
-two time lags. So a choice is in doubt in four cases. The other reading fits clearly better. Or an
+two time lags. So a choice is in doubt in three cases. The other reading fits clearly better. Or an
 input in straight lines follows the residuals, as a command that a controller computes and holds.
-Or the samples beside each of its samples say nothing of it, so no line leads there. Or an input is
-held because it moves at random, and that does not fit clearly better.
+Or the samples beside each of its samples say nothing of it, so no line leads there.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
-from sysid.data.holds import Hold, is_rough
+from sysid.data.holds import Hold
 from sysid.data.records import Channel, Record
 from sysid.kernels.reads import is_difference
 from sysid.residuals.feedback import find_commands
@@ -25,10 +24,10 @@ from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
 
-FITS_AS_WELL = "That fits as well"  # a doubt, but no reason to prefer the other reading
 _NOTABLE_STDERRS = 1.0  # standard errors: a larger difference is told
 _CLEAR_EVIDENCE = 10.0  # twice the logarithm of the ratio of likelihoods
 _MAX_TOLD = 3  # estimates in one sentence
+_MIN_ROUGH = 50  # samples: fewer may be rough by chance
 _READINGS = {"zero": "held", "first": "as straight lines", "band-limited": "band-limited"}
 
 
@@ -99,29 +98,20 @@ def find_hold_doubts(
 
     `simulated` (n,) and `rms` are those with the chosen readings.
     """
-    may_be_command = any(hold.chosen == "first" and hold.rms_other for hold in holds)
-    commands = find_commands(list_residual_series(problem, simulated)) if may_be_command else set()
+    open_holds = [hold.chosen == "first" and hold.rms_other is not None for hold in holds]
+    commands = find_commands(list_residual_series(problem, simulated)) if any(open_holds) else set()
     doubts = []
-    for hold in holds:
+    for hold, is_open in zip(holds, open_holds, strict=True):
         evidence, doubt = _compute_evidence(hold, problem.n_scored, rms), ""
         if evidence > _CLEAR_EVIDENCE:
             doubt = f"That fits better: RMS {hold.rms_other:.4g}, not {rms:.4g}"
-        elif hold.rms_other is not None and evidence >= -_CLEAR_EVIDENCE:
-            channels = _find_channels(hold.input, problem.records)
-            doubt = _doubt_equal_fit(hold, channels, commands)
+        elif is_open and evidence >= -_CLEAR_EVIDENCE:
+            if hold.input in commands:
+                doubt = "The input follows the residuals as a command does, which is held"
+            elif _is_rough(hold.input, problem.records):
+                doubt = "Its samples do not follow each other, so hardly in straight lines"
         doubts.append(doubt)
     return doubts
-
-
-def _doubt_equal_fit(hold: InputHold, channels: Sequence[Channel], commands: set[str]) -> str:
-    """Say why the other reading is as likely if both fit; empty if it is not."""
-    if hold.chosen == "zero":
-        return FITS_AS_WELL if any(one.hold_choice.needs_fit for one in channels) else ""
-    if hold.input in commands:
-        return "The input follows the residuals as a command does, which is held"
-    if any(is_rough(one.values) for one in channels):
-        return "Its samples do not follow each other, so hardly in straight lines"
-    return ""
 
 
 def mark_hold_dependent(
@@ -207,6 +197,16 @@ def _compute_evidence(hold: InputHold, samples: int, rms: float) -> float:
     if not hold.rms_other or not rms > 0:
         return 0.0
     return 2 * samples * log(rms / hold.rms_other)
+
+
+def _is_rough(name: str, records: Sequence[Record]) -> bool:
+    """Whether the mean of an input tells more of its samples than their two neighbours do."""
+    for channel in _find_channels(name, records):
+        values = channel.values
+        between = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+        if values.size > _MIN_ROUGH and np.mean(np.square(between)) >= np.var(values):
+            return True
+    return False
 
 
 def _describe_uncertain_jumps(name: str, records: Sequence[Record]) -> list[str]:

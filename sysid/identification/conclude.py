@@ -13,7 +13,6 @@ from sysid.data.records import find_common_sample_time
 from sysid.diagnosis.fixed_start import warn_fixed_starts
 from sysid.diagnosis.hard_switching import warn_hard_switching
 from sysid.diagnosis.input_hold import (
-    FITS_AS_WELL,
     describe_input_holds,
     find_hold_doubts,
     list_input_holds,
@@ -166,11 +165,7 @@ def _build_identification(
         left,
         late,
         has_feedback=bool(feedback),
-        doubtful=[
-            hold
-            for hold, doubt in zip(holds, doubts, strict=True)
-            if doubt not in ("", FITS_AS_WELL)
-        ],
+        doubtful=[hold for hold, doubt in zip(holds, doubts, strict=True) if doubt],
     )
     budget.spend(spent)
     analysis = replace(analysis, estimates=mark_prediction_dependent(analysis.estimates, ahead))

@@ -1,11 +1,9 @@
 """Signals that a sweep does not store are computed again: the file is the same, byte for byte."""
 
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from service.core.errors import Conflict
@@ -134,39 +132,6 @@ def test_a_sweep_stores_no_signals_and_a_single_run_does_unless_the_job_says_oth
     runs = carry_out_sweep(place, **body)
     assert {run.state for run in runs} == {JobState.SUCCEEDED}
     assert {run.signals_sha256 is not None for run in runs} == {is_kept}
-
-
-@pytest.mark.parametrize("validation", [{"fraction": 0.3}, {"datasets": ["random 1"]}])
-def test_a_run_keeps_the_reading_of_the_program_that_fitted_it(
-    place: Place, validation: dict[str, Any]
-) -> None:
-    for seed in (0, 1):
-        (u,), (y,) = (record := step_record(200, seed=seed)).inputs, record.outputs
-        moving = replace(u, values=np.random.default_rng(seed).standard_normal(200), hold="auto")
-        add_recording(
-            place.database,
-            place.store,
-            Recording((moving, y)),
-            name=f"random {seed}",
-            kind="upload",
-            key=f"random {seed}",
-            details={"warnings": []},
-        )
-    (run,) = carry_out_sweep(place, sweep={}, datasets=["random 0"], validation=validation)
-    assert list_readings(place, run) == {"zero"}
-    with place.database.write_session() as session:
-        row = session.get_one(Run, run.id)
-        assert row.result is not None
-        (hold,) = row.result["input_hold"]
-        row.result = {**row.result, "input_hold": [{**hold, "chosen": "first"}]}
-    assert list_readings(place, run) == {"first"}
-
-
-def list_readings(place: Place, run: Run) -> set[str]:
-    with place.database.read_session() as session:
-        records = load_run(session, run.id).read_fit_records(session, place.store)
-    read = (*records.estimation, *(records.validation_runs or ()))
-    return {channel.effective_hold for record in read for channel in record.inputs}
 
 
 def test_a_store_that_is_down_is_not_told_as_a_deleted_dataset(

@@ -33,10 +33,6 @@ HELD: dict[str, FloatArray] = {
     "a pulse of one sample": np.eye(1, N, 500)[0],
     "a slower controller": np.repeat(RNG.standard_normal(100), 10),
     "steps of few samples": dwell(RNG.uniform(0, 1, 300), 1, 4),
-    "a new level at every sample": np.random.default_rng(1).uniform(0, 60, N),
-    "a command that follows noise": np.convolve(
-        np.random.default_rng(2).standard_normal(N + 1), [1.0, 0.2], "valid"
-    ),
 }
 MOVING: dict[str, FloatArray] = {
     "a sine": np.sin(40 * PHASE),
@@ -51,14 +47,6 @@ MOVING: dict[str, FloatArray] = {
     "a ramp between rests": np.clip(10 * PHASE - 4, 0, 1),
     "noisy steps": np.repeat(RNG.uniform(0, 60, 20), 50) + RNG.normal(0, 0.01, N),
     "a constant": np.full(N, 3.0),
-    "a slow signal in noise": 1.5 * SLOW + np.random.default_rng(3).standard_normal(N),
-    "a measured random signal": np.convolve(
-        np.random.default_rng(4).standard_normal(N + 1), [1.0, 0.6], "valid"
-    ),
-    "eight fast sines": np.sum(
-        np.sin(np.outer(np.linspace(1.1, 2.9, 8), np.arange(N)) + np.arange(8)[:, None]), axis=0
-    ),
-    "few random samples": np.random.default_rng(5).standard_normal(60),
 }
 
 
