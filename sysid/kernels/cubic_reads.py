@@ -36,8 +36,7 @@ class CubicReader:
         whole, fraction = lanes.split_fraction(delay)
         zero, unit = (lanes.splat(lanes.make_integer(value)) for value in (0, 1))
         self._within = b.icmp_signed("==", whole, zero)
-        self.is_some_within = lanes.test_any(self._within)
-        self.is_far = False  # True: what is emitted runs only if no delay is below one step
+        self._is_some_within = lanes.test_any(self._within)
         half = lanes.make_number(0.5)
         self._is_later = lanes.compare("<", fraction, half)
         half_fraction = lanes.select(
@@ -90,14 +89,12 @@ class CubicReader:
             return self._now
         lanes = self._lanes
         finished = self._middle if halves == 1 else self._ahead[0]
-        if self.is_far:
-            return finished
 
         def emit_inside() -> list[IrValue]:
             is_inside = lanes.compare("<", self._delay, lanes.make_number(halves / 2))
             return [lanes.select(is_inside, self._read_inside(halves, now, stage), finished)]
 
-        return lanes.branch(self.is_some_within, emit_inside, [finished])[0]
+        return lanes.branch(self._is_some_within, emit_inside, [finished])[0]
 
     def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Update the carried values."""

@@ -20,11 +20,8 @@ from sysid.kernels.signals import (
     States,
 )
 from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
-from sysid.language.tree import Binary, Expression, FunctionCall, PastValue, walk
+from sysid.language.tree import Binary, FunctionCall, walk
 from sysid.models.model import DerivedInitial, EstimatedInitial, MeasuredInitial, Model
-
-_MAX_NODES_EMITTED_TWICE = 500
-"""Larger equations would compile for too long."""
 
 
 def emit_kernel(model: Model, variant: KernelVariant) -> str:
@@ -57,7 +54,7 @@ def emit_kernel(model: Model, variant: KernelVariant) -> str:
         lanes.builder.icmp_signed(">", remaining, lanes.make_integer(0)), emit_narrow_block, []
     )
     lanes.builder.ret_void()
-    if _has_repeated_calls(model) or _calls_of_past_repeat(model):
+    if _has_repeated_calls(model):
         _declare_pure_functions(module)
     return str(module)
 
@@ -65,26 +62,13 @@ def emit_kernel(model: Model, variant: KernelVariant) -> str:
 def _has_repeated_calls(model: Model) -> bool:
     """Whether a function is called twice with the same arguments, as by intermediate names."""
     trees = (*model.equations, *(output.expression for output in model.outputs))
-    calls = [node for tree in trees for node in walk(tree) if _is_call(node)]
+    calls = [
+        node
+        for tree in trees
+        for node in walk(tree)
+        if isinstance(node, FunctionCall) or (isinstance(node, Binary) and node.operator == "**")
+    ]
     return len(set(calls)) < len(calls)
-
-
-def _calls_of_past_repeat(model: Model) -> bool:
-    """Whether both middle stages of a step call functions of the same delayed states."""
-    nodes = [node for equation in model.equations for node in walk(equation)]
-    return (
-        reads.reads_cubics(model)
-        and len(nodes) <= _MAX_NODES_EMITTED_TWICE
-        and any(_is_call(node) and any(map(_is_delayed_state, walk(node))) for node in nodes)
-    )
-
-
-def _is_call(node: Expression) -> bool:
-    return isinstance(node, FunctionCall) or (isinstance(node, Binary) and node.operator == "**")
-
-
-def _is_delayed_state(node: Expression) -> bool:
-    return isinstance(node, PastValue) and node.kind == "state" and node.delay is not None
 
 
 def _declare_pure_functions(module: ir.Module) -> None:
@@ -145,9 +129,7 @@ class _Block:
         if self.variant.one_step:
             states.store_states(time_step.row)
             signals.begin_step(time_step)
-        following = self._emit_following_states(
-            time_step, states, signals, build_environment, start
-        )
+        following = self._emit_following_states(time_step, states, build_environment, start)
         signals.end_step(loop, following)
         states.end_step(loop, following)
         comparison.end_step(loop)
@@ -188,14 +170,11 @@ class _Block:
         self,
         time_step: TimeStep,
         states: States,
-        signals: SignalReaders,
         build_environment: EnvironmentBuilder,
         start: list[IrValue],
     ) -> dict[str, IrValue]:
         """Emit the next states: computed, or in the first samples of a recursion measured."""
         lanes, model = self.lanes, self.model
-        if _calls_of_past_repeat(model):
-            return self._emit_near_and_far(states, signals, build_environment)
         if not reads.is_difference(model) or model.memory <= 1:
             return emit_next_states(
                 lanes, model, self.experiment.get_number("step"), states, build_environment
@@ -215,38 +194,6 @@ class _Block:
         is_computed = lanes.builder.icmp_signed(">=", following, lanes.make_integer(model.memory))
         merged = lanes.branch(is_computed, emit_computed, measured)
         return dict(zip(states.names, merged, strict=True))
-
-    def _emit_near_and_far(
-        self, states: States, signals: SignalReaders, build_environment: EnvironmentBuilder
-    ) -> dict[str, IrValue]:
-        """Emit the step twice: for delays below one step, and for others only.
-
-        If no delay is below one step, both middle stages read the same past. So the compiler
-        computes functions of it once.
-        """
-
-        def emit_step() -> list[IrValue]:
-            values = emit_next_states(
-                self.lanes,
-                self.model,
-                self.experiment.get_number("step"),
-                states,
-                build_environment,
-            )
-            rises = (states.first_rises, states.last_rises)
-            carried = [values[name] for name in states.names]
-            carried += [rise[name] for rise in rises for name in states.with_rises]
-            return [self.lanes.splat(value) for value in carried]
-
-        def emit_far() -> list[IrValue]:
-            with signals.assume_far():
-                return emit_step()
-
-        merged = iter(self.lanes.branch(signals.test_near(), emit_step, emit_far))
-        following = {name: next(merged) for name in states.names}
-        states.first_rises = {name: next(merged) for name in states.with_rises}
-        states.last_rises = {name: next(merged) for name in states.with_rises}
-        return following
 
     def _load_measured_state(self, i: int, sample: IrValue, start: IrValue) -> IrValue:
         if not isinstance(self.model.initial[i], MeasuredInitial):

@@ -1,9 +1,5 @@
 """Readers of all signals of a model, in one block of individuals."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import reduce
-
 from sysid.kernels import reads
 from sysid.kernels.cubic_reads import CubicReader
 from sysid.kernels.delayed_reads import (
@@ -86,23 +82,6 @@ class SignalReaders:
         if past.delay is None:
             raise AssertionError(f"{past.name} is read without delay")
         return self._readers[past.name, past.delay, halves]
-
-    def test_near(self) -> IrValue:
-        """Emit whether any delay of a state is below one step in any lane; for cubic reads."""
-        near = [reader.is_some_within for reader in self._list_cubic_readers()]
-        return reduce(self._lanes.builder.or_, near)
-
-    @contextmanager
-    def assume_far(self) -> Iterator[None]:
-        """Emit reads that are right only if `test_near` is false."""
-        for reader in self._list_cubic_readers():
-            reader.is_far = True
-        yield
-        for reader in self._list_cubic_readers():
-            reader.is_far = False
-
-    def _list_cubic_readers(self) -> list[CubicReader]:
-        return [reader for _, reader in self._owners if isinstance(reader, CubicReader)]
 
     def get_state_delay(self, past: PastValue) -> IrValue:
         """Return the delay of a delayed state, in integration steps, however long."""

@@ -315,23 +315,17 @@ class VectorBuilder:
         self,
         condition: IrValue,
         body: Callable[[], Sequence[IrValue]],
-        otherwise: Sequence[IrValue] | Callable[[], Sequence[IrValue]],
+        otherwise: Sequence[IrValue],
     ) -> list[IrValue]:
-        """Return the values of `body` if the scalar condition holds, else those of `otherwise`."""
+        """Return the values of `body` if the scalar condition holds, else `otherwise`."""
         before = self.builder.block
         inside = self.function.append_basic_block("then")
         after = self.function.append_basic_block("join")
-        outside = self.function.append_basic_block("else") if callable(otherwise) else after
-        self.builder.cbranch(condition, inside, outside)
+        self.builder.cbranch(condition, inside, after)
         self.builder.position_at_end(inside)
         values = body()
         last = self.builder.block
         self.builder.branch(after)
-        if callable(otherwise):
-            self.builder.position_at_end(outside)
-            otherwise = otherwise()
-            before = self.builder.block
-            self.builder.branch(after)
         self.builder.position_at_end(after)
         merged = []
         for new, old in zip(values, otherwise, strict=True):

@@ -11,12 +11,8 @@ from sysid import load_model
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.kernels import machine_code, vectors
-from sysid.kernels.abi import LANES, NARROW_LANES
-from sysid.kernels.kernel import emit_kernel
-from sysid.kernels.layout import KernelVariant
 from sysid.kernels.vectors import VectorFunctions, load_vector_functions
 from sysid.simulation.problem import Problem
-from tests import reference
 
 FUNCTIONS = {
     "exp": np.exp,
@@ -124,33 +120,6 @@ def test_a_lane_does_not_depend_on_its_neighbours() -> None:
     candidates = np.column_stack([PLACES, PLACES])
     alone = np.array([values_of("exp(p) + 0*x(k-1)", one[None])[0] for one in candidates])
     np.testing.assert_array_equal(values_of("exp(p) + 0*x(k-1)", candidates), alone)
-
-
-def test_a_long_delay_does_not_depend_on_a_short_one_beside_it() -> None:
-    """A block of long delays only runs other code than one with a delay below a step.
-
-    Both give what the twin gives.
-    """
-    times = 0.5 * np.arange(150.0)
-    measured = Channel("y", times, 0.8 + 0.1 * np.sin(times), "1")
-    problem = Problem.build(load_model("mackey-glass"), [Record((), (measured,))])
-    long = np.column_stack(
-        [np.full(8, 0.2), np.full(8, 0.1), np.linspace(2, 12, 8), np.linspace(0.5, 9, 8)]
-    )
-    short = long * [1, 1, 1, 0] + [0, 0, 0, 0.2]
-    beside = np.concatenate([short[:4], long, short[4:]])
-    np.testing.assert_array_equal(problem.predict(beside)[4:12], problem.predict(long))
-    expected = [reference.predictions(problem, one) for one in beside]
-    np.testing.assert_allclose(problem.predict(beside), expected, rtol=1e-9)
-
-
-def test_both_middle_stages_compute_a_function_of_the_past_once() -> None:
-    """Calls of pow: one at the start of a step, then three if a delay is short, else two."""
-    code = emit_kernel(load_model("mackey-glass"), KernelVariant())
-    lines = str(machine_code.optimize_assembly(code)).splitlines()
-    lanes = load_vector_functions().lanes
-    parts = (LANES + NARROW_LANES) // lanes if lanes > 1 else 2
-    assert sum("call" in line and "pow" in line for line in lines) == (1 + 3 + 2) * parts
 
 
 def test_a_machine_without_the_library_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
