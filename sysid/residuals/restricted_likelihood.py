@@ -27,9 +27,8 @@ from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness, 
 MAX_POLE = 0.97
 """Limit on an autoregressive pole: beyond, it follows a single drift (Andrews and Monahan 1992)."""
 
-_SEARCH_STARTS = np.array([[0.6, -1.5], [1.5, 0.0]])
-_FIRST_SHARE, _FIRST_STEP = 0.05, 2.5e-4  # of an argument: sides of the first simplex; of one at 0
-_MAX_EVALUATIONS, _TOLERANCE = 80, 0.02  # of a search; of both arguments and the deviance
+_SEARCH_STARTS = ((0.6, -1.5), (1.5, 0.0))
+_SEARCH_OPTIONS = {"maxfev": 80, "xatol": 0.02, "fatol": 0.02}  # evaluations; tolerances
 _TINY = float(np.finfo(float).tiny)
 _DIFFERENCE_STEP = 0.1  # of the two arguments, for finite differences
 _MIN_CURVATURE = 0.05  # a flatter likelihood counts as having this curvature
@@ -203,61 +202,14 @@ def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
 
 def _minimise_deviance(series: _ObservedSeries) -> FloatArray:
     """Find the two arguments by the simplex of Nelder and Mead (1965), the best of all starts."""
-    best: FloatArray = _SEARCH_STARTS[0].copy()
-    least = np.inf
-    places, deviances = np.empty((3, 2)), np.empty(3)
-    for start in _SEARCH_STARTS:
-        for k in range(3):
-            places[k] = start
-            if k > 0:
-                places[k, k - 1] += _FIRST_SHARE * start[k - 1] if start[k - 1] else _FIRST_STEP
-            deviances[k] = _compute_deviance(places[k], series)
-        count = 3
-        _sort_simplex(places, deviances)
-        while count < _MAX_EVALUATIONS and (
-            np.max(np.abs(places[1:] - places[0])) > _TOLERANCE
-            or np.max(np.abs(deviances[1:] - deviances[0])) > _TOLERANCE
-        ):
-            count += _move_simplex(places, deviances, series)
-            _sort_simplex(places, deviances)
-        if deviances[0] < least:
-            best, least = places[0].copy(), deviances[0]
+    from scipy.optimize import minimize  # imported late: slow to load, rarely needed
+
+    solutions = [
+        minimize(_compute_deviance, start, (series,), method="Nelder-Mead", options=_SEARCH_OPTIONS)
+        for start in _SEARCH_STARTS
+    ]
+    best: FloatArray = min(solutions, key=lambda solution: float(solution.fun)).x
     return best
-
-
-def _move_simplex(places: FloatArray, deviances: FloatArray, series: _ObservedSeries) -> int:
-    """Replace the worst of three places, or shrink them to the best; count the evaluations."""
-    middle = 0.5 * (places[0] + places[1])
-    away = middle - places[2]
-    reflected = middle + away
-    value = _compute_deviance(reflected, series)
-    if value < deviances[0]:
-        expanded = middle + 2.0 * away
-        further = _compute_deviance(expanded, series)
-        if further < value:
-            places[2], deviances[2] = expanded, further
-        else:
-            places[2], deviances[2] = reflected, value
-        return 2
-    if value < deviances[1]:
-        places[2], deviances[2] = reflected, value
-        return 1
-    limit = min(value, deviances[2])
-    contracted = middle + (0.5 if value < deviances[2] else -0.5) * away
-    nearer = _compute_deviance(contracted, series)
-    if nearer <= limit:
-        places[2], deviances[2] = contracted, nearer
-        return 2
-    for k in range(1, 3):
-        places[k] = 0.5 * (places[0] + places[k])
-        deviances[k] = _compute_deviance(places[k], series)
-    return 4
-
-
-def _sort_simplex(places: FloatArray, deviances: FloatArray) -> None:
-    """Sort three places by their deviance, in place; one that is not a number comes last."""
-    order = np.argsort(deviances, kind="stable")
-    places[:], deviances[:] = places[order], deviances[order]
 
 
 def _are_white(values: FloatArray) -> bool:

@@ -28,7 +28,7 @@ def compute_explained_share(left: FloatArray, retained: BoolArray, influence: Fl
         explained += parts[k] ** 2 if retained[k] else 0.0
     for i in range(influence.size):
         total += influence[i] ** 2
-    return explained / total
+    return explained / total if total > 0.0 else 0.0
 
 
 @jit_compile
