@@ -23,7 +23,6 @@ from sqlalchemy import (
     Select,
     and_,
     case,
-    delete,
     exists,
     false,
     func,
@@ -39,8 +38,7 @@ from service.core.states import OPEN_STATES, JobState
 from service.queue.admission import Admission, count_running_jobs, is_open
 from service.queue.clocks import Clock, choose_database_clock
 from service.repositories.events import EventKind, EventRepository
-from service.repositories.jobs import end_open_runs, lock_parcels, notify_queue
-from service.repositories.outcomes import record_best_run
+from service.repositories.jobs import end_job, end_open_runs, lock_parcels, notify_queue
 from service.storage.columns import Document, UtcDateTime
 from service.storage.errors import LeaseLost, RowConflict
 from service.storage.statements import RETURNING_OPTIONS
@@ -375,7 +373,6 @@ class LeaseQueue:
         self.lock_lease(lease)
         lock_parcels(self._session, lease.job_id)
         job = self._lock_job(lease.job_id)
-        record_best_run(self._session, job)
         if state is JobState.SUCCEEDED:
             self._check_runs_finished(job.id, range(job.n_runs))
         self._end_job(job, state, error)
@@ -525,16 +522,7 @@ class LeaseQueue:
         return parcel.lost_leases >= job.max_attempts * (SPARED_LOSS_FACTOR if is_spared else 1)
 
     def _end_job(self, job: Job, state: JobState, error: str | None) -> None:
-        job.state, job.finished_at = state, self._read_clock()
-        if state is not JobState.CANCELLED or error is not None:
-            job.error = error  # else it has the reason, if the service cancelled it
-        job.seconds_left = None
-        self._session.flush()
-        parcels = delete(Parcel).where(Parcel.job_id == job.id)
-        self._session.execute(parcels, execution_options={"synchronize_session": False})
-        if state is not JobState.SUCCEEDED:
-            end_open_runs(self._session, job.id, state, error)
-        self._events.append_state(job)
+        end_job(self._session, job, state, error, self._read_clock())
 
     def _cancel_parcel(self, parcel: Parcel, job: Job) -> None:
         parcel.lease_owner = None  # it waits for the end of the job, and nobody claims it

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, Literal, get_args
 
 from sqlalchemy import ColumnElement, case, delete, func, or_, select, text, update
@@ -11,6 +12,7 @@ from sqlalchemy.orm import Session
 from service.core.states import OPEN_STATES, JobState
 from service.repositories.audit import record_action
 from service.repositories.events import EventRepository
+from service.repositories.outcomes import record_best_run
 from service.repositories.projects import DAY
 from service.repositories.search import NO_FILTER, ListFilter, select_ids, select_matches
 from service.storage.columns import Document, utc_now
@@ -232,10 +234,7 @@ class JobRepository:
         if not job.cancel_requested:  # else the first who asked has told why
             job.cancel_requested, job.error = True, reason
         if job.state is JobState.QUEUED:
-            job.state, job.finished_at = JobState.CANCELLED, utc_now()
-            self._session.execute(delete(Parcel).where(Parcel.job_id == job_id))
-            end_open_runs(self._session, job_id, JobState.CANCELLED, None)
-            EventRepository(self._session).append_state(job)
+            end_job(self._session, job, JobState.CANCELLED, None, utc_now())
         record_action(self._session, "job.cancel", job_id, self._project_id)
         self._session.flush()
         return job
@@ -392,6 +391,26 @@ def lock_parcels(session: Session, job_id: str) -> None:
     """Lock all parcels of a job, in their order, before the row of the job is locked."""
     query = select(Parcel.first).where(Parcel.job_id == job_id).order_by(Parcel.first)
     session.execute(query.with_for_update(key_share=True)).all()
+
+
+def end_job(
+    session: Session, job: Job, state: JobState, error: str | None, moment: datetime
+) -> None:
+    """End a job, with its parcels and its unfinished runs, and record its best run.
+
+    Its parcels and its row are locked. Every end of a job is here, so that lists of jobs sort all
+    that have ended by their results.
+    """
+    job.state, job.finished_at, job.seconds_left = state, moment, None
+    if state is not JobState.CANCELLED or error is not None:
+        job.error = error  # else it has the reason, if the service cancelled it
+    session.flush()
+    parcels = delete(Parcel).where(Parcel.job_id == job.id)
+    session.execute(parcels, execution_options={"synchronize_session": False})
+    if state is not JobState.SUCCEEDED:
+        end_open_runs(session, job.id, state, error)
+    record_best_run(session, job)
+    EventRepository(session).append_state(job)
 
 
 def end_open_runs(

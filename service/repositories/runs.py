@@ -19,7 +19,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from service.core.states import JobState
+from service.core.states import OPEN_STATES, JobState
 from service.core.text_checks import MANY
 from service.repositories.history import HistoryPoint, MigrantPoint, unpack_history, unpack_migrants
 from service.repositories.search import select_items_with
@@ -121,6 +121,12 @@ class RunRepository:
         query = select(Run.state, func.count()).where(*of_job).group_by(Run.state)
         counts = dict(self._session.execute(query).all())
         return {state: counts.get(state, 0) for state in JobState}
+
+    def count_ended(self, job_id: str) -> int:
+        """Count the runs of a job that have ended, deleted ones too."""
+        of_job = Run.job_id == select_job_id(job_id, self._project_id)
+        query = select(func.count()).where(of_job, Run.state.not_in(OPEN_STATES))
+        return self._session.scalars(query).one()
 
     def read_history(self, run_id: str) -> list[HistoryPoint]:
         """Read the improved champions of a run by island, in their order."""

@@ -112,8 +112,8 @@ def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
             reference.explain_gaps(request["x"], rows_by_label),
             describe_differences(session, reference.run, list(bodies.values()), channels),
         ]
-    runs = RunRepository(session).count_states(job.id)
-    ended = sum(runs[state] for state in JobState if state.is_terminal)
+    repository = RunRepository(session)
+    runs, n_ended = repository.count_states(job.id), repository.count_ended(job.id)
     return TrendOut(
         job=job.id,
         x=request["x"],
@@ -128,7 +128,7 @@ def _compute(session: Session, job: Job, outliers: OutlierRule) -> TrendOut:
         quantities=answers,
         missing=job.n_runs - runs[JobState.SUCCEEDED],
         failed=runs[JobState.FAILED],
-        unended=0 if job.state.is_terminal else job.n_runs - ended,
+        unended=0 if job.state.is_terminal else job.n_runs - n_ended,
         notes=[note for note in notes if note],
     )
 

@@ -5,12 +5,21 @@ import threading
 import pytest
 
 from service.core.states import JobState
-from service.queue.leases import LeaseQueue
+from service.queue.leases import LeaseOwners, LeaseQueue
 from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.errors import RowConflict, RowNotFound
-from tests.stored import claim, claimed, job_of, record_success, runs_of, state_of, submit
+from tests.stored import (
+    claim,
+    claimed,
+    job_of,
+    record_outcomes,
+    record_success,
+    runs_of,
+    state_of,
+    submit,
+)
 
 
 def finish(database, lease, state):
@@ -32,6 +41,71 @@ def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
         assert (job.state, job.cancel_requested) == (JobState.RUNNING, True)
     finish(database, got.lease, JobState.CANCELLED)
     assert state_of(database, got.job.id) is JobState.CANCELLED
+
+
+def cancel_job(database, lease):
+    with database.write_session() as session:
+        JobRepository(session).cancel(lease.job_id)
+
+
+def release(database, lease, **how):
+    with database.write_session() as session:
+        LeaseQueue(session).release_job(lease, **how)
+
+
+def reap(database, lease):
+    with database.write_session() as session:
+        LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({lease.owner})))
+
+
+def cancel_parcel(database, lease):
+    with database.write_session() as session:
+        LeaseQueue(session).cancel_parcel(lease)
+
+
+def lose_workers(database, lease):
+    release(database, lease, lost=True)
+
+
+def cancel_resumed(database, lease):
+    finish(database, lease, JobState.FAILED)
+    with database.write_session() as session:
+        JobRepository(session).resume(lease.job_id)
+    assert (job_of(database, lease.job_id).fit_estimation, state_of(database, lease.job_id)) == (
+        None,
+        JobState.QUEUED,
+    )
+    cancel_job(database, lease)
+
+
+@pytest.mark.parametrize(
+    ("ways", "state"),
+    [
+        ([cancel_job, cancel_parcel], JobState.CANCELLED),
+        ([cancel_job, release], JobState.CANCELLED),
+        ([cancel_job, reap], JobState.CANCELLED),
+        ([cancel_job, lose_workers], JobState.CANCELLED),
+        ([release, cancel_job], JobState.CANCELLED),
+        ([cancel_resumed], JobState.CANCELLED),
+        ([reap], JobState.FAILED),
+        ([lose_workers], JobState.FAILED),
+    ],
+)
+def test_a_job_that_ends_early_has_the_results_of_its_best_run(database, ways, state):
+    got, runs = claimed(database, n_runs=3, max_attempts=1)
+    for run, rms, trust in zip(runs, (0.5, 0.4), ("trustworthy", "limited"), strict=False):
+        outcome = RunOutcome(
+            run_id=run,
+            state=JobState.SUCCEEDED,
+            best_rms=rms,
+            fit_estimation=100 - rms,
+            result={"parameters": [], "verdict": {"trust": trust}},
+        )
+        record_outcomes(database, got.lease, outcome)
+    for way in ways:
+        way(database, got.lease)
+    job = job_of(database, got.job.id)
+    assert (job.state, job.best_rms, job.fit_estimation, job.trust) == (state, 0.4, 99.6, "limited")
 
 
 def test_of_two_wishes_to_cancel_the_first_gives_the_reason(database):

@@ -118,8 +118,14 @@ def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
 
 
 def end_with_fit(database, name, *fits, cell=None, trust=None):
-    """A job whose runs ended with these fits (%); a better fit has a smaller RMS."""
-    result = None if trust is None else {"parameters": [], "verdict": {"trust": trust}}
+    """A job whose runs ended with these fits (%); a better fit has a smaller RMS.
+
+    `trust` is that of all runs, or has one for each.
+    """
+    each = trust if isinstance(trust, tuple) else (trust,) * len(fits)
+    results = [
+        None if one is None else {"parameters": [], "verdict": {"trust": one}} for one in each
+    ]
     ended, runs = claimed(database, n_runs=len(fits), name=name)
     record_outcomes(
         database,
@@ -132,7 +138,7 @@ def end_with_fit(database, name, *fits, cell=None, trust=None):
                 fit_estimation=fit,
                 result=result,
             )
-            for run, fit in zip(runs, fits, strict=True)
+            for run, fit, result in zip(runs, fits, results, strict=True)
         ),
     )
     with database.write_session() as session:
@@ -187,13 +193,17 @@ def test_jobs_are_sorted_by_the_trust_in_their_results(database):
     assert list_in_order(database, "verdict")[0:2] == ["d", "a"]
 
 
-def test_the_fit_of_a_job_is_that_of_the_best_run_that_is_left(database):
-    job = end_with_fit(database, "two", 90.0, 95.0)
-    assert job_of(database, job).fit_estimation == 95.0
-    best = runs_of(database, job)[1].id
-    with database.write_session() as session:
-        delete_item(session, "run", best)
-    assert (job_of(database, job).fit_estimation, job_of(database, job).best_rms) == (90.0, 10.0)
+def test_fit_and_trust_of_a_job_are_those_of_the_best_run_that_is_left(database):
+    job = end_with_fit(database, "two", 90.0, 95.0, trust=("limited", "trustworthy"))
+    runs = [run.id for run in runs_of(database, job)]
+    found = []
+    for best in (None, runs[1], runs[0]):
+        if best is not None:
+            with database.write_session() as session:
+                delete_item(session, "run", best)
+        left = job_of(database, job)
+        found.append((left.fit_estimation, left.best_rms, left.trust))
+    assert found == [(95.0, 5.0, "trustworthy"), (90.0, 10.0, "limited"), (None, None, None)]
 
 
 @pytest.mark.parametrize("cursor", ["job_0", "nothing", "job_0:7"])

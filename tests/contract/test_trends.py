@@ -7,9 +7,11 @@ from typing import Any
 import pytest
 
 from service.core.states import JobState
+from service.items.deletion import delete_item
 from service.pages.pages import job_page
 from service.queue.leases import Lease, LeaseQueue
 from service.queue.run_writes import RunOutcome
+from service.repositories.jobs import JobRepository
 from service.repositories.references import ReferenceRepository
 from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
@@ -130,6 +132,27 @@ def test_runs_that_have_not_succeeded_are_missing(place: Place) -> None:
         LeaseQueue(session).finish_job(lease, JobState.CANCELLED)
     found = trend(place, job)
     assert (found.missing, found.failed, found.unended) == (2, 1, 0)
+
+
+def test_a_deleted_run_of_a_resumed_batch_has_ended(place: Place) -> None:
+    labels = [{"x": x} for x in (*LENGTHS, 8.0)]
+    job = place.submit(
+        sweep={"axes": [{"path": "/seed", "values": [1, 2, 3, 4], "labels": labels}]},
+        trend={"x": "x", "parameters": ["L"]},
+    )
+    lease = claim_job(place.database, job)
+    first, deleted, _, last = (run.id for run in place.runs(job))
+    with place.database.write_session() as session:  # as in a sweep that is created by parcels
+        session.delete(session.get_one(Run, last))
+    write_results(place.database, lease, {first: conclude(L=(0.1, 0.01))})
+    with place.database.write_session() as session:
+        LeaseQueue(session).finish_job(lease, JobState.CANCELLED)
+    with place.database.write_session() as session:
+        delete_item(session, "run", deleted)
+        JobRepository(session).resume(job)
+    found = trend(place, job)
+    # The third run waits, and the fourth has no row.
+    assert (found.missing, found.failed, found.unended) == (3, 0, 2)
 
 
 def end(place: Place, job: str) -> None:

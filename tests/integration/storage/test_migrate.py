@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from sqlalchemy import delete, inspect, text
+from sqlalchemy import delete, inspect, select, text
 
 import migrations
 from service.core.states import JobState
@@ -21,7 +21,7 @@ from service.storage import migrate, sessions
 from service.storage.errors import DatabaseIsNewer, DatabaseNotAtHead, UnknownRevision
 from service.storage.sessions import Database
 from service.storage.tables import Base, Event, Job, Project, Run, SearchTerm, StoredSummary
-from tests.database import empty_postgres
+from tests.database import empty_postgres, record_statements
 from tests.limits import LIMIT_SECONDS
 from tests.stored import (
     claim,
@@ -106,34 +106,65 @@ def test_postgresql_compresses_no_result_by_its_slow_method_after_a_way_back():
     assert all(storage == "e" or method == "l" for storage, method in found.values()), found
 
 
-def test_fit_and_trust_of_ended_jobs_are_taken_from_their_best_runs(empty_database):
+def end_two_runs(database, *, fits=True, batch=False, trust=True, state=JobState.SUCCEEDED):
+    """A job of three runs, or of two if it succeeds, of which two ended with a result."""
+    ended, runs = claimed(database, n_runs=2 + (state is not JobState.SUCCEEDED))
+    for run, rms in zip(runs, (0.5, 0.4), strict=False):
+        verdict = {"trust": "limited" if rms == 0.4 else "trustworthy"}
+        outcome = RunOutcome(
+            run_id=run,
+            state=JobState.SUCCEEDED,
+            best_rms=rms,
+            fit_estimation=100 - rms if fits else None,
+            result={"parameters": [], **({"verdict": verdict} if trust else {})},
+        )
+        record_outcomes(database, ended.lease, outcome)
+    with database.write_session() as session:
+        if batch:
+            for run in runs:
+                session.get_one(Run, run).cell = {"/datasets": ["ds_1"]}
+        LeaseQueue(session).finish_job(ended.lease, state)
+    return ended.job.id
+
+
+def test_rms_fit_and_trust_of_ended_jobs_are_taken_from_their_best_runs(empty_database):
     database = empty_database
     migrate.upgrade_database(database)
-    jobs = []
-    for cells in ({"/seed": 1}, {"/datasets": ["ds_1"]}):
-        ended, runs = claimed(database, n_runs=2)
-        for run, rms in zip(runs, (0.5, 0.4), strict=True):
-            outcome = RunOutcome(
-                run_id=run,
-                state=JobState.SUCCEEDED,
-                best_rms=rms,
-                fit_estimation=100 - rms,
-                result={
-                    "parameters": [],
-                    "verdict": {"trust": "limited" if rms == 0.4 else "trustworthy"},
-                },
-            )
-            record_outcomes(database, ended.lease, outcome)
-        with database.write_session() as session:
-            session.get_one(Run, runs[0]).cell = cells
-            LeaseQueue(session).finish_job(ended.lease, JobState.SUCCEEDED)
-        jobs.append(ended.job.id)
+    jobs = {
+        end_two_runs(database): (0.4, 99.6, "limited"),
+        end_two_runs(database, batch=True): (0.4, None, None),
+        end_two_runs(database, fits=False): (0.4, None, "limited"),
+        end_two_runs(database, state=JobState.CANCELLED): (0.4, 99.6, "limited"),
+        end_two_runs(database, state=JobState.FAILED): (0.4, 99.6, "limited"),
+        end_two_runs(database, trust=False): (0.4, 99.6, None),
+    }
+    running, (run, _) = claimed(database, n_runs=2)
+    record_success(database, running.lease, run, rms=0.3)
+    jobs[running.job.id] = (0.3, None, None)
+    assert read_sorted_values(database) == jobs
     migrate.downgrade_database(database, "0006")
+    with record_statements(database) as statements:
+        migrate.upgrade_database(database)
+    assert read_sorted_values(database) == jobs
+    # SQLite knows these since 3.38.
+    assert not [text for text, _ in statements if database.is_sqlite and "->" in text]
+
+
+def test_an_ended_job_that_the_program_left_without_fit_gets_that_of_its_best_run(empty_database):
+    database = empty_database
     migrate.upgrade_database(database)
+    job = end_two_runs(database, state=JobState.CANCELLED)
+    migrate.downgrade_database(database, "0008")
+    with database.engine.begin() as connection:
+        connection.execute(text("UPDATE jobs SET fit_estimation = NULL, best_rms = 0.1"))
+    migrate.upgrade_database(database)
+    assert read_sorted_values(database) == {job: (0.4, 99.6, "limited")}
+
+
+def read_sorted_values(database):
+    query = select(Job.id, Job.best_rms, Job.fit_estimation, Job.trust)
     with database.read_session() as session:
-        found = [session.get_one(Job, job) for job in jobs]
-    # A batch has none.
-    assert [(job.fit_estimation, job.trust) for job in found] == [(99.6, "limited"), (None, None)]
+        return {job: tuple(values) for job, *values in session.execute(query)}
 
 
 def test_a_sweep_in_parcels_goes_down_without_gaps_and_up_again(empty_database):
