@@ -53,6 +53,7 @@ from service.storage.tables import Dataset, Job, Run
 from service.sweeps.schemas import NoiseSweepIn
 from sysid.core.settings import SEARCH_METHODS
 from sysid.core.text import join_estimate
+from sysid.data.holds import HOLD_TEXTS
 from sysid.figures import signals
 from sysid.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from sysid.figures.posterior import posterior_height
@@ -341,6 +342,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         dataset=dataset,
         etag=compute_etag(dataset),
         height=signals.signals_height(dataset.n_channels),
+        hold_texts=HOLD_TEXTS,
         has_history=any(channel["history_samples"] for channel in dataset.channels),
         lineage=draw_lineage(session, dataset),
     )

@@ -21,6 +21,7 @@ from service.models.models import add_model
 from service.pages.lineage import MAX_CHARACTERS
 from service.repositories.lineage import LineageRepository
 from service.storage.tables import Job
+from sysid.data.holds import HOLD_TEXTS, HOLDS, HoldSetting
 from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
 from sysid.figures.signals import plot_comparison
@@ -212,6 +213,27 @@ def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, fill
     upwards = client.get(f"/datasets/{part}").text.partition('class="lineage"')[2]
     assert f'<a href="/datasets/{filled.dataset}"' in upwards
     assert f"/jobs/{filled.sweep}" not in upwards  # made from its parent, not from it
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_recording_says_what_its_channels_do_between_samples(
+    client: TestClient, hold: HoldSetting
+) -> None:
+    assert set(HOLD_TEXTS) == set(HOLDS)
+    parts = parts_of(client)
+    channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, 2.0]), "V", hold)
+    stored = add_recording(
+        parts.database,
+        parts.store,
+        Recording((channel,)),
+        name=f"read as {hold}",
+        kind="upload",
+        key=f"hold {hold}",
+        details={"warnings": []},
+    ).dataset.id
+    answer = client.get(f"/datasets/{stored}")
+    assert answer.status_code == 200
+    assert f"<td>{HOLD_TEXTS[hold]}</td>" in answer.text
 
 
 def test_health_tells_what_works_and_settings_where_they_come_from(
