@@ -44,8 +44,9 @@ def test_the_list_is_filtered_by_state(site: Site, page: Page) -> None:
 
 
 def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
-    site: Site, page: Page
+    site: Site, scripted_page: Page
 ) -> None:
+    page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     page.emulate_media(color_scheme="light")
