@@ -240,7 +240,7 @@ def job_page(
         comparable=_comparison_query(page.items),
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
-        lineage=draw_lineage(session, job),
+        drawing=None if view.is_open else draw_lineage(session, job),
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
@@ -344,7 +344,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         height=signals.signals_height(dataset.n_channels),
         hold_texts=HOLD_TEXTS,
         has_history=any(channel["history_samples"] for channel in dataset.channels),
-        lineage=draw_lineage(session, dataset),
+        drawing=draw_lineage(session, dataset),
     )
 
 

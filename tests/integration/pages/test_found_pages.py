@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
 
 from service.api.app import create_app
 from service.core.settings import Settings
@@ -18,7 +19,8 @@ from service.datasets.datasets import add_recording
 from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
-from service.pages.lineage import MAX_CHARACTERS
+from service.pages import pages
+from service.pages.lineage import MAX_CHARACTERS, LineageDrawing, draw_lineage
 from service.repositories.lineage import LineageRepository
 from service.storage.tables import Job
 from sysid.data.holds import HOLD_TEXTS, HOLDS, HoldSetting
@@ -183,6 +185,23 @@ def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Fi
     assert drawn.count('<g class="shown">') == 1
     assert 'aria-label="reference tube"' in drawn
     assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording
+
+
+def test_the_lineage_of_an_open_job_follows_when_it_has_ended(
+    client: TestClient, filled: Filled, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+
+    def draw(session: Session, shown: Job) -> LineageDrawing:
+        drawn.append(shown.id)
+        return draw_lineage(session, shown)
+
+    monkeypatch.setattr(pages, "draw_lineage", draw)
+    shown = {job: client.get(f"/jobs/{job}").text for job in (filled.running, filled.finished)}
+    assert drawn == [filled.finished]
+    region = '<div data-live="lineage">'
+    assert f'{region}<p class="muted">Drawn when the job has ended.</p>' in shown[filled.running]
+    assert '<svg class="lineage"' in shown[filled.finished].partition(region)[2]
 
 
 def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
