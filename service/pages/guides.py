@@ -90,11 +90,22 @@ def list_notebooks() -> dict[str, Path]:
 def format_formula(latex: str) -> str:
     """Format a ``math`` block of a page, which is LaTeX, as HTML with MathML.
 
+    The converter does not escape the text of a formula, so what HTML would read is refused.
+
+    Raises
+    ------
+    ValueError
+        If the formula has one of the characters <, > and &.
+
     Examples
     --------
     >>> format_formula("a")  # doctest: +ELLIPSIS
     '<div class="equation" tabindex="0"><math aria-label="a" ...><mrow><mi>a</mi></mrow></math>...'
     """
+    if refused := re.search("[<>&]", latex):
+        raise ValueError(
+            f"the formula {latex.strip()} has {refused[0]}; write \\lt, \\gt or words instead"
+        )
     mathml = convert(latex.strip(), display="block")
     label = f'<math aria-label="{escape(latex.strip())}"'
     return f'<div class="equation" tabindex="0">{mathml.replace("<math", label, 1)}</div>\n'

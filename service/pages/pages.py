@@ -53,6 +53,7 @@ from service.storage.tables import Dataset, Job, Run
 from service.sweeps.schemas import NoiseSweepIn
 from sysid.core.settings import SEARCH_METHODS
 from sysid.core.text import join_estimate
+from sysid.data.holds import HOLD_TEXTS
 from sysid.figures import signals
 from sysid.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from sysid.figures.posterior import posterior_height
@@ -239,7 +240,7 @@ def job_page(
         comparable=_comparison_query(page.items),
         datasets=dataset_links(session, job),
         more_datasets=count_unlisted_datasets(job),
-        lineage=draw_lineage(session, job),
+        drawing=None if view.is_open else draw_lineage(session, job),
         commands=_request_commands(view, base_url),
         events=[to_event_view(event) for event in _latest_events(session, job)],
     )
@@ -341,8 +342,9 @@ def dataset_page(session: Session, dataset_id: str) -> str:
         dataset=dataset,
         etag=compute_etag(dataset),
         height=signals.signals_height(dataset.n_channels),
+        hold_texts=HOLD_TEXTS,
         has_history=any(channel["history_samples"] for channel in dataset.channels),
-        lineage=draw_lineage(session, dataset),
+        drawing=draw_lineage(session, dataset),
     )
 
 

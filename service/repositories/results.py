@@ -4,15 +4,16 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, exists, select
 from sqlalchemy.orm import Session
 
 from service.core.states import JobState
 from service.repositories.jobs import JobRepository
 from service.repositories.outcomes import match_outcomes
-from service.repositories.search import NO_FILTER, ListFilter
+from service.repositories.search import NO_FILTER, ListFilter, select_ids
 from service.storage.columns import Document
 from service.storage.errors import InvalidCursor, RowNotFound
+from service.storage.sessions import find_project
 from service.storage.statements import RowPage
 from service.storage.tables import Job, Run
 
@@ -70,17 +71,32 @@ def list_results(
         job_cursor = job.id
         if not only_best:
             rows += _list_runs(session, job, last, limit + 1)
-    for _ in range(MAX_JOBS // JOBS_AT_ONCE):
+    looked_at, following = _list_jobs(session, job_cursor, chosen)
+    for start in range(0, len(looked_at), JOBS_AT_ONCE):
         if len(rows) > limit:
             break
-        page = JobRepository(session).list_page(
-            cursor=job_cursor, limit=JOBS_AT_ONCE, chosen=chosen
-        )
-        rows += _list_runs_of_jobs(session, page.items, limit + 1 - len(rows), only_best=only_best)
-        if page.next is None:
-            return _make_page(rows, limit, None)
-        job_cursor = page.next
-    return _make_page(rows, limit, f"{job_cursor}:{_AFTER_ALL}")
+        jobs = _load_jobs_with_results(session, looked_at[start : start + JOBS_AT_ONCE])
+        rows += _list_runs_of_jobs(session, jobs, limit + 1 - len(rows), only_best=only_best)
+    return _make_page(rows, limit, following)
+
+
+def _list_jobs(
+    session: Session, cursor: str | None, chosen: ListFilter
+) -> tuple[Sequence[str], str | None]:
+    """List the jobs that a page looks at, and where the next page goes on if there are more."""
+    query = select_ids(Job, find_project(session), chosen, cursor=cursor, limit=MAX_JOBS)
+    ids = session.scalars(query).all()
+    looked_at = ids[:MAX_JOBS]
+    return looked_at, f"{looked_at[-1]}:{_AFTER_ALL}" if len(ids) > MAX_JOBS else None
+
+
+def _load_jobs_with_results(session: Session, ids: Sequence[str]) -> Sequence[Job]:
+    """Load those of these jobs that have a run with a result, latest first."""
+    has_result = exists().where(
+        Run.job_id == Job.id, Run.state == JobState.SUCCEEDED, Run.deleted_at.is_(None)
+    )
+    query = select(Job).where(Job.id.in_(ids), Job.n_done > Job.n_failed, has_result)
+    return session.scalars(query.order_by(Job.id.desc())).all()
 
 
 _AFTER_ALL = 2**31 - 1
@@ -116,7 +132,7 @@ def _list_runs_of_jobs(
     for job in jobs:
         if len(rows) >= room:
             break
-        if job.n_runs > 1 and job.n_done > job.n_failed and not only_best:
+        if job.n_runs > 1 and not only_best:
             rows += _list_runs(session, job, -1, room - len(rows))
         else:
             rows += of_job.get(job.id, [])

@@ -1,5 +1,6 @@
 """What an input does between its samples: the choices, and the choice by its values."""
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -9,6 +10,13 @@ from sysid.core.types import FloatArray
 Hold = Literal["zero", "first", "band-limited"]
 HoldSetting = Literal["auto", "zero", "first", "band-limited"]
 HOLDS: tuple[HoldSetting, ...] = get_args(HoldSetting)
+HOLD_TEXTS: Mapping[HoldSetting, str] = {
+    "auto": "decided from the data",
+    "zero": "held",
+    "first": "straight lines",
+    "band-limited": "band-limited",
+}
+"""What a signal does between its samples, in words."""
 
 _ROUNDING_SHARE = 1e-9  # of the span: nearer values are equal
 _ONE_QUANTUM = 1.5  # quanta: smaller jumps are of one quantum

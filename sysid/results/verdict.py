@@ -107,8 +107,8 @@ class Evidence:
         return [estimate for estimate in self.estimates if estimate.is_free]
 
     def list_names(self, *statuses: str) -> list[str]:
-        """List the parameters that have one of these statuses."""
-        return [estimate.name for estimate in self.estimates if estimate.status in statuses]
+        """List the free parameters that have one of these statuses."""
+        return [estimate.name for estimate in self.free if estimate.status in statuses]
 
     def tell_reasons(self, status: str) -> str:
         """Tell each free parameter of this status with its value, and the reason, as sentences."""

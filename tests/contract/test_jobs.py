@@ -10,6 +10,7 @@ from service.items.deletion import delete_item
 from service.queue.leases import JobProgress, LeaseQueue
 from service.queue.queue_state import read_queue_state
 from service.queue.run_writes import RunOutcome, RunWriter
+from service.repositories import results
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.results import list_results
@@ -22,6 +23,7 @@ from service.storage.errors import (
     UnstorableValue,
 )
 from service.storage.tables import Job, Project, Run
+from tests.database import record_statements
 from tests.stored import claim, claimed, job_of, record_outcomes, runs_of, submit
 
 NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
@@ -235,6 +237,35 @@ def test_results_of_all_jobs_follow_each_other_page_by_page(database):
     for cursor in ("job_0:1", "x", "job_0:", "job_0:-1"):
         with pytest.raises(InvalidCursor), database.read_session() as session:
             list_results(session, cursor=cursor)
+
+
+def test_jobs_without_results_cost_pages_of_results_no_query_each(database):
+    end_with_fit(database, "first", 70.0)
+    for name in "abcdef":
+        job = end_with_fit(database, name, 80.0, 85.0)
+        with database.write_session() as session:
+            for run in runs_of(database, job):
+                delete_item(session, "run", run.id)
+    for options in ({}, {"only_best": True}):
+        with database.read_session() as session, record_statements(database) as statements:
+            page = list_results(session, **options)
+        assert [row.job.name for row in page.items] == ["first"]
+        assert len(statements) <= 5
+
+
+def test_a_page_of_results_looks_at_so_many_jobs_and_the_next_goes_on(database, monkeypatch):
+    monkeypatch.setattr(results, "MAX_JOBS", 2)
+    monkeypatch.setattr(results, "JOBS_AT_ONCE", 1)
+    end_with_fit(database, "first", 70.0)
+    for _ in range(4):
+        submit(database, "waits")
+    pages, cursor = [], None
+    while not pages or cursor is not None:
+        with database.read_session() as session:
+            page = list_results(session, cursor=cursor)
+        pages.append([row.job.name for row in page.items])
+        cursor = page.next
+    assert pages == [[], [], ["first"]]
 
 
 def test_jobs_are_listed_and_counted_by_state(database):

@@ -3,7 +3,7 @@
 import re
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,21 +136,21 @@ def page(tab: Page) -> Iterator[Page]:
     """A tab in which nothing may go wrong, blank and of the usual size."""
     with watch_tab(tab):
         yield tab
-    tab.unroute_all()
-    tab.emulate_media(media="null", color_scheme="null")
-    tab.set_viewport_size(VIEWPORT)
 
 
 @pytest.fixture
 def scripted_page(browser_context: BrowserContext) -> Iterator[Page]:
-    """Such a tab of the test's own, for scripts that every page of it begins with."""
+    """Such a tab of the test's own, for scripts and listeners, which stay in a tab."""
     with browser_context.new_page() as tab, watch_tab(tab):
         yield tab
 
 
 @contextmanager
 def watch_tab(tab: Page) -> Iterator[None]:
-    """Fail the test after an error on the console of the tab; leave the tab blank."""
+    """Fail the test after an error on the console of the tab; leave the tab as it was.
+
+    Each step is undone, even if another one fails.
+    """
     wrong: list[str] = []
 
     def note(message: ConsoleMessage) -> None:
@@ -161,10 +161,14 @@ def watch_tab(tab: Page) -> Iterator[None]:
     def note_error(error: Error) -> None:
         wrong.append(str(error))
 
-    tab.on("console", note)
-    tab.on("pageerror", note_error)
-    yield
-    tab.goto("about:blank")  # it asks no server any more
-    tab.remove_listener("console", note)
-    tab.remove_listener("pageerror", note_error)
+    with ExitStack() as undo:
+        undo.callback(tab.set_viewport_size, VIEWPORT)
+        undo.callback(tab.emulate_media, media="null", color_scheme="null")
+        undo.callback(tab.unroute_all)
+        tab.on("console", note)
+        undo.callback(tab.remove_listener, "console", note)
+        tab.on("pageerror", note_error)
+        undo.callback(tab.remove_listener, "pageerror", note_error)
+        undo.callback(tab.goto, "about:blank")  # it asks no server any more
+        yield
     assert wrong == []

@@ -180,7 +180,8 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
     assert spec["parameters"] == body["parameters"]
 
 
-def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, page: Page) -> None:
+def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, scripted_page: Page) -> None:
+    page = scripted_page
     opened(own_site, page)
     page.locator("[name=dataset]").select_option(own_site.filled.dataset)
     expect(page.locator("[data-signal]").first).to_be_attached()

@@ -44,8 +44,9 @@ def test_the_list_is_filtered_by_state(site: Site, page: Page) -> None:
 
 
 def test_a_finished_job_shows_its_estimates_plots_and_residual_tests(
-    site: Site, page: Page
+    site: Site, scripted_page: Page
 ) -> None:
+    page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     page.emulate_media(color_scheme="light")
@@ -220,8 +221,11 @@ def test_the_result_appears_when_a_running_job_ends(own_site: Site, page: Page) 
     page.goto(f"{own_site.url}/jobs/{own_site.filled.running}")
     figure(page, "history")
     expect(page.locator("table.estimates")).to_have_count(0)
+    lineage = page.locator('[data-live="lineage"]')
+    expect(lineage).to_have_text("Drawn when the job has ended.")
     end_running(own_site.parts.database, own_site.parts.store, own_site.filled.lease)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
+    expect(lineage.get_by_role("link", name="run run 1 of")).to_have_count(1)
     expect(page.locator("#job .chip")).to_have_text("succeeded")
     expect(page.locator("[data-announcement]")).to_have_text("succeeded: trustworthy")
     assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 8

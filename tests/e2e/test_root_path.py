@@ -42,8 +42,9 @@ def address(filled: tuple[Path, Filled]) -> Iterator[str]:
 
 
 def test_pages_work_below_the_path_of_a_proxy(
-    address: str, filled: tuple[Path, Filled], page: Page
+    address: str, filled: tuple[Path, Filled], scripted_page: Page
 ) -> None:
+    page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"{address}/jobs/{filled[1].finished}")
@@ -61,8 +62,9 @@ def test_pages_work_below_the_path_of_a_proxy(
 
 
 def test_items_are_found_edited_and_deleted_below_the_path(
-    address: str, filled: tuple[Path, Filled], page: Page
+    address: str, filled: tuple[Path, Filled], scripted_page: Page
 ) -> None:
+    page = scripted_page
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"{address}/jobs/{filled[1].failed}")

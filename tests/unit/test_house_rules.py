@@ -2,10 +2,12 @@
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from tests.limits import LIMIT_SECONDS
 from tests.repository import ROOT
 from tests.sources import list_modules, read_facts
 
@@ -69,6 +71,12 @@ def test_no_test_replaces_a_name_by_its_dotted_text() -> None:
     dotted = re.compile(r"setattr\(\s*[\"']")
     found = [str(p.relative_to(ROOT)) for p in list_modules(CODE) if dotted.search(p.read_text())]
     assert found == []
+
+
+def test_two_waits_of_a_test_end_before_the_limit_of_pytest() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    limit = settings["tool"]["pytest"]["ini_options"]["timeout"]
+    assert limit >= 2 * LIMIT_SECONDS + 100.0
 
 
 def test_no_class_name_is_used_twice() -> None:

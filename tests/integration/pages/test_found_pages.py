@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.orm import Session
 
 from service.api.app import create_app
 from service.core.settings import Settings
@@ -18,9 +19,11 @@ from service.datasets.datasets import add_recording
 from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
 from service.models.models import add_model
-from service.pages.lineage import MAX_CHARACTERS
+from service.pages import pages
+from service.pages.lineage import MAX_CHARACTERS, LineageDrawing, draw_lineage
 from service.repositories.lineage import LineageRepository
 from service.storage.tables import Job
+from sysid.data.holds import HOLD_TEXTS, HOLDS, HoldSetting
 from sysid.data.records import Channel, Recording
 from sysid.figures.data import ExperimentTraces, OutputTraces, SignalTrace
 from sysid.figures.signals import plot_comparison
@@ -184,6 +187,23 @@ def test_the_lineage_of_a_job_is_drawn_with_links(client: TestClient, filled: Fi
     assert f'href="/jobs/{filled.sweep}"' not in drawn  # it only used the same recording
 
 
+def test_the_lineage_of_an_open_job_follows_when_it_has_ended(
+    client: TestClient, filled: Filled, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+
+    def draw(session: Session, shown: Job) -> LineageDrawing:
+        drawn.append(shown.id)
+        return draw_lineage(session, shown)
+
+    monkeypatch.setattr(pages, "draw_lineage", draw)
+    shown = {job: client.get(f"/jobs/{job}").text for job in (filled.running, filled.finished)}
+    assert drawn == [filled.finished]
+    region = '<div data-live="lineage">'
+    assert f'{region}<p class="muted">Drawn when the job has ended.</p>' in shown[filled.running]
+    assert '<svg class="lineage"' in shown[filled.finished].partition(region)[2]
+
+
 def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, filled: Filled) -> None:
     parts = parts_of(client)
     channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, 2.0]), "V")
@@ -212,6 +232,27 @@ def test_the_lineage_of_a_recording_is_drawn_with_links(client: TestClient, fill
     upwards = client.get(f"/datasets/{part}").text.partition('class="lineage"')[2]
     assert f'<a href="/datasets/{filled.dataset}"' in upwards
     assert f"/jobs/{filled.sweep}" not in upwards  # made from its parent, not from it
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_recording_says_what_its_channels_do_between_samples(
+    client: TestClient, hold: HoldSetting
+) -> None:
+    assert set(HOLD_TEXTS) == set(HOLDS)
+    parts = parts_of(client)
+    channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, 2.0]), "V", hold)
+    stored = add_recording(
+        parts.database,
+        parts.store,
+        Recording((channel,)),
+        name=f"read as {hold}",
+        kind="upload",
+        key=f"hold {hold}",
+        details={"warnings": []},
+    ).dataset.id
+    answer = client.get(f"/datasets/{stored}")
+    assert answer.status_code == 200
+    assert f"<td>{HOLD_TEXTS[hold]}</td>" in answer.text
 
 
 def test_health_tells_what_works_and_settings_where_they_come_from(

@@ -77,6 +77,12 @@ def test_formulas_are_mathml_on_a_page_and_latex_in_its_notebook(client: TestCli
     assert cells[0]["source"].count("$$") == 10
 
 
+@pytest.mark.parametrize("latex", [r"\text{<b>bold</b>}", "x > 0", r"\text{a&lt;b}", "a & b"])
+def test_a_formula_with_characters_of_html_is_refused(latex: str) -> None:
+    with pytest.raises(ValueError, match=r"write \\lt"):
+        guides.format_formula(latex)
+
+
 def test_a_folder_has_one_address_where_its_links_lead_to_its_pages(client: TestClient) -> None:
     asked = client.get("/guides/howto", follow_redirects=False)
     assert (asked.status_code, asked.headers["Location"]) == (307, "/guides/howto/")

@@ -198,7 +198,8 @@ def test_a_file_names_its_source_and_the_recorded_clock(server: TestClient) -> N
     assert metadata[0]["source"] == sha256(content).hexdigest()
     assert (metadata[1]["source"], metadata[1]["parents"]) == ("", stored["id"])
     assert [one["started_at"] for one in metadata] == [stored["started_at"]] * 2
-    assert "2026-01-31T08:00:00" in server.get(f"/datasets/{stored['id']}").text
+    shown = '<time datetime="2026-01-31T08:00:00+00:00">2026-01-31 08:00:00+00:00</time>'
+    assert shown in server.get(f"/datasets/{stored['id']}").text
 
 
 def test_lineage_leads_from_a_derived_dataset_to_its_source(

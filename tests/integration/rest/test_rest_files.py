@@ -75,7 +75,8 @@ def test_the_clock_of_a_recording_is_kept_and_told(server: TestClient) -> None:
         assert (
             server.get(f"/v1/datasets/{stored['id']}").json()["started_at"] == stored["started_at"]
         )
-        assert stored["started_at"] in server.get(f"/datasets/{stored['id']}").text
+        shown = f'{stored["started_at"]}">{stored["started_at"].replace("T", " ")}</time>'
+        assert shown in server.get(f"/datasets/{stored['id']}").text
         steps = {"steps": [{"trim": {"start": 1}}, {"resample": {"sample_time": 0.2}}]}
         part = server.post(f"/v1/datasets/{stored['id']}:derive", json=steps).json()
         assert part["started_at"] == stored["started_at"]  # the time axis is that of the parent

@@ -9,6 +9,8 @@ import pytest
 
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
 from workers import packing
+from workers import ray_executor as module
+from workers.errors import ClusterLost
 from workers.inline_executor import InlineExecutor
 from workers.protocol import QueuedRun
 from workers.scheduler import Scheduler
@@ -76,6 +78,29 @@ def test_a_run_survives_the_death_of_its_worker(ray_executor) -> None:
     assert killed
     assert notebook.failures == {}
     assert len(notebook.results["r"]) == 1
+
+
+def test_a_ray_that_does_not_answer_a_probe_is_lost(
+    ray_executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SILENCE_SECONDS", 0.0)
+    monkeypatch.setattr(module, "ANSWER_SECONDS", 0.5)
+    never = ray_executor._noop.options(resources={"of no machine": 1.0})
+    monkeypatch.setattr(ray_executor, "_noop", never)
+    monkeypatch.setattr(ray_executor, "_probe", None)
+    monkeypatch.setattr(ray_executor, "_last_answer", time.monotonic())
+    try:
+        with pytest.raises(ClusterLost, match="has not answered"):
+            check_for_a_minute(ray_executor)
+    finally:
+        ray_executor.cancel_pack(ray_executor._probe, force=False)
+
+
+def check_for_a_minute(executor: module.RayExecutor) -> None:
+    limit = time.monotonic() + 60.0
+    while time.monotonic() < limit:
+        executor.check_cluster_alive()
+        time.sleep(0.02)
 
 
 def workers_of(pid: int) -> list[int]:
