@@ -90,7 +90,8 @@ def compare_orders(
 
     None if the model is no process with one unknown dead time, or is not fitted by least squares
     of a free run. Also if a gain, an offset or a start is at its bound, if it fits nearly without
-    residuals, or if the budget does not suffice.
+    residuals, or if the budget does not suffice. A dead time at its bound, in the model's own fit
+    or in that of the preferred order, says nothing of orders either.
 
     Parameters
     ----------
@@ -116,23 +117,27 @@ def compare_orders(
     if len(fits) < 2:
         return None, spent
     has_colour = problem.loss.noise_model == "ar1" or _has_coloured_residuals(fits[-1])
-    compared = []
+    compared, bounded = list[OrderFit](), set[str]()
     for fitted in fits:
-        order, simulations = _assess_order(fitted, has_colour=has_colour)
+        order, is_bounded, simulations = _assess_order(fitted, has_colour=has_colour)
         compared.append(order)
+        bounded |= {order.model} if is_bounded else set()
         spent += simulations
     own = next(
         fitted.entry.model
         for fitted in fits
         if fitted.entry.parts == len(assumptions.process.time_constants)
     )
-    return OrderComparison(
+    comparison = OrderComparison(
         own,
         assumptions.delay.name,
         assumptions.delay.unit,
         "ar1" if has_colour else "white",
         tuple(compared),
-    ), spent
+    )
+    if bounded & {own, comparison.preferred_model}:
+        return None, spent
+    return comparison, spent
 
 
 def mark_order_dependent(
@@ -210,7 +215,7 @@ def _read_assumptions(
         return None
     [delay] = [estimate for estimate in estimates if estimate.name in delays]
     # A delay may be an expression, such as V/q. Without an error nothing is known of it.
-    if delay.value != process.delay or delay.stderr is None:
+    if delay.value != process.delay or delay.stderr is None or delay.status == "at bound":
         return None
     changed, bounded = set[str](), {one.name for one in estimates if one.status == "at bound"}
     for d, name in enumerate(problem.free_names):
@@ -333,8 +338,8 @@ def _has_coloured_residuals(fitted: _FittedOrder) -> bool:
     return any(is_coloured(part, residuals[part.rows]) for part in iterate_parts(fitted.problem))
 
 
-def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, int]:
-    """Compute the BIC of a fitted order, and its dead time with its standard error."""
+def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, bool, int]:
+    """Compute the BIC of a fitted order, its dead time, and whether that is at its bound."""
     problem, theta, spent, whitening = fitted.problem, fitted.theta, fitted.evaluations, None
     if has_colour:
         theta, whitening, simulations = _fit_coloured_noise(fitted)
@@ -354,7 +359,7 @@ def _assess_order(fitted: _FittedOrder, *, has_colour: bool) -> tuple[OrderFit, 
         float(np.sqrt(np.mean(np.square(residuals)))),
         criteria.bic,
     )
-    return order, spent + analysis.evaluations + 1
+    return order, delay.status == "at bound", spent + analysis.evaluations + 1
 
 
 def _fit_coloured_noise(fitted: _FittedOrder) -> tuple[FloatArray, Whitening, int]:

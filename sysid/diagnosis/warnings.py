@@ -112,9 +112,7 @@ def collect_warnings(
     elif tests is not None and not is_of_the_solver:
         loss = problem.loss
         is_plain = loss.kind == "squares" and loss.noise_model != "ar1"
-        coloured = _warn_coloured_residuals(
-            tests, delay_names, analysis.uncertainty, may_be_noise=is_plain
-        )
+        coloured = _warn_coloured_residuals(tests, delay_names, analysis, may_be_noise=is_plain)
         messages += _name_suspects(problem, analysis, tests, are_white=not coloured) or coloured
     return (*messages, *about_unread_units)
 
@@ -346,7 +344,7 @@ def _is_insignificant_delay(estimate: Estimate) -> bool:
 def _warn_coloured_residuals(
     tests: ResidualTests,
     delay_names: set[str],
-    uncertainty: Uncertainty | None,
+    analysis: Analysis,
     *,
     may_be_noise: bool,
 ) -> list[str]:
@@ -357,8 +355,9 @@ def _warn_coloured_residuals(
     that depend on an input contain dynamics, and no noise model describes these. Residuals that
     do not may be slow noise (Ljung, System Identification, 2nd ed., ch. 16.6). On validation data
     alone, errors of the estimates look the same as missing dynamics. The standard errors are
-    correct then.
+    correct then. A time lag at its bound explains the residuals as well as a missing order does.
     """
+    uncertainty = analysis.uncertainty
     if all(
         test.kind != "whiteness" or test.p is None or test.p > _WHITENESS_LEVEL
         for test in tests.tests
@@ -372,6 +371,13 @@ def _warn_coloured_residuals(
             "the residuals are consistent with white noise on the estimation data, but not on the "
             "validation data. Either dynamics are missing from the model, or parameters are known "
             "too roughly. Estimate from data that cover both."
+        ]
+    bounded = delay_names & {one.name for one in analysis.estimates if one.status == "at bound"}
+    if bounded:
+        names = ", ".join(sorted(bounded))
+        return [
+            f"the residuals are not white (on the {tests.data} data). The bound of {names} may be "
+            f"the cause. {_STDERR_MEANINGS[colour]}"
         ]
     if delay_names:
         suggestion = _NOISE_MODEL_SUGGESTION if advises else ""

@@ -254,14 +254,15 @@ def _find_undetermined(evidence: Evidence) -> Iterator[Reason]:
 
 def _find_bounds(evidence: Evidence) -> Iterator[Reason]:
     """Find estimates at a bound; with missing dynamics they are no physical limit."""
-    names = evidence.list_names("at bound")
+    names, is_coloured = evidence.list_names("at bound"), evidence.has_failed("whiteness")
     if names:
         lies = "lies at its bound" if len(names) == 1 else "lie at their bounds"
+        coloured = " The residuals are not white, which the bound may cause." * is_coloured
         yield Reason(
-            "serious" if evidence.has_failed("whiteness") else "caution",
+            "serious" if is_coloured else "caution",
             f"{_join(names)} {lies}",
             f"{_join(names)} {lies}, so the best value may be outside, and other estimates follow "
-            "it. Widen the range, unless it is a physical limit.",
+            f"it.{coloured} Widen the range, unless it is a physical limit.",
         )
 
 
@@ -270,6 +271,8 @@ def _find_other_order(evidence: Evidence) -> Iterator[Reason]:
     orders = evidence.orders
     if orders is None or orders.preferred_model == orders.model:
         return
+    if orders.delay in evidence.list_names("at bound"):
+        return  # the bound speaks against every order
     own, unit = orders.own_fit, "" if orders.unit == "1" else f" {orders.unit}"
     lower, upper = orders.delay_range
     if orders.preferred_model is not None:
@@ -291,7 +294,9 @@ def _find_other_order(evidence: Evidence) -> Iterator[Reason]:
 def _find_missing_dynamics(evidence: Evidence) -> Iterator[Reason]:
     if _is_number(evidence.fit_percent) and evidence.fit_percent >= _EXPLAINED:
         return
-    orders = evidence.orders
+    orders, bounded = evidence.orders, evidence.list_names("at bound")
+    if evidence.has_failed("whiteness") and set(bounded) & set(evidence.delays):
+        return  # what is missing may be the time lag that the bound excludes
     if evidence.has_failed("whiteness") and orders and orders.preferred_model == orders.model:
         yield Reason(
             "caution",
@@ -300,7 +305,7 @@ def _find_missing_dynamics(evidence: Evidence) -> Iterator[Reason]:
             "warning names what they are most likely of.",
         )
     elif evidence.has_failed("whiteness"):
-        names = [name for name in evidence.delays if name not in evidence.list_names("at bound")]
+        names = evidence.delays
         what = _join(names) if names else "each estimate"
         depends = "depend" if len(names) > 1 else "depends"
         yield Reason(

@@ -180,6 +180,27 @@ def test_what_cannot_be_compared_is_not() -> None:
     assert without_noise.order_comparison is None  # what is left is of the integration
 
 
+def test_orders_are_not_compared_where_the_dead_time_is_at_its_bound() -> None:
+    """Of a first order the bound is exceeded by L, and of the preferred second order as well."""
+    limited = identify(
+        "fopdt", make_record(1.5), QUICK, parameters={"L": {"lower": 0, "upper": 0.5}}
+    )
+    assert limited["L"].status == "at bound"
+    assert limited.order_comparison is None
+    assert find_order_warnings(limited) == []
+    assert limited.verdict.reasons[0].brief == "L lies at its bound"
+    assert not any("order" in reason.text for reason in limited.verdict.reasons)
+    [coloured] = [text for text in limited.warnings if "not white" in text]
+    assert coloured.startswith(
+        "the residuals are not white (on the estimation data). The bound of L may be the cause. "
+    )
+    near = identify(  # L of the first order lies inside, that of the second at the bound
+        "fopdt", make_record(1.5, 0.3), QUICK, parameters={"L": {"lower": 1.45, "upper": 5}}
+    )
+    assert near["L"].status not in ("at bound", "order-dependent")
+    assert near.order_comparison is None
+
+
 def write_fits(*bics: float) -> OrderComparison:
     fits = tuple(
         OrderFit(model, order, delay, 0.01, {}, 0.02, bic)

@@ -142,6 +142,22 @@ def test_an_order_that_the_data_prefer_limits_the_trust_and_names_its_lag() -> N
     assert "prefer sopdt, with L = 1.33 s instead of 1.57 s" in verdict.reasons[0].text
 
 
+def test_a_lag_at_its_bound_is_told_alone_without_advice_on_orders() -> None:
+    lag = estimate("L", "at bound", value=5.0)
+    for compared in (None, orders(-1264.0, -1474.0), orders(-1473.0, -1474.0)):
+        verdict = judge_result(
+            Evidence(
+                estimates=[estimate("K"), lag],
+                tests=[residual_test()],
+                delays=("L",),
+                orders=compared,
+            )
+        )
+        assert verdict.text == "not trustworthy: L lies at its bound"
+        [reason] = verdict.reasons
+        assert "The residuals are not white, which the bound may cause. Widen" in reason.text
+
+
 def test_orders_that_the_data_do_not_tell_apart_give_a_range_of_the_lag() -> None:
     verdict = judge_result(Evidence(estimates=[estimate("L")], orders=orders(-1473.0, -1474.0)))
     assert verdict.text == "trustworthy, but L depends on the model's order"
