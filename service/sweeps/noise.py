@@ -134,7 +134,8 @@ def _build_base(
 
     If the true parameters are unknown, σ = 0 is added: errors refer to its best run.
     """
-    fields = {"name": "noise sweep", **body.job_fields, "datasets": source.datasets}
+    name = body.name or "noise sweep"
+    fields = {**body.job_fields, "name": name, "datasets": source.datasets}
     job = JobIn.model_validate(fields)
     checker = JobChecker(session, source.new_rows)
     faults = [*_grid_faults(body, most_runs), *source.faults]

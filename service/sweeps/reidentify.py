@@ -72,8 +72,9 @@ def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     }
     return JobIn.model_validate(
         {
-            "name": f"{_choose_model_name(body.model)} over {name_label(body.label)}"[:200],
             **body.job_fields,
+            "name": body.name
+            or f"{_choose_model_name(body.model)} over {name_label(body.label)}"[:200],
             "datasets": chosen[0].datasets,
             "sweep": {"axes": [axis]},
             "warm_start": _choose_warm_start(body, reference),

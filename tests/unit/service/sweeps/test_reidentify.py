@@ -23,7 +23,20 @@ def test_runs_come_in_the_order_of_the_label_each_with_its_own_data() -> None:
     assert axis.values == [["ds_2"], ["ds_4"], ["ds_8"]]
     assert axis.labels == [{"length_m": 2.0}, {"length_m": 4.0}, {"length_m": 8.0}]
     assert job.datasets == ["ds_2"]
-    assert job.name == "tube over length [m]"
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({}, "tube over length [m]"),
+        ({"name": None}, "tube over length [m]"),  # an empty field of the form
+        ({"name": "spring"}, "spring"),
+    ],
+)
+def test_a_batch_without_a_name_is_called_after_model_and_label(
+    fields: dict[str, Any], name: str
+) -> None:
+    assert job_of(**fields).name == name
 
 
 @pytest.mark.parametrize(

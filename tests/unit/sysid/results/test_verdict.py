@@ -142,7 +142,7 @@ def test_an_order_that_the_data_prefer_limits_the_trust_and_names_its_lag() -> N
     assert "prefer sopdt, with L = 1.33 s instead of 1.57 s" in verdict.reasons[0].text
 
 
-def test_a_lag_at_its_bound_is_told_alone_without_advice_on_orders() -> None:
+def test_a_lag_at_its_bound_stands_alone_without_advice_on_orders() -> None:
     lag = estimate("L", "at bound", value=5.0)
     for compared in (None, orders(-1264.0, -1474.0), orders(-1473.0, -1474.0)):
         verdict = judge_result(
