@@ -12,7 +12,7 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 _READING_METHODS = ("GET", "HEAD")
 _PUBLIC = re.compile(
-    r"/(healthz|readyz|docs|openapi\.json|sign-in|sign-out|problems/[^/]*|static/[^/]*|guides/.*)"
+    r"/(healthz|readyz|docs|openapi\.json|sign-in|sign-out|problems/[^/]*|static/[^/]*|guides(/.*)?)"
 )
 """Paths without anything of a project: health, texts of the program, and the way in."""
 _ADMIN = re.compile(r"/v1/audit|/keys(/.*)?|/settings")

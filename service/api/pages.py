@@ -52,6 +52,12 @@ def reference_page() -> Response:
     return HtmlPage(pages.reference_page())
 
 
+@router.get("/guides", **HIDDEN)
+def guides_page() -> Response:
+    """Lead to the contents of the documentation; its links are relative."""
+    return RedirectResponse(to_address("/guides/"))
+
+
 @router.get("/guides/{path:path}", **HIDDEN)
 def guide_page(path: str) -> Response:
     """Show a page of the documentation, one of its files, or a page as a notebook."""
@@ -61,7 +67,7 @@ def guide_page(path: str) -> Response:
         return Response(notebook, media_type="application/x-ipynb+json")
     if guides.is_folder(path):  # its links are relative
         return RedirectResponse(to_address(f"/guides/{path}/"))
-    return HtmlPage(pages.guide_page(path))
+    return HtmlPage(pages.guide_page(path or guides.INDEX))
 
 
 @router.get("/", **HIDDEN)

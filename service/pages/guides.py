@@ -177,8 +177,11 @@ def _name_anchor(heading: str) -> str:
 
 
 def _keep_inside(tokens: list[Token], path: str) -> None:
-    """Point links that leave the documentation to nothing: a server has no repository."""
+    """Show links that leave the documentation as their text: a server has no repository."""
+    leaves = False
     for token in tokens:
-        target = str(token.attrs.get("href", ""))
-        if normpath(join(dirname(path), target)).startswith(".."):
-            token.attrs["href"] = "#"
+        if token.type == "link_open":
+            target = str(token.attrs.get("href", ""))
+            leaves = normpath(join(dirname(path), target)).startswith("..")
+        if leaves and token.type in ("link_open", "link_close"):
+            token.type, token.content = "text", ""

@@ -133,13 +133,43 @@ def test_a_printed_page_has_every_figure_and_each_is_saved_as_an_image(
         "plots => plots.every(plot => plot.querySelector('.main-svg').clientWidth <= 720)"
     )
     page.emulate_media(media="print")
-    expect(page.locator("details.card pre", has_text='"parameters"')).to_be_visible()
+    expect(page.locator("details.request")).to_be_hidden()
     page.emulate_media(media="screen")
     page.evaluate("() => dispatchEvent(new Event('afterprint'))")
     for kind in ("SVG", "PNG"):
         with page.expect_download() as saved:
             page.get_by_role("button", name=f"Measured against identified as {kind}").click()
         assert saved.value.suggested_filename == f"response.{kind.lower()}"
+
+
+def test_what_the_menu_of_the_browser_prints_has_every_figure_within_the_sheet(
+    site: Site, page: Page
+) -> None:
+    page.emulate_media(color_scheme="light")
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    figures = page.locator("[data-figure]")
+    drawn = page.locator("[data-figure].js-plotly-plot")
+    expect(drawn).to_have_count(figures.count())  # without scrolling
+    page.evaluate(
+        "() => addEventListener('beforeprint', () => { window.widths = "
+        "[...document.querySelectorAll('.main-svg')].map(svg => svg.getBoundingClientRect().width)"
+        " })"
+    )
+    page.pdf(format="A4")
+    widths = page.evaluate("window.widths")
+    assert len(widths) >= figures.count()
+    assert max(widths) <= 720
+    page.wait_for_function("() => !document.body.classList.contains('printing')")
+
+
+def test_what_was_not_drawn_yet_is_fetched_before_the_page_is_printed(
+    site: Site, page: Page
+) -> None:
+    page.emulate_media(color_scheme="light")
+    page.goto(f"{site.url}/jobs/{site.filled.finished}", wait_until="domcontentloaded")
+    page.wait_for_function("() => window.Plotly")
+    with page.expect_request(re.compile("figures/waterfall"), timeout=1500):
+        page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
 
 
 def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:

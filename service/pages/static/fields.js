@@ -100,17 +100,21 @@ function writeFault(name, { detail, column }) {
   return `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? '' : '.'}`;
 }
 
-/** Mark the field of a fault, and write the fault below it. Return whether the form has a place for it. */
+/** Mark the fields of a fault, and write the fault below. Return whether the form has a place for it. */
 function markFault(form, fault) {
   const parts = (fault.pointer ?? '').split('/');
   for (; parts.length > 1; parts.pop()) {
     const pointer = parts.join('/');
-    const input = form.querySelector(`:is(input, select, textarea)[data-pointer="${CSS.escape(pointer)}"]`);
+    const inputs = [pointer, `${pointer}/lower`, `${pointer}/upper`].flatMap((path) => [
+      ...form.querySelectorAll(`:is(input, select, textarea)[data-pointer="${CSS.escape(path)}"]`),
+    ]);
     const place = form.querySelector(`[data-fault="/${CSS.escape(parts[1])}"]`);
-    if (input) input.ariaInvalid = 'true';
-    if ((input || parts.length === 2) && place) {
+    inputs.forEach((input) => (input.ariaInvalid = 'true'));
+    if ((inputs.length || parts.length === 2) && place) {
+      const [input] = inputs;
       const isEmpty = input ? input.value.trim() === '' : pointer === fault.pointer;
-      const text = (isEmpty && (input ?? place).dataset.missing) || writeFault(nameField(input, fault.pointer), fault);
+      const name = inputs.length > 1 ? '' : nameField(input, fault.pointer);
+      const text = (isEmpty && (input ?? place).dataset.missing) || writeFault(name, fault);
       place.textContent = [place.textContent, text].filter(Boolean).join(' ');
       return true;
     }

@@ -1,4 +1,4 @@
-// Draws the figures that the server defines. Only what is on the screen is fetched and drawn.
+// Draws the figures that the server defines: first what is on the screen, and the others once the browser is idle.
 
 import { Problem, ask, makeElement, post } from './live.js';
 
@@ -79,6 +79,13 @@ async function printAll() {
   window.print();
 }
 
+/** Fit what is drawn to the width of a sheet at once: the browser's own menu does not wait. */
+function fitToSheet() {
+  document.body.classList.add('printing');
+  for (const plot of document.querySelectorAll('.js-plotly-plot')) window.Plotly.relayout(plot, { autosize: true });
+  for (const plot of listPlots().filter((p) => !seen.has(p))) drawOnce(plot);
+}
+
 const fitPlots = () => Promise.all([...document.querySelectorAll('.js-plotly-plot')].map((plot) => window.Plotly.Plots.resize(plot)));
 
 /** Request the profiles of a run, and draw them. */
@@ -137,17 +144,37 @@ export const redraw = (names) =>
 const watcher = new IntersectionObserver(
   (entries) => {
     for (const { target, isIntersecting } of entries) {
-      if (!isIntersecting || seen.has(target)) continue;
-      seen.add(target);
-      watcher.unobserve(target);
-      draw(target);
+      if (isIntersecting && !seen.has(target)) drawOnce(target);
     }
   },
   { rootMargin: '300px' },
 );
 
-/** Draw every plot once it is on the screen, including plots added since. */
-export const watch = () => listPlots().filter((plot) => !seen.has(plot)).forEach((plot) => watcher.observe(plot));
+function drawOnce(plot) {
+  seen.add(plot);
+  watcher.unobserve(plot);
+  return draw(plot);
+}
+
+const REST_MS = 2000;
+const whenIdle = window.requestIdleCallback ?? ((work) => setTimeout(work, 200)); // Safari has none
+let restTimer = 0;
+
+/** Draw the plots that were never on the screen, one after the other. A printed page needs them. */
+async function drawRest() {
+  const plot = listPlots().find((p) => !seen.has(p));
+  if (!plot) return;
+  await drawOnce(plot);
+  whenIdle(drawRest);
+}
+
+/** Draw every plot once it is on the screen, and the others later, including plots added since. */
+export function watch() {
+  const waiting = listPlots().filter((plot) => !seen.has(plot));
+  waiting.forEach((plot) => watcher.observe(plot));
+  clearTimeout(restTimer);
+  if (waiting.length) restTimer = setTimeout(() => whenIdle(drawRest), REST_MS);
+}
 
 // The figure lists its experiments.
 document.addEventListener('drawn', ({ target, detail }) => {
@@ -167,6 +194,7 @@ addEventListener('keydown', (event) => {
   event.preventDefault(); // the browser would not wait for the plots
   printAll();
 });
+addEventListener('beforeprint', fitToSheet);
 addEventListener('afterprint', () => {
   document.body.classList.remove('printing');
   redraw().then(fitPlots);

@@ -93,6 +93,21 @@ def test_a_folder_has_one_address_where_its_links_lead_to_its_pages(client: Test
     assert guides.read_guide.cache_info().currsize == before  # nobody fills it
 
 
+@pytest.mark.parametrize("path", ["/guides", "/guides/"])
+def test_the_folder_of_all_pages_shows_their_contents(client: TestClient, path: str) -> None:
+    shown = client.get(path)
+    assert shown.status_code == 200
+    assert shown.url.path == "/guides/"  # its links are relative
+    assert shown.text == client.get("/guides/README.md").text
+
+
+def test_a_link_that_leaves_the_documentation_is_text(client: TestClient) -> None:
+    assert "](../SECURITY.md)" in (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    page = client.get("/guides/").text
+    assert "<li>What is defended, what is not, and how do I report a fault?</li>" in page
+    assert 'href="#"' not in page
+
+
 def test_pictures_come_with_their_type(client: TestClient) -> None:
     picture = client.get("/guides/tutorials/pictures/first_time_lag.png")
     assert picture.headers["Content-Type"] == "image/png"
@@ -103,7 +118,7 @@ def test_pictures_come_with_their_type(client: TestClient) -> None:
     "path",
     [
         *("nothing.md", "%2e%2e/README.md", "..%2fREADME.md", "%2fetc%2fpasswd", "site/conf.py"),
-        *("", "howto//", "/howto/", "tutorials/pictures/"),
+        *("howto//", "/howto/", "tutorials/pictures/"),
     ],
 )
 def test_only_the_documentation_is_shown(client: TestClient, path: str) -> None:
