@@ -91,6 +91,20 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     expect(page.get_by_label("population")).to_be_focused()
 
 
+def test_swapped_bounds_are_marked_both_and_told_once(site: Site, page: Page) -> None:
+    opened(site, page, f"?dataset={site.filled.dataset}")
+    write_own(page, EQUATIONS)
+    expect(page.locator("#check")).to_contain_text("the model is valid")
+    page.get_by_label("output y").select_option("P2")
+    bounds = [page.locator(f'[data-pointer="/parameters/T/{end}"]') for end in ("lower", "upper")]
+    for field, text in zip(bounds, ("3", "1"), strict=True):
+        field.fill(text)
+    page.get_by_role("button", name="Identify").click()
+    for field in bounds:
+        expect(field).to_have_attribute("aria-invalid", "true")
+    expect(page.locator('[data-fault="/parameters"]')).to_have_text(re.compile(r"^Parameter 'T'"))
+
+
 def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: Path) -> None:
     path = tmp_path / "step.csv"
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
