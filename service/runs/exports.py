@@ -78,6 +78,7 @@ def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
         {signal.name: _find_hold(signal.name, stored, rows) for signal in stored.model.inputs},
         stored.result.get("version") or stored.job.version or "",
         _describe_provenance(stored, rows),
+        dict(_find_units(stored, rows)),
     )
 
 
@@ -133,6 +134,14 @@ def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
     if not periods or None in periods or max(periods) - min(periods) > 1e-6 * min(periods):
         return None
     return float(periods[0])
+
+
+def _find_units(stored: StoredRun, rows: list[Dataset]) -> Iterator[tuple[str, str]]:
+    """Find the units of the recorded signals; those of several units are left out."""
+    for signal in stored.channels.by_signal:
+        units = {str(channel["unit"]) for channel in _find_channels(signal, stored, rows)}
+        if len(units) == 1:
+            yield signal, units.pop()
 
 
 def _find_hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:

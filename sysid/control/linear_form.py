@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sysid.core.errors import SysidError
 from sysid.core.text import plain_estimate, plain_unit
 from sysid.core.types import FloatArray
+from sysid.core.units import is_blank_unit
 from sysid.data.records import Hold
 from sysid.kernels.reads import is_difference
 from sysid.language.delays import has_varying_delay
@@ -26,7 +27,7 @@ from sysid.language.tree import (
     Unary,
     walk,
 )
-from sysid.models.model import Model
+from sysid.models.model import Model, ModelSignal, Output
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,8 @@ class IdentifiedModel:
         Version of the program that writes the text.
     provenance : mapping
         Run, data sets with their hashes, dates: JSON values, written unchanged.
+    units : mapping of str to str
+        Units of the recorded channels by signal, for signals without a unit in the model.
     """
 
     model: Model
@@ -75,6 +78,7 @@ class IdentifiedModel:
     holds: Mapping[str, Hold] = field(default_factory=dict)
     version: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         values = (
@@ -95,6 +99,11 @@ class IdentifiedModel:
     def get_hold(self, signal: str) -> Hold:
         """Get the behaviour of an input between its samples."""
         return self.holds.get(signal, "first")
+
+    def get_unit(self, signal: ModelSignal | Output) -> str:
+        """Get the unit of an input or output: the model's, else that of the recorded channel."""
+        blank = is_blank_unit(signal.unit)
+        return self.units.get(signal.name, signal.unit) if blank else signal.unit
 
 
 class NotLinear(SysidError, ValueError):

@@ -222,7 +222,10 @@ def _write_simulate_comment(program: GeneratedProgram) -> str:
         ("Input", program.input_names, model.inputs),
         ("Output", program.output_names, model.outputs),
     ):
-        lines += [f"{kind} {names[q.name]}: {q.name}, {describe_unit(q.unit)}." for q in signals]
+        lines += [
+            f"{kind} {names[q.name]}: {q.name}, {describe_unit(program.identified.get_unit(q))}."
+            for q in signals
+        ]
     lines += ["Returns 0; 1 if n, the times or a time lag cannot be used; 2 if memory is short."]
     comment = "\n".join(f" * {escape_c_comment(line)}" for line in lines)
     return f"/*\n{comment}\n */"

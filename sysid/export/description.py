@@ -7,7 +7,7 @@ document, its values and their provenance.
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 from typing import Any
 
@@ -44,9 +44,18 @@ def describe_model(identified: IdentifiedModel) -> list[str]:
     if identified.version:
         lines.append(f"Identified by lagid {identified.version}.")
     for key, value in identified.provenance.items():
-        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        lines.append(f"{key}: {text}")
+        lines.append(f"{key}: {_describe_origin(value)}")
     return [part for line in lines for part in textwrap.wrap(to_one_line(line), 94) or [""]]
+
+
+def _describe_origin(value: Any) -> str:
+    """Describe a JSON value of the provenance in words: ``name tube.csv, sha256 …``."""
+    if isinstance(value, Mapping):
+        pairs = ((key, entry) for key, entry in value.items() if entry is not None)
+        return ", ".join(f"{key} {_describe_origin(entry)}" for key, entry in pairs)
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "; ".join(map(_describe_origin, value))
+    return "none" if value is None else str(value)
 
 
 def _describe_hold(identified: IdentifiedModel, name: str) -> str:
@@ -127,6 +136,10 @@ def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
         "data": {
             "sample_time": identified.sample_time,
             "hold": {item.name: identified.get_hold(item.name) for item in identified.model.inputs},
+            "units": {
+                **{item.name: identified.get_unit(item) for item in identified.model.inputs},
+                **{item.name: identified.get_unit(item) for item in identified.model.outputs},
+            },
         },
         "provenance": dict(identified.provenance),
     }

@@ -18,6 +18,7 @@ from sysid.models.model import Model, name_initial_state
 from sysid.models.parse import keep_terms
 from sysid.models.ties import resolve_ties
 from sysid.results.result import Identification
+from sysid.simulation.data_bounds import find_signal_units
 
 ExportFormat = Literal["json", "python", "c", "control"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
@@ -76,17 +77,18 @@ def export_model(
     >>> "tf(" in export_model(load_model("fopdt"), values, "control")
     True
     """
-    holds = dict(hold or {})
+    holds, units = dict(hold or {}), {}
     if isinstance(result, Identification):
         if model.rule is not None and result.selection:
             model = keep_terms(model, [term.term for term in result.selection])
         input_names = {signal.name for signal in model.inputs}
         holds = {**{k: v for k, v in result.holds.items() if k in input_names}, **holds}
         sample_time = result.sample_time if sample_time is None else sample_time
+        units = {} if result.data is None else find_signal_units(result.data.records)
     values, covariance = _collect_values(model, result)
     _check_options(model, values, sample_time, holds)
     identified = IdentifiedModel(
-        model, values, covariance, sample_time, holds, version, dict(provenance or {})
+        model, values, covariance, sample_time, holds, version, dict(provenance or {}), units
     )
     return write_export(identified, format, pade_order)
 

@@ -67,8 +67,8 @@ def to_one_line(text: str) -> str:
 
 
 def escape_docstring(text: str) -> str:
-    """Escape a line of a docstring, so that backslashes and quotes cannot end it."""
-    return to_one_line(text).replace("\\", "\\\\").replace('"', '\\"')
+    """Escape a line of a docstring in three quotes, so that its text cannot end it."""
+    return to_one_line(text).replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
 
 
 def escape_c_comment(text: str) -> str:

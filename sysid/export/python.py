@@ -190,19 +190,22 @@ def _write_function_docstring(program: GeneratedProgram) -> list[str]:
         "    Times in s, one sampling period apart.",
     ]
     for signal in model.inputs:
-        lines += _describe_signal(program.input_names[signal.name], "Input", signal)
+        lines += _describe_signal(program, program.input_names[signal.name], "Input", signal)
     for name, line in describe_values(
         program.identified, program.parameter_names, program.start_names
     ):
         lines += [f"{name} : float", f"    {line}"]
     lines += ["", "Returns", "-------"]
     for output in model.outputs:
-        lines += _describe_signal(program.output_names[output.name], "Output", output)
+        lines += _describe_signal(program, program.output_names[output.name], "Output", output)
     return [lines[0], *map(_escape_line, lines[1:]), '"""']
 
 
-def _describe_signal(identifier: str, kind: str, signal: ModelSignal | Output) -> list[str]:
-    about = f"    {kind} {signal.name}, {describe_unit(signal.unit)}."
+def _describe_signal(
+    program: GeneratedProgram, identifier: str, kind: str, signal: ModelSignal | Output
+) -> list[str]:
+    unit = describe_unit(program.identified.get_unit(signal))
+    about = f"    {kind} {signal.name}, {unit}."
     return [f"{identifier} : array (N,)", about]
 
 

@@ -98,6 +98,13 @@ def _choose_unit(parameter: Parameter, output: str | None, driven: str | None) -
     return output
 
 
+def find_signal_units(records: Sequence[Record]) -> dict[str, str]:
+    """Find the units of the recorded signals by name; those of several units are left out."""
+    channels = [c for record in records for c in (*record.inputs, *record.outputs)]
+    units = {c.name: _find_common_unit(d for d in channels if d.name == c.name) for c in channels}
+    return {name: unit for name, unit in units.items() if unit is not None}
+
+
 def _find_common_unit(channels: Iterable[Channel]) -> str | None:
     """Find the unit that channels share; None if they have none, or several."""
     units = {channel.unit for channel in channels if not is_blank_unit(channel.unit)}

@@ -1,6 +1,7 @@
 """The identified model of a run as JSON, Python, C and python-control: REST, clients, commands."""
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -56,7 +57,7 @@ class Served(NamedTuple):
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     app = create_app(settings_of(tmp_path_factory.mktemp("exports")))
     with TestClient(app) as server:
-        data = store_csv(server, recording())
+        data = store_csv(server, recording(columns=("u [V]", "y [degC]")))
         parts = parts_of(server)
         body = {
             "model": "fopdt",
@@ -98,7 +99,11 @@ def test_the_document_tells_estimates_and_where_they_come_from(served: Served) -
     expected = np.array(correlation["matrix"]) * np.outer(deviations, deviations)
     np.testing.assert_allclose(document["covariance"]["matrix"], expected)
     assert document["model"]["name"] == "fopdt"
-    assert document["data"] == {"sample_time": pytest.approx(0.1), "hold": {"u": "zero"}}
+    assert document["data"] == {
+        "sample_time": pytest.approx(0.1),
+        "hold": {"u": "zero"},
+        "units": {"u": "V", "y": "degC"},
+    }
     origin = document["provenance"]
     stored = served.server.get(f"/v1/datasets/{served.dataset}").json()
     assert origin["run"] == served.run
@@ -106,6 +111,18 @@ def test_the_document_tells_estimates_and_where_they_come_from(served: Served) -
     assert origin["datasets"] == [
         {"id": served.dataset, "name": "steps", "sha256": stored["sha256"]}
     ]
+
+
+@pytest.mark.parametrize("format", ["python", "c"])
+def test_a_program_tells_the_units_of_the_recording_and_its_origin_in_words(
+    served: Served, format: str
+) -> None:
+    text = export(served, served.run, format=format).text
+    assert re.search(r"\bu, V\.$", text, re.M)
+    assert re.search(r"\by, degC\.$", text, re.M)
+    words = re.sub(r"\s(\* )?", " ", text)
+    assert f"datasets: id {served.dataset}, name steps, sha256 " in words
+    assert '\\"' not in text
 
 
 @pytest.mark.parametrize("which", ["run", "polynomial"])

@@ -381,6 +381,8 @@ def test_the_document_has_all_that_is_needed_to_simulate_again() -> None:
     assert values == {**case.values, "p": 2 * case.values["n"]}
     assert units["lambda"] == "s"
     assert units["int(0)"] == "m"
+    units = document["data"].pop("units")
+    assert units == {"i": "N", "q": "N", "int": "1", "step": "1"}
     assert document["data"] == {"sample_time": 0.05, "hold": {"i": "zero", "q": "first"}}
     times, inputs = excitation(model, case)
     for one, other in zip(
@@ -399,7 +401,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, times.size)
     y = simulated(model, truth, times, {"u": u}, "zero")[0] + noise
     record = sysid.Record(
-        (sysid.Channel("u", times, u, hold="zero"),), (sysid.Channel("y", times, y),)
+        (sysid.Channel("u", times, u, "V", hold="zero"),), (sysid.Channel("y", times, y, "bar"),)
     )
     small = sysid.GeneticAlgorithm(population=16, generations=20, islands=1)
     found = sysid.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
@@ -410,7 +412,11 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     for name, variance in variances.items():
         assert stderr[name] ** 2 == pytest.approx(variance)
     assert document["provenance"] == {"made": "here"}
-    assert document["data"] == {"sample_time": pytest.approx(0.05), "hold": {"u": "zero"}}
+    assert document["data"] == {
+        "sample_time": pytest.approx(0.05),
+        "hold": {"u": "zero"},
+        "units": {"u": "V", "y": "bar"},
+    }
     text = sysid.export_model(model, found, "python")  # held as the data of the result were
     assert f"standard error {stderr['T']:.3g}" in text
     # The tube starts where it was measured, so that is to be given.
