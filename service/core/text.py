@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 from typing import Any
 
-from sysid.core.text import DASH, format_number, format_unit, plain_unit
+from sysid.core.text import DASH, format_criterion, format_number, format_unit, plain_unit
 from sysid.core.units import is_known_unit
 
 _THIN_SPACE = "\u202f"  # narrow no-break space: groups digits and joins a number to its unit
@@ -129,6 +129,7 @@ def unescape_formula(text: str) -> str:
 
 TEMPLATE_FILTERS = {
     "number": format_number,
+    "criterion": format_criterion,
     "unit": format_unit,
     "count": format_count,
     "duration": format_duration,

@@ -4,7 +4,7 @@ from typing import Any
 
 from service.core.text import name_label
 from service.trends.schemas import LawOut, LawPointOut, PointOut, QuantityOut, TrendOut
-from sysid.core.text import append_unit
+from sysid.core.text import append_unit, format_number
 from sysid.figures import theme
 from sysid.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
 from sysid.figures.plotly import Figure, base_layout, to_json_numbers
@@ -27,11 +27,7 @@ def plot_trend(trend: TrendOut, columns: int = 2) -> Figure:
     Each plot has the chosen law as a line in its confidence band, and the other law dotted.
     Predictions are diamonds with their intervals. Rings mark outliers and drifted estimates.
     """
-    shown = [
-        quantity
-        for quantity in trend.quantities
-        if any(p.value is not None for p in quantity.points)
-    ]
+    shown = _list_drawn(trend)
     grid = wide_grid(len(shown), columns)
     figure: Figure = {
         "data": [],
@@ -49,9 +45,19 @@ def plot_trend(trend: TrendOut, columns: int = 2) -> Figure:
     return figure
 
 
-def trend_height(n_quantities: int, columns: int = 2) -> int:
+def trend_height(trend: TrendOut, columns: int = 2) -> int:
     """Compute the height (px) of the figure, so that a page can reserve its room."""
-    return wide_grid(n_quantities, columns).height(WIDE_MARGIN)
+    return wide_grid(max(len(_list_drawn(trend)), 1), columns).height(WIDE_MARGIN)
+
+
+def _list_drawn(trend: TrendOut) -> list[QuantityOut]:
+    """List the quantities with a value; an onset delay only if it has a law."""
+    return [
+        quantity
+        for quantity in trend.quantities
+        if quantity.laws
+        or (quantity.kind == "parameter" and any(p.value is not None for p in quantity.points))
+    ]
 
 
 def _add_axes(
@@ -70,20 +76,20 @@ def _add_axes(
         },
         {"nticks": 6, "title": {"text": append_unit(quantity.name, quantity.unit), "font": small}},
     )
-    add_caption(figure, _law_caption(quantity), domain)
+    add_caption(figure, _law_caption(quantity, x), domain)
     return axis_names
 
 
-def _law_caption(quantity: QuantityOut) -> str:
+def _law_caption(quantity: QuantityOut, x: str) -> str:
     chosen = next((law for law in quantity.laws if law.is_chosen), None)
     if chosen is None:
         return f"<b>{quantity.name}</b>: no law"
-    return f"<b>{quantity.name}</b> = {_law_formula(chosen)}"
+    return f"<b>{quantity.name}</b> = {_law_formula(chosen, x)}"
 
 
-def _law_formula(law: LawOut) -> str:
-    a, b = (f"{coefficient.value:.4g}".replace("-", "−") for coefficient in law.coefficients)
-    return f"{a} + {b}·x".replace("+ −", "− ") if law.law == "line" else f"{a}·x<sup>{b}</sup>"
+def _law_formula(law: LawOut, x: str) -> str:
+    a, b = (format_number(coefficient.value) for coefficient in law.coefficients)
+    return f"{a} + {b}·{x}".replace("+ −", "− ") if law.law == "line" else f"{a}·{x}<sup>{b}</sup>"
 
 
 def _quantity_traces(quantity: QuantityOut) -> list[dict[str, Any]]:

@@ -44,6 +44,7 @@ PEEK_CELLS = 40_000
 MAX_FOOTER_ROWS = 20
 """Most rows of words below the data, such as mean values; more are faults."""
 _MAX_UNIT_CHARACTERS = 12
+_MAX_LISTED = 8  # columns named in a message
 
 _UNIT_FIELD = re.compile(r"^(\[.*\]|\(.*\))$")
 
@@ -320,6 +321,8 @@ def _choose_block(blocks: Sequence[_DataBlock], lines: Sequence[str]) -> _DataBl
 def _build_layout(
     block: _DataBlock, segments: Sequence[str], sample_time: float | None, max_channels: int
 ) -> TableLayout:
+    if not block.data:
+        raise _build_no_table_error(block)
     header, units, names = _find_header(block)
     cells = [row.fields for row in block.data]
     names, cells = _align_header(names, cells)
@@ -351,8 +354,6 @@ def classify_cells(cells: Sequence[str], name: str) -> CellKind:
 def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
     """Find the header before the data, the row of units below it, and the names."""
     rows = [row for row in block.before if not is_comment(row.fields)]
-    if not block.data:
-        rows = rows[:1] or block.before[:1]
     fit = [row for row in rows if abs(len(row.fields) - block.width) <= 1] or rows[-1:]
     same = [row for row in fit if len(row.fields) == block.width] or fit
     if same:
@@ -366,8 +367,6 @@ def _find_header(block: _DataBlock) -> tuple[_Row, list[str], list[str]]:
         names = _split_comment(row.fields, block)
         if len(names) == block.width and not all(map(_is_number, names)):
             return row, [], names
-    if not block.data:
-        raise UnreadableFile("there are no rows below the header")
     first = block.data[0]
     if block.width == 1:
         raise _build_narrow_error(first.fields[0])
@@ -393,6 +392,16 @@ def _check_widths(rows: Sequence[_Row], last: _Row, width: int) -> None:
 def _build_header_error(row: int | None) -> UnreadableFile:
     return UnreadableFile(
         "the first row holds numbers; need a header that names the columns, such as t,u,y", row=row
+    )
+
+
+def _build_no_table_error(block: _DataBlock) -> UnreadableFile:
+    """Return the error of a file without a row of numbers: a lone header, or no table."""
+    rows = [row for row in block.before if not is_comment(row.fields)]
+    if len(rows) < 2 and any(len(row.fields) > 1 for row in rows):
+        return UnreadableFile("there are no rows below the header")
+    return UnreadableFile(
+        "this is not a table: no row has numbers. Need a header and rows of numbers, such as t,u,y"
     )
 
 
@@ -537,12 +546,14 @@ def _check_names(columns: Sequence[TableColumn], row: int | None) -> None:
 
 
 def _list_columns(columns: Sequence[TableColumn]) -> str:
-    """List the columns of a table in which none is a time, as a part of a sentence."""
-    names = ", ".join(one.name for one in columns if one.name and one.role != "label")
+    """List the columns of a table in which none is a time, as the end of a sentence."""
+    found = [one.name for one in columns if one.name and one.role != "label"]
+    more = len(found) - _MAX_LISTED
+    names = ", ".join(found[:_MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
     if labels := ", ".join(one.name for one in columns if one.role == "label"):
-        names += f", and {labels} as labels of segments"
+        names += f", and {labels} as labels of segments, one measurement each"
     counts = next((one.name for one in columns if one.kind == "count"), "")
-    return f"{names}." + (f" Column {counts!r} only counts rows." if counts else "")
+    return f"{names.rstrip('.')}." + (f" Column {counts!r} only counts rows." if counts else "")
 
 
 def _assign_time(

@@ -233,7 +233,10 @@ def _build_segments(
         {label: column[first] for label, column in values.items()} for first in starts
     ]
     axis, spans = concatenate_segments(times, starts, segment_labels)
-    notes.append(f"{len(spans)} segments follow each other on one time axis")
+    notes.append(
+        f"{', '.join(labels)} divide the file into {len(spans)} segments, one measurement each. "
+        "They follow each other on one time axis"
+    )
     return axis, spans
 
 
@@ -267,12 +270,13 @@ def _check_increasing(times: FloatArray, starts: IntArray, table: Table, time: T
         return
     before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
     what = "repeats" if before == after else "decreases"
-    hint = "For repeated measurements, "
-    advice = Advice("name their label columns with ", "segments", ".")
+    hint = "If the file has several measurements, "
+    advice = Advice("name the columns that number them with ", "segments", ".")
     if is_stamp:
         hint, advice = "If the stamps are too coarse, ", GIVE_PERIOD
     elif before == after:
-        hint += "give their label columns as segments. If it is no real time, remove it and "
+        hint += "give the columns that number them as segments. "
+        hint += "If it is no real time, remove it and "
         advice = GIVE_PERIOD
     raise UnreadableFile(
         f"the time {what}: {before!r} s is followed by {after!r} s. Times must increase from "

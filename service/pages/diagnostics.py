@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sysid.core.text import (
     DASH,
+    format_criterion,
     format_estimate,
     format_number,
     format_p_value,
@@ -56,14 +57,14 @@ class SelectedTermView:
 
 @dataclass(frozen=True, slots=True)
 class OrderView:
-    """One order of a process as a row of a table."""
+    """One order of a process as a row of a table; BIC is less the lowest of all orders."""
 
     model: str
     order: int
     delay: str
     delay_text: str
-    bic: float
-    verdict: str
+    bic_text: str
+    evidence: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,19 +121,19 @@ def _list_orders(comparison: Document | None) -> list[OrderView]:
     """List the orders of a process; none if they were not compared."""
     if not comparison:
         return []
-    unit = plain_unit(comparison["unit"])
+    unit, lowest = plain_unit(comparison["unit"]), min(fit["bic"] for fit in comparison["fits"])
     return [
         OrderView(
             fit["model"],
             fit["order"],
             comparison["delay"],
             join_estimate(fit["delay"], fit["delay_stderr"]) + unit,
-            fit["bic"],
+            format_criterion(fit["bic"] - lowest),
             "preferred"
             if fit["model"] == comparison["preferred_model"]
             else "possible"
             if fit["is_open"]
-            else "ruled out",
+            else "strong evidence against",
         )
         for fit in comparison["fits"]
     ]
@@ -172,6 +173,7 @@ def _to_onset_view(onset: Document, several: bool) -> OnsetView:
     if onset["delay"] is None:
         return OnsetView(pair, "", onset.get("reason") or "")
     value, spread = format_estimate(onset["delay"], onset.get("spread"))
+    value = value if spread else format_number(onset["delay"])
     steps = "one step" if onset["events"] == 1 else f"{onset['events']} steps"
     scatter = f", spread {spread}\u202fs" if spread else ""
     return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")

@@ -100,7 +100,7 @@ def to_trend_view(trend: TrendOut) -> TrendView:
         reference_text=format_reference(document),
         suggested_run=_suggest_run(trend),
         suggested_name=next(iter(trend.reference_names), ""),
-        height=trend_height(max(len(tables.headings), 1)),
+        height=trend_height(trend),
     )
 
 

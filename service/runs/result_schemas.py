@@ -232,7 +232,9 @@ class OrderFitOut(Answer):
     values: dict[str, Finite] = Field(description="all parameters of that model, in their units")
     rms: Finite = Field(description="RMS error, in the unit of `rms`")
     bic: Finite = Field(description="Schwarz's criterion; smaller is better")
-    is_open: bool = Field(description="whether its BIC is within 6 of the lowest: not ruled out")
+    is_open: bool = Field(
+        description="whether its BIC is within 6 of the lowest: no strong evidence against it"
+    )
 
 
 class OrderComparisonOut(Answer):
@@ -240,12 +242,12 @@ class OrderComparisonOut(Answer):
 
     model: str = Field(description="the catalogue's name of the model's own order")
     preferred_model: str | None = Field(
-        description="the one order that is not ruled out; null if there are several"
+        description="the one order that is open; null if there are several"
     )
     delay: str = Field(description="the parameter that is the dead time")
     unit: str = Field(description="unit of the dead times")
     delay_range: list[float] = Field(
-        description="smallest and largest dead time of the orders that are not ruled out, in `unit`"
+        description="smallest and largest dead time of the open orders, in `unit`"
     )
     noise_model: str = Field(description="noise model of the criteria: white or ar1")
     fits: list[OrderFitOut] = Field(description="the orders, the lowest first")

@@ -56,7 +56,8 @@ def _describe_points(quantity: TrendQuantity, fitted: Trend) -> Iterator[str]:
         yield f"the laws leave out the outlier at {outliers}"
     without = [f"{point.x:g}" for point in quantity.points if point.estimate is None]
     if without:
-        yield f"no standard error at {', '.join(without)}, so the laws leave it out"
+        why = "; an onset delay has one from two steps on" if quantity.kind == "onset delay" else ""
+        yield f"no standard error at {', '.join(without)}, so the laws leave it out{why}"
     if quantity.between_runs is not None and quantity.between_runs > 1:
         yield (
             f"runs of one label differ by {quantity.between_runs:.2g} times their standard errors. "

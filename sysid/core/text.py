@@ -81,6 +81,13 @@ def format_interval(ends: Sequence[float] | None, stderr: float | None, *, statu
     return f"{low} … {high}"
 
 
+def format_criterion(value: float | None) -> str:
+    """Format AIC or BIC to one decimal: less of a difference says nothing."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value:.1f}".replace("-", "−")
+
+
 def format_p_value(p: float | None) -> str:
     """Format the p value of a test."""
     if p is None:

@@ -12,8 +12,8 @@ the estimate. A dead time that grows by the time constant that is left out keeps
 The criterion is Schwarz's (BIC, 1978). If the residuals of the highest order are not white, or the
 estimate has a noise model, each order has first-order noise of its own, with the correlation time
 of its largest likelihood. An order is preferred if its BIC is 6 lower than that of every other:
-odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are not
-ruled out, and the dead time lies in the range of theirs.
+odds of 20 to 1 (Kass and Raftery 1995: strong evidence). Orders within 6 of the lowest are open,
+and the dead time lies in the range of theirs.
 """
 
 from collections.abc import Callable, Sequence

@@ -324,12 +324,13 @@ def _warn_correlations(
                     else f", {alike:.3f} if the residuals were white"
                 )
                 messages.append(
-                    f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix only a "
-                    "combination of them. The time lag is less than two of its standard errors."
+                    f"{first} and {second} not separable (correlation {r:.3f}{plain}): the data "
+                    "fix only a combination of them. The time lag is less than two of its "
+                    "standard errors."
                 )
             elif abs(r) > _STRONG_CORRELATION:
                 messages.append(
-                    f"{first} and {second} are strongly correlated (r = {r:.3f}): "
+                    f"{first} and {second} have the correlation {r:.3f}: "
                     "the data fix a combination of them better than each alone"
                 )
     return messages

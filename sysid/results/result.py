@@ -182,19 +182,19 @@ class OrderComparison:
 
     @property
     def open_fits(self) -> tuple[OrderFit, ...]:
-        """The orders that the data do not rule out: BIC within 6 of the lowest."""
+        """The orders without strong evidence against them: BIC within 6 of the lowest."""
         limit = min(fit.bic for fit in self.fits) + STRONG_EVIDENCE
         return tuple(fit for fit in self.fits if fit.bic <= limit)
 
     @property
     def preferred_model(self) -> str | None:
-        """The one order that is not ruled out; None if there are several."""
+        """The one order that is open; None if there are several."""
         fits = self.open_fits
         return fits[0].model if len(fits) == 1 else None
 
     @property
     def delay_range(self) -> tuple[float, float]:
-        """Smallest and largest dead time (s) of the orders that are not ruled out."""
+        """Smallest and largest dead time (s) of the open orders."""
         delays = [fit.delay for fit in self.open_fits]
         return min(delays), max(delays)
 

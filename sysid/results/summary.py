@@ -134,7 +134,7 @@ def describe_search(evidence: SearchEvidence) -> str:
 def describe_order(comparison: OrderComparison) -> str:
     """Say which order the data prefer, and the dead time with those that matter.
 
-    These are the model's own and all that are not ruled out.
+    These are the model's own and all that are open.
     """
     unit, open_fits = plain_unit(comparison.unit), comparison.open_fits
     listed = [fit for fit in comparison.fits if fit.model == comparison.model or fit in open_fits]

@@ -137,9 +137,10 @@ def fit_trend(
     labels, values, errors = (np.asarray(array, dtype=np.float64) for array in (x, y, stderr))
     distinct = np.unique(labels).size
     if distinct < MIN_DISTINCT_X:
+        found = f"{distinct or 'no'} {'value' if distinct == 1 else 'values'} of x"
         return Trend(
-            reason=f"found {distinct} different {'value' if distinct == 1 else 'values'} of x "
-            f"with a standard error; a law with errors needs {MIN_DISTINCT_X} or more"
+            reason=f"there {'is' if distinct == 1 else 'are'} {found} with a standard error. "
+            f"A law needs {MIN_DISTINCT_X} or more"
         )
     with np.errstate(all="ignore"):  # an overflow of doubles gives no law
         fit = _fit_laws(labels, values, errors, outliers)

@@ -82,7 +82,9 @@ def test_a_run_says_which_order_of_the_process_the_data_prefer(served: ServedRun
     assert compared["delay_range"] == [compared["fits"][0]["delay"]] * 2
     page = served.server.get(f"/runs/{served.run}").text
     assert '<table class="orders ' in page
-    assert "ruled out" in page
+    assert "strong evidence against" in page
+    lowest, other = sorted(fit["bic"] for fit in compared["fits"])
+    assert f'data-label="BIC − lowest BIC">{other - lowest:.1f}</td>' in page
 
 
 def test_a_sweep_compares_orders_on_request_only(served: ServedRun) -> None:

@@ -293,6 +293,9 @@ def test_the_report_holds_tests_and_figures(served: Served) -> None:
     text = served.server.get(f"/v1/jobs/{job}/report").text
     assert "Correlation of the residuals: validation 1" in text
     assert "Onset delay, y behind u" in text
+    assert "A dead time should not be longer." in text
+    assert text.index("<dt>BIC</dt>") < text.index("<dt>Onset delay")
+    assert re.search(r"<dt>BIC</dt><dd>−?\d+\.\d</dd>", text)
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_an_input_that_is_constant_in_one_record_only_is_not_told() -> None:
 def test_of_parameters_without_a_standard_error_only_their_groups_are_told() -> None:
     found = identify(FOPDT, driven("u", 0.0 * TIMES + 2.0, 3.0 + noise()))
     assert told(found, "input 'u' is constant, so it excites nothing")
-    assert not told(found, "correlated")
+    assert not told(found, "correlation")
 
 
 @pytest.mark.parametrize(("sd", "vague"), [(0.01, False), (2.0, True)])
@@ -97,6 +97,9 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     turned = replace(found.uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
     [ridge] = _warn_correlations(turned, found.estimates, {"L"})
     r = found.uncertainty.sensitivity_correlation[0, 1]
-    assert f"not separable (r = 0.500, {r:.3f} if the residuals were white)" in ridge
+    assert f"not separable (correlation 0.500, {r:.3f} if the residuals were white)" in ridge
     apart = replace(turned, sensitivity_correlation=turned.correlation)
     assert _warn_correlations(apart, found.estimates, {"L"}) == []
+    strong = replace(turned, correlation=np.array([[1.0, 0.98], [0.98, 1.0]]))
+    [text] = _warn_correlations(strong, found.estimates, set())
+    assert text.startswith("T and L have the correlation 0.980: ")  # `r` is a parameter of sopdt

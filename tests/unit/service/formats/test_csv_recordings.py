@@ -190,6 +190,10 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("1\n2\n", "only one column"),
         ("t,u\n", "no rows"),
         ("t,u\n\n\n", "no rows"),
+        ("A letter about the plant.\n\nIt has words, and a comma.\n", "this is not a table"),
+        ("# Title\n\nIt has 12 words; and 5 more.\n- one, two\n", "this is not a table"),
+        ("a,u.\n0,1\n", "found a, u. Name one of them"),
+        ("a b c d e f g h i j\n0 1 2 3 4 5 6 7 8 9\n", "a, b, c, d, e, f, g, h and 2 more. Name"),
         ("1,2\n3,4\n", "header"),
         ("a,u\n0,1\n", "no time column"),
         ("t,\n0,1\n", "has no name"),
@@ -302,7 +306,7 @@ def test_more_signals_than_the_limit_are_refused_before_anything_below_the_heade
         ("a,b,c,d", {"sample_time": 1.0}),
         ("t,run,a,b,c,d", {"segments": ["run"]}),
     ):
-        error = refused(f"{header}\nthis is no row\n", limits=limits, **options)
+        error = refused(f"{header}\n0,this is no row\n", limits=limits, **options)
         assert error.row == 1
         assert f"the header has {header.count(',') + 1} columns; at most 3 signals" in str(error)
     assert len(read_csv(b"t,a,b,c\n0,1,2,3\n", limits=limits)[0].channels) == 3

@@ -623,7 +623,10 @@ def test_a_temperature_called_t_is_the_time_with_a_note_and_never_beside_a_perio
     assert notes == ()
     with pytest.raises(UnreadableFile, match=r"there is no time column; found T, u\."):
         read_rows(["T [°C],u", *rows[1:]])
-    with pytest.raises(UnreadableFile, match=r"column; found u, and T as labels of segments\."):
+    with pytest.raises(
+        UnreadableFile,
+        match=r"column; found u, and T as labels of segments, one measurement each\.",
+    ):
         read_rows(rows, segments=["T"])
     assert read_rows(["T [ms],u", *rows[1:]])[0].names == ("u",)
     arrays = write_npz(T=20 + TIMES, u=INPUT, Ts=0.5)
