@@ -1148,13 +1148,13 @@ class OrderComparisonDocument(TypedDict):
     model: str
     """the catalogue's name of the model's own order"""
     preferred_model: str | None
-    """the one order that is not ruled out; null if there are several"""
+    """the one order that is open; null if there are several"""
     delay: str
     """the parameter that is the dead time"""
     unit: str
     """unit of the dead times"""
     delay_range: list[float]
-    """smallest and largest dead time of the orders that are not ruled out, in `unit`"""
+    """smallest and largest dead time of the open orders, in `unit`"""
     noise_model: str
     """noise model of the criteria: white or ar1"""
     fits: list[OrderFitDocument]
@@ -1179,7 +1179,7 @@ class OrderFitDocument(TypedDict):
     bic: float | None
     """Schwarz's criterion; smaller is better"""
     is_open: bool
-    """whether its BIC is within 6 of the lowest: not ruled out"""
+    """whether its BIC is within 6 of the lowest: no strong evidence against it"""
 
 
 class OutcomeDocument(TypedDict):

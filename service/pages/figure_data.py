@@ -22,6 +22,7 @@ from service.storage.errors import ObjectMissing, RowNotFound
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
+from sysid.core.text import find_shown_error
 from sysid.figures.data import (
     CornerParameter,
     ExperimentTraces,
@@ -173,7 +174,7 @@ def _to_estimated_parameter(
         estimate["upper"],
         scales.get(estimate["name"], "linear"),
         value=estimate["value"],
-        stderr=None if estimate["status"] == "not settled" else estimate.get("stderr"),
+        stderr=find_shown_error(estimate.get("stderr"), estimate["status"]),
     )
 
 

@@ -18,6 +18,7 @@ from service.pages.views import format_cell
 from service.repositories.results import ResultRow, list_results
 from service.repositories.search import ListFilter
 from service.storage.statements import RowPage
+from sysid.core.text import find_shown_error
 from sysid.figures.plotly import Figure, empty_figure
 
 _Entry = tuple[ResultRow, Mapping[str, Any]]
@@ -132,7 +133,7 @@ def load_results_figure(session: Session, choice: ResultChoice) -> Figure:
         ResultPoint(
             x=x,
             value=one["value"],
-            stderr=None if one["status"] == "not settled" else one["stderr"],
+            stderr=find_shown_error(one["stderr"], one["status"]),
             group=find_model_name(row.job.spec),
             text=f"{row.job.name}, run {row.number + 1}",
         )
@@ -161,7 +162,7 @@ def _list_fields(row: ResultRow, one: Mapping[str, Any]) -> tuple[object, ...]:
         _describe_place(row),
         one["name"],
         one["value"],
-        one["stderr"],
+        find_shown_error(one["stderr"], one["status"]),
         low,
         high,
         one["unit"],

@@ -12,7 +12,7 @@ from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
 from service.sweeps.job_summary import load_summary
-from sysid.core.text import append_unit
+from sysid.core.text import append_unit, find_shown_error
 
 RUNS_PER_PART = 500
 COLUMNS = (
@@ -113,9 +113,16 @@ def _build_row(run: Run, layout: _TableLayout) -> list[Any]:
         *(getattr(run, name) for name in COLUMNS[3:]),
         *(_to_csv_value(run.cell.get(path)) for path in layout.paths),
         *(_to_csv_value(run.labels.get(name)) for name in layout.labels),
-        *(estimate.get(what) for estimate in cells for what in ("value", "stderr")),
+        *(number for estimate in cells for number in _list_numbers(estimate)),
         *(statuses.get(name) for name in layout.parameter_names),
     ]
+
+
+def _list_numbers(estimate: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """List value and standard error of an estimate; nothing if the run has none."""
+    if not estimate:
+        return None, None
+    return estimate["value"], find_shown_error(estimate["stderr"], estimate["status"])
 
 
 def _get_estimates(run: Run) -> list[dict[str, Any]]:

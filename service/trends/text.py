@@ -10,6 +10,7 @@ from service.core.text import format_count
 from sysid.core.text import (
     DASH,
     append_unit,
+    find_shown_error,
     format_number,
     format_unit,
     join_estimate,
@@ -124,7 +125,9 @@ def _label_row(
     return PlaceRow(
         x_text=style.label(label_runs["x"]),
         cells=[
-            DASH if p is None or p["value"] is None else style.estimate(p["value"], p["stderr"])
+            DASH
+            if p is None or p["value"] is None
+            else style.estimate(p["value"], find_shown_error(p["stderr"], p["status"]))
             for p in points
         ],
         span_text="; ".join(map(format_span, label_runs["spans"])) or DASH,

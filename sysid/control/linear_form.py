@@ -82,7 +82,8 @@ class IdentifiedModel:
 
     def __repr__(self) -> str:
         values = (
-            f"  {value.name} = {plain_estimate(value.value, value.stderr)}{plain_unit(value.unit)}"
+            f"  {value.name} = {plain_estimate(value.value, value.stderr, status=value.status)}"
+            f"{plain_unit(value.unit)}"
             for value in self.values
         )
         return "\n".join([f"Identified model {self.model.name!r}", *values])

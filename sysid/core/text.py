@@ -16,7 +16,8 @@ _SETTING = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
 
 Text after "the model" is excluded: it names a field of the model document, which no option sets.
 """
-_AT_BOUND, _UNSETTLED = "at bound", "not settled"  # statuses of an estimate
+_AT_BOUND = "at bound"
+_WITHOUT_ERROR = (_AT_BOUND, "not settled")  # statuses of an estimate
 _THIN_SPACE = "\u202f"  # narrow no-break space: joins a number to its unit
 
 
@@ -35,19 +36,28 @@ def format_number(value: float | None, digits: int = 4) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
+def find_shown_error(stderr: float | None, status: str) -> float | None:
+    """Find the standard error that is shown with an estimate.
+
+    An estimate at its bound has none, since its errors are not symmetric there. One of a search
+    that did not settle has none either: its distance from the optimum is unknown.
+    """
+    return None if status in _WITHOUT_ERROR else stderr
+
+
 def format_estimate(value: float, stderr: float | None, *, status: str = "") -> tuple[str, str]:
     """Format an estimate and its standard error, both to the error's second significant digit.
 
-    A value "at bound" is not rounded to its error. One of a search that did not settle has no
-    error: its distance from the optimum is unknown.
+    The error is empty where `find_shown_error` finds none.
     """
-    if not _is_positive(stderr) or status == _UNSETTLED:
+    if status == _AT_BOUND:
+        return f"{value:.6g}".replace("-", "−"), ""
+    stderr = find_shown_error(stderr, status)
+    if not _is_positive(stderr):
         return format_number(value, 6), ""
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return format_number(value, 6), format_number(stderr, 2)
-    if status == _AT_BOUND:
-        return f"{value:.6g}".replace("-", "−"), f"{stderr:.{decimals}f}"
     rounded = [f"{v:.{decimals}f}".replace("-", "−") for v in (value, stderr)]
     return rounded[0], rounded[1]
 
@@ -58,24 +68,19 @@ def join_estimate(value: float, stderr: float | None, *, status: str = "") -> st
 
 
 def plain_estimate(value: float, stderr: float | None, *, status: str = "") -> str:
-    """Format an estimate and its error for terminals and notes, readable by programs.
-
-    A value "at bound" is not rounded to its error, which may be far larger. One of a search that
-    did not settle has no error.
-    """
-    if not _is_positive(stderr) or status == _UNSETTLED:
+    """Format an estimate and its error for terminals and notes, readable by programs."""
+    stderr = find_shown_error(stderr, status)
+    if not _is_positive(stderr):
         return f"{value:.6g}"
     decimals = _estimate_decimals(value, stderr)
     if decimals is None:
         return f"{value:.6g} ± {stderr:.2g}"
-    if status == _AT_BOUND:
-        return f"{value:.6g} ± {stderr:.{decimals}f}"
     return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 
 def format_interval(ends: Sequence[float] | None, stderr: float | None, *, status: str = "") -> str:
     """Format a 95 % interval, to the digits of the standard error; empty without one."""
-    if ends is None or status == _UNSETTLED:
+    if ends is None or status in _WITHOUT_ERROR:
         return ""
     low, high = (format_estimate(end, stderr)[0] for end in ends)
     return f"{low} … {high}"

@@ -12,6 +12,7 @@ from math import isfinite
 from typing import Any
 
 from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.core.text import find_shown_error
 from sysid.export.identifiers import to_one_line
 from sysid.models.model import DerivedInitial, MeasuredInitial, name_initial_state
 
@@ -101,7 +102,8 @@ def describe_values(
 
 
 def _describe_value(value: IdentifiedValue) -> str:
-    error = "" if value.stderr is None else f"; standard error {value.stderr:.3g}"
+    stderr = find_shown_error(value.stderr, value.status)
+    error = "" if stderr is None else f"; standard error {stderr:.3g}"
     status = f"; {value.status}" if value.status and value.status != "identified" else ""
     return f"{describe_unit(value.unit)}{error}{status}."
 

@@ -10,6 +10,7 @@ import numpy as np
 from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.lazy_names import load_library
 from sysid.core.settings import LossKind
+from sysid.core.text import find_shown_error
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.figures import plotly
@@ -215,7 +216,7 @@ def _to_free_parameter(found: Identification, estimate: Estimate) -> FreeParamet
         estimate.upper,
         scales.get(estimate.name, "linear"),
         estimate.value,
-        None if estimate.status == "not settled" else estimate.stderr,
+        find_shown_error(estimate.stderr, estimate.status),
     )
 
 

@@ -113,7 +113,8 @@ class Evidence:
     def tell_reasons(self, status: str) -> str:
         """Tell each free parameter of this status with its value, and the reason, as sentences."""
         return " ".join(
-            f"{one.name} = {plain_estimate(one.value, one.stderr)}{plain_unit(one.unit)}"
+            f"{one.name} = {plain_estimate(one.value, one.stderr, status=one.status)}"
+            f"{plain_unit(one.unit)}"
             f"{f'; {one.reason}' if one.reason else ''}."
             for one in self.free
             if one.status == status

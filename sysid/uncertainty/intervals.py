@@ -88,7 +88,7 @@ def mark_poor_intervals(
 
 
 def keep_in_bounds(estimates: Sequence[Estimate]) -> tuple[Estimate, ...]:
-    """Cut the intervals of free parameters at their bounds."""
+    """Cut the intervals of free parameters at their bounds, and say so in the reason."""
     return tuple(_keep_in_bounds(one) for one in estimates)
 
 
@@ -98,7 +98,10 @@ def _keep_in_bounds(estimate: Estimate) -> Estimate:
     lower, upper = (min(max(end, estimate.lower), estimate.upper) for end in estimate.interval95)
     if (lower, upper) == estimate.interval95:
         return estimate
-    return replace(estimate, interval95=(lower, upper))
+    pairs = zip(("lower", "upper"), (lower, upper), estimate.interval95, strict=True)
+    cut = [f"{name} bound {end:.6g}" for name, end, uncut in pairs if end != uncut]
+    reason = estimate.reason or f"its 95 % interval is cut at the {' and the '.join(cut)}"
+    return replace(estimate, interval95=(lower, upper), reason=reason)
 
 
 def _explain_poor_interval(parameter: Parameter, interval: Interval) -> str:

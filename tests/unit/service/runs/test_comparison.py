@@ -3,7 +3,7 @@
 import pytest
 
 from service.runs.comparison import find_furthest_pair
-from sysid.core.text import join_estimate, plain_estimate
+from sysid.core.text import find_shown_error, format_interval, join_estimate, plain_estimate
 
 
 def estimate(value: float, stderr: float | None) -> dict[str, object]:
@@ -39,10 +39,14 @@ def test_values_are_cut_at_the_second_digit_of_their_error(
 
 def test_a_bound_is_not_rounded_to_the_error_of_its_estimate() -> None:
     assert plain_estimate(0.2, 835.0) == "0 ± 835"
-    assert plain_estimate(0.2, 835.0, status="at bound") == "0.2 ± 835"
-    assert join_estimate(-0.2, 835.0, status="at bound") == "−0.2 ± 835"
+    assert plain_estimate(0.2, 835.0, status="at bound") == "0.2"
+    assert join_estimate(-0.2, 835.0, status="at bound") == "−0.2"
 
 
-def test_an_estimate_of_a_search_that_did_not_settle_has_no_error() -> None:
+def test_an_estimate_at_its_bound_or_of_a_search_that_did_not_settle_has_no_error() -> None:
+    for status in ("at bound", "not settled"):
+        assert find_shown_error(0.1, status) is None
+        assert format_interval((0.1, 0.2), 0.05, status=status) == ""
+    assert find_shown_error(0.1, "order-dependent") == 0.1
     assert plain_estimate(0.0937, 0.0072, status="not settled") == "0.0937"
     assert join_estimate(-0.0937, 0.0072, status="not settled") == "−0.0937000"

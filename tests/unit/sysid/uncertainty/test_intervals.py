@@ -10,7 +10,8 @@ from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.language.functions import Interval
 from sysid.uncertainty.analysis import analyse_estimate
-from sysid.uncertainty.intervals import mark_poor_intervals
+from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.intervals import keep_in_bounds, mark_poor_intervals
 from tests.models import LINE
 from tests.searching import example
 
@@ -75,3 +76,12 @@ def test_an_interval_of_one_degree_of_freedom_is_not_identified_and_stays_in_the
     assert slope.stderr < 0.2 * (slope.upper - slope.lower)
     assert (slope.status, slope.interval95) == ("unidentifiable", (1.0, 3.0))
     assert slope.reason.endswith("its 95 % interval is wider than its range")
+
+
+def test_an_interval_that_a_bound_cuts_says_so() -> None:
+    inside = Estimate("T", "s", 0.5, 0.0, 5.0, 0.01, (0.48, 0.52), "identified")
+    cut = replace(inside, interval95=(-0.1, 5.2))
+    kept, shown = keep_in_bounds([inside, cut])
+    assert kept == inside
+    assert shown.interval95 == (0.0, 5.0)
+    assert shown.reason == "its 95 % interval is cut at the lower bound 0 and the upper bound 5"
