@@ -312,8 +312,8 @@ def _find_missing_dynamics(evidence: Evidence) -> Iterator[Reason]:
         yield Reason(
             "caution",
             "the residuals are not noise",
-            "The residuals are not white, and a model of another order does not explain them. A "
-            "warning names what they are most likely of.",
+            "The residuals are not white, and a model of another order does not explain them. Look "
+            "for a disturbance, slow noise, or a system that changed during the recording.",
         )
     elif evidence.has_failed("whiteness"):
         names = evidence.delays
