@@ -48,8 +48,10 @@ def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page
     check = page.locator("#check")
     expect(check).to_contain_text("column 2")
     expect(check).to_contain_text("Kp")
+    expect(page.locator("#about-model")).to_be_hidden()  # it has the equations of before
     write_own(page, EQUATIONS)
     expect(check).to_contain_text("the model is valid")
+    expect(page.get_by_role("math", name="dy/dt = (K*u(t - L) - y)/T")).to_be_visible()
 
 
 def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, page: Page) -> None:
@@ -154,6 +156,25 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
             jobs.get(name).spec for name in (own_site.filled.finished, page.url.rsplit("/", 1)[1])
         ]
     assert specs[0] == specs[1]
+
+
+def test_a_clone_of_a_job_that_the_service_named_is_named_after_its_new_model(
+    own_site: Site, page: Page
+) -> None:
+    model = yaml.safe_load(EQUATIONS)
+    body = {"model": model, "datasets": [own_site.filled.dataset]}
+    body |= {"channels": {"u": "P1", "y": "P2"}}
+    answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()
+    assert answer["name"] == "my-tube on tube 40 m"
+    opened(own_site, page, f"?clone={answer['id']}")
+    name = page.get_by_label("name of the job")
+    expect(name).to_have_attribute("placeholder", answer["name"])
+    write_own(page, EQUATIONS.replace("my-tube", "longer-tube"))
+    expect(name).to_have_attribute("placeholder", "longer-tube on tube 40 m")
+    expect(name).to_have_value("")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(page.locator("h1")).to_have_text("longer-tube on tube 40 m")
 
 
 def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> None:

@@ -43,7 +43,7 @@ async function fillFrom(job) {
   const { request, name } = await ask(address(`/v1/jobs/${encodeURIComponent(job)}`));
   const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
   state.extra = request;
-  set('name', name);
+  if (request.name) set('name', name); // the service names the other jobs after model and data
   const algorithm = request.algorithm ?? {};
   for (const key of ['method', 'population', 'generations']) set(key, algorithm[key]);
   if (Number.isInteger(algorithm.islands)) set('islands', algorithm.islands);
@@ -167,6 +167,7 @@ async function checkModel(changes) {
 function showVerdict(result) {
   const place = document.getElementById('check');
   field('equations').ariaInvalid = String(!result.valid);
+  document.getElementById('about-model').classList.toggle('outdated', !result.valid);
   const list = document.createElement('ul');
   for (const fault of (result.valid ? result.warnings : result.errors) ?? []) {
     const where = [fault.pointer, fault.column && `column ${fault.column}`].filter(Boolean).join(', ');
@@ -187,8 +188,14 @@ function applyModel(model, equations, changes) {
   mapChannels();
 }
 
+/** Show in the empty field how the service will name the job. A batch is named after its label. */
+function showDefaultName() {
+  if (state.model && state.dataset && !state.extra.trend) field('name').placeholder = `${state.model.name} on ${state.dataset.name}`;
+}
+
 /** Draw one choice per signal of the model: the channel of the same name, else of the same place. */
 function mapChannels(wanted = {}, held = readHolds()) {
+  showDefaultName();
   if (!state.model || !state.dataset) return;
   const recorded = state.dataset.channels.map((channel) => channel.name);
   const inputs = Object.keys(state.model.inputs ?? {});
