@@ -58,7 +58,7 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
     opened(own_site, page, f"?dataset={own_site.filled.dataset}")
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("the model is valid")
-    page.get_by_label("upper of L").fill("0.3")
+    page.get_by_label("upper of L").fill("0,3")
     page.get_by_label("output y").select_option("P2")
     page.get_by_label("u between samples").select_option("zero")
     page.get_by_label("noise").select_option("ar1")
@@ -91,6 +91,14 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     expect(page.locator("#form-fault")).to_have_text("Change the marked fields.")
     assert page.locator("#job-form").inner_text().count("need 4 or more") == 1  # told once
     expect(page.get_by_label("population")).to_be_focused()
+
+
+def test_a_comma_that_may_separate_thousands_is_refused_with_advice(site: Site, page: Page) -> None:
+    opened(site, page, f"?dataset={site.filled.dataset}")
+    page.get_by_label("upper of T").fill("1,000")
+    page.get_by_role("button", name="Identify").click()
+    expect(page.get_by_label("upper of T")).to_have_attribute("aria-invalid", "true")
+    expect(page.locator('[data-fault="/parameters"]')).to_contain_text("write a decimal point")
 
 
 def test_swapped_bounds_are_marked_both_and_told_once(site: Site, page: Page) -> None:

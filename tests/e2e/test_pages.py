@@ -381,10 +381,15 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
 def test_a_run_is_simulated_in_a_closed_loop_from_its_page(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
     page.get_by_role("link", name="Simulate").click()
+    expect(page.get_by_label("tuning")).to_have_value("simc PI")
     page.get_by_label("gain").first.fill("0.5")
+    page.get_by_label("integral time").fill("")
     page.get_by_label("height").fill("10")
     page.get_by_role("button", name="Simulate").click()
     page.wait_for_selector("#result .main-svg")
+    expect(page.get_by_role("heading", name="Response")).to_be_focused()
+    expect(page.get_by_role("heading", name="Response")).to_be_in_viewport()
+    expect(page.get_by_label("tuning")).to_have_value("by hand")
     expect(page.locator("#result .verdict")).to_have_text("settles")
     assert page.locator(f"#result {LINES}").count() == 3  # reference, output and input
     address = page.url
@@ -428,6 +433,7 @@ def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
     page.get_by_label("gain").first.fill("much")
     page.get_by_role("button", name="Simulate").click()
     expect(page.get_by_role("alert")).to_contain_text("gain: found 'much'; need a number")
+    expect(page.get_by_role("alert")).to_be_focused()
     expect(page.locator("[name=gain]")).to_have_attribute("aria-invalid", "true")
 
 

@@ -2,7 +2,7 @@
 
 import { Problem, address, ask, makeElement, keepLatest, post } from './live.js';
 import * as forms from './fields.js';
-import { clearFaults, fillTable, readOverrides, showProposals } from './fields.js';
+import { clearFaults, fillTable, parseNumber, readOverrides, showProposals } from './fields.js';
 import { forgetPreview, listValidationSteps, previewDataset, readSteps } from './preview.js';
 import { describeModel } from './equations.js';
 
@@ -114,8 +114,8 @@ async function upload() {
   showState(`storing ${file.name}…`);
   try {
     const options = new URLSearchParams({ name: file.name });
-    const period = field('upload-period').value;
-    if (period) options.set('sample_time', period);
+    const period = readNumber('upload-period');
+    if (period !== null) options.set('sample_time', period);
     const stored = await storeFile(() => ask(address(`/v1/datasets?${options}`), {
       method: 'POST', headers: { 'Content-Type': 'application/octet-stream' }, body: file,
     }));
@@ -247,11 +247,7 @@ const readHolds = () =>
 const readChannels = () =>
   Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((select) => [select.dataset.signal, select.value]));
 
-/** Read a number. Other text is sent as typed, so that the server reports the fault. */
-const readNumber = (name) => {
-  const text = field(name).value.trim();
-  return text === '' ? null : Number.isNaN(Number(text)) ? text : Number(text);
-};
+const readNumber = (name) => parseNumber(field(name).value);
 
 const isOwn = () => field('source').value === 'own';
 /** Return the own model. An unchanged cloned document is sent as it was, others in normal form. */
