@@ -445,6 +445,24 @@ CUT_TABLES = """boxes => boxes.filter((box) => box.checkVisibility()).filter((bo
 PATHS = ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
 
 
+def test_the_menu_of_a_narrow_page_is_opened_by_the_keyboard(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/health")
+    models = page.get_by_role("navigation", name="Main").get_by_role("link", name="Models")
+    expect(models).to_be_visible()
+    expect(page.get_by_text("Menu", exact=True)).to_be_hidden()
+    page.set_viewport_size({"width": 390, "height": 900})
+    expect(models).to_be_hidden()
+    head = page.locator(".top").bounding_box()
+    assert head is not None
+    assert head["height"] < 60  # one line
+    for key in ("Tab", "Tab", "Tab", "Enter"):  # the skip link, the brand, the menu
+        page.keyboard.press(key)
+    expect(models).to_be_visible()
+    for _ in range(4):
+        page.keyboard.press("Tab")
+    expect(models).to_be_focused()
+
+
 def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(
     site: Site, page: Page
 ) -> None:
