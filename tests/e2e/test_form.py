@@ -120,7 +120,7 @@ def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: P
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
     opened(own_site, page)
     page.get_by_label("or upload a recording").set_input_files(path)
-    expect(page.locator("#form-state")).to_contain_text("step.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("step.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
 
 
@@ -144,8 +144,8 @@ def test_a_file_without_times_is_stored_with_its_sampling_period(
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text('field "sampling period"')
     page.get_by_label("sampling period [s]").fill("0.1")
     page.get_by_label("sampling period [s]").blur()
-    expect(page.locator("#form-state")).to_contain_text("notime.csv is stored")
-    expect(page.locator("#form-state")).to_contain_text("decimal commas")
+    expect(page.locator("#upload-state")).to_contain_text("notime.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("decimal commas")
     expect(page.locator('[data-fault="/datasets"]')).to_be_empty()
 
 
@@ -260,7 +260,7 @@ def test_a_file_is_dropped_on_the_page(own_site: Site, page: Page) -> None:
           document.dispatchEvent(new DragEvent('drop', {dataTransfer: files, bubbles: true}));
         }"""
     )
-    expect(page.locator("#form-state")).to_contain_text("dropped.csv is stored")
+    expect(page.locator("#upload-state")).to_contain_text("dropped.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u · y")
 
 

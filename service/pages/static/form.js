@@ -100,10 +100,12 @@ async function showDataset() {
 /** Store a file. Only the answer to the last choice of a recording is used. */
 const storeFile = keepLatest((question) => question());
 
+const showUpload = (text) => (document.getElementById('upload-state').textContent = text);
+
 /** Forget the upload that is not answered yet, and what the form says of an earlier one. */
 function dropUpload() {
   storeFile(async () => null);
-  showState('');
+  showUpload('');
   form.querySelector('[data-fault="/datasets"]').textContent = '';
 }
 
@@ -111,7 +113,7 @@ async function upload() {
   const [file] = field('upload').files;
   if (!file) return;
   clearFaults(form);
-  showState(`storing ${file.name}…`);
+  showUpload(`storing ${file.name}…`);
   try {
     const options = new URLSearchParams({ name: file.name });
     const period = readNumber('upload-period');
@@ -121,12 +123,12 @@ async function upload() {
     }));
     if (!stored) return;
     await selectDataset(stored.id);
-    showState([`${file.name} is stored`, ...stored.warnings].join(' · '));
+    showUpload([`${file.name} is stored`, ...stored.warnings].join(' · '));
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     const message = error.message.replace(/\bsample_time\b/g, 'the field "sampling period"');
     form.querySelector('[data-fault="/datasets"]').textContent = message;
-    showState('');
+    showUpload('');
   }
 }
 
