@@ -381,10 +381,15 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
 def test_a_run_is_simulated_in_a_closed_loop_from_its_page(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
     page.get_by_role("link", name="Simulate").click()
+    expect(page.get_by_label("tuning")).to_have_value("simc PI")
     page.get_by_label("gain").first.fill("0.5")
+    page.get_by_label("integral time").fill("")
     page.get_by_label("height").fill("10")
     page.get_by_role("button", name="Simulate").click()
     page.wait_for_selector("#result .main-svg")
+    expect(page.get_by_role("heading", name="Response")).to_be_focused()
+    expect(page.get_by_role("heading", name="Response")).to_be_in_viewport()
+    expect(page.get_by_label("tuning")).to_have_value("by hand")
     expect(page.locator("#result .verdict")).to_have_text("settles")
     assert page.locator(f"#result {LINES}").count() == 3  # reference, output and input
     address = page.url
@@ -428,6 +433,7 @@ def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
     page.get_by_label("gain").first.fill("much")
     page.get_by_role("button", name="Simulate").click()
     expect(page.get_by_role("alert")).to_contain_text("gain: found 'much'; need a number")
+    expect(page.get_by_role("alert")).to_be_focused()
     expect(page.locator("[name=gain]")).to_have_attribute("aria-invalid", "true")
 
 
@@ -437,6 +443,24 @@ CUT_TABLES = """boxes => boxes.filter((box) => box.checkVisibility()).filter((bo
 ).map((box) => box.innerText)"""
 """Tables that are cut at the window's edge, or hide a cell."""
 PATHS = ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
+
+
+def test_the_menu_of_a_narrow_page_is_opened_by_the_keyboard(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/health")
+    models = page.get_by_role("navigation", name="Main").get_by_role("link", name="Models")
+    expect(models).to_be_visible()
+    expect(page.get_by_text("Menu", exact=True)).to_be_hidden()
+    page.set_viewport_size({"width": 390, "height": 900})
+    expect(models).to_be_hidden()
+    head = page.locator(".top").bounding_box()
+    assert head is not None
+    assert head["height"] < 60  # one line
+    for key in ("Tab", "Tab", "Tab", "Enter"):  # the skip link, the brand, the menu
+        page.keyboard.press(key)
+    expect(models).to_be_visible()
+    for _ in range(4):
+        page.keyboard.press("Tab")
+    expect(models).to_be_focused()
 
 
 def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(
