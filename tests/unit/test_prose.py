@@ -27,8 +27,9 @@ def sentences(markdown: str, ends: str = ".!?:") -> list[str]:
 
 
 def sentences_of_cells(markdown: str) -> list[str]:
-    """Sentences of the cells of tables; code and a formula count as a word."""
-    rows = re.findall(r"^\s*\|.*$", re.sub(r"```.*?```", "", markdown, flags=re.DOTALL), re.MULTILINE)
+    """Sentences of the cells of tables; a piece of code counts as a word."""
+    prose = re.sub(r"```.*?```", "", markdown, flags=re.DOTALL)
+    rows = re.findall(r"^\s*\|.*$", prose, re.MULTILINE)
     text = re.sub(r"`[^`]*`", "X", "\n".join(rows))
     return re.split(r"(?<=[.!?:;])\s+|\||\n", text)
 
